@@ -1,0 +1,126 @@
+"""From Hydra's composed configuration to checked settings, with one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from omegaconf import DictConfig, OmegaConf
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from proposer_rl.experiment import Schedule
+from proposer_rl.methods import ProposerSettings
+from proposer_rl.task import (
+    DistributionSettings,
+    EvaluationSettings,
+    MazeSettings,
+    SolverSettings,
+    SpaceSettings,
+)
+
+PACKAGE = Path(__file__).resolve().parents[1]
+# In a wheel the configuration lies in the package, in a checkout beside it.
+CONFIG_FOLDER = next(
+    (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
+    PACKAGE / "conf",
+)
+
+
+class ConfigError(ValueError):
+    """The configuration is wrong; the message is one line."""
+
+
+class LoggerSettings(BaseModel):
+    """Where rows of metrics go besides the run's folder."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    type: Literal["csv", "tensorboard", "wandb"]
+    project: str = "proposer_rl"
+    mode: Literal["online", "offline", "disabled"] = "online"
+
+
+class RunConfig(BaseModel):
+    """Every setting of a run; names and meaning as in ``conf/train.yaml``."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    method: str
+    scale: str
+    ablation: str
+    curriculum: dict[str, Any]
+    seed: Annotated[int, Field(ge=0)]
+    device: str
+    precision: Literal["fp32", "bf16"]
+    threads: Annotated[int, Field(ge=1)] | None
+    progress: bool
+    maze: MazeSettings
+    distributions: dict[str, DistributionSettings]
+    target: str
+    space: SpaceSettings
+    solver: SolverSettings
+    proposer: ProposerSettings
+    schedule: Schedule
+    evaluation: EvaluationSettings
+    logger: LoggerSettings
+
+    @model_validator(mode="after")
+    def _agree(self) -> RunConfig:
+        proposer, schedule, solver = self.proposer, self.schedule, self.solver
+        if proposer.advance != "train" and schedule.cycle_length != proposer.lookahead:
+            raise ValueError(
+                f"schedule.cycle_length={schedule.cycle_length} must equal proposer.lookahead="
+                f"{proposer.lookahead} where proposer.advance={proposer.advance}"
+            )
+        if proposer.ppo.horizon != proposer.lookahead:
+            raise ValueError(
+                f"proposer.ppo.horizon={proposer.ppo.horizon} must equal proposer.lookahead="
+                f"{proposer.lookahead}"
+            )
+        uneven = [width for width in solver.channels if width % solver.groups]
+        if uneven:
+            raise ValueError(
+                f"solver.channels={solver.channels} must be multiples of solver.groups="
+                f"{solver.groups}"
+            )
+        smallest = min(self.maze.height, self.maze.width) >> (len(solver.channels) - 1)
+        if smallest < 1:
+            raise ValueError(
+                f"solver.channels={solver.channels} halve a {self.maze.height}x{self.maze.width} "
+                "maze to nothing; give fewer channels or a larger maze"
+            )
+        return self
+
+
+def read_config(config: DictConfig) -> RunConfig:
+    """Check a composed configuration.
+
+    Raises:
+        ConfigError: naming the first wrong key, its value and what is allowed.
+    """
+    if config.method is None or config.curriculum is None:
+        names = ", ".join(methods())
+        raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {names}")
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    try:
+        return RunConfig.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_first_line(error)) from error
+
+
+def methods() -> list[str]:
+    """Names of the methods in the configuration folder."""
+    return sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
+
+
+def _first_line(error: ValidationError) -> str:
+    details: Mapping[str, Any] = error.errors()[0]
+    key = ".".join(str(part) for part in details["loc"])
+    message = details["msg"].removeprefix("Value error, ")
+    if not key:
+        return message
+    if details["type"] == "extra_forbidden":
+        return f"{key}: there is no such key"
+    return f"{key}={details['input']!r}: {message[0].lower()}{message[1:]}"

@@ -1,0 +1,14 @@
+"""What the Solver trains on."""
+
+from proposer_rl.curricula.base import Curriculum, Improvement
+from proposer_rl.curricula.proposer import ProposerCurriculum, total_gain
+from proposer_rl.curricula.sampling import SamplingCurriculum, ScheduleCurriculum
+
+__all__ = [
+    "Curriculum",
+    "Improvement",
+    "ProposerCurriculum",
+    "SamplingCurriculum",
+    "ScheduleCurriculum",
+    "total_gain",
+]

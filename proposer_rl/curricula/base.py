@@ -1,0 +1,53 @@
+"""A curriculum decides what the Solver trains on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from tensordict import TensorDictBase
+
+from proposer_rl.ppo import PPO
+from proposer_rl.streams import Streams
+
+
+@dataclass
+class Improvement:
+    """What a curriculum did before a cycle.
+
+    Attributes:
+        metrics: of the cycle, ready for JSON; empty if nothing was done.
+        meta_frames: inner environment steps that it cost, beyond the Solver's own.
+        updates: Solver updates that it has made itself, instead of the cycle's.
+    """
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+    meta_frames: int = 0
+    updates: int = 0
+
+
+class Curriculum:
+    """The interface of curricula; each method does nothing unless a curriculum has use for it.
+
+    A Solver is a :class:`~proposer_rl.ppo.PPO` of a population of K; ``streams`` has the K copies'
+    random streams for the present update or cycle.
+    """
+
+    def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
+        """Levels [K, P] for the Solver's next update."""
+        raise TypeError(f"{type(self).__name__} must define propose(solver, streams)")
+
+    def observe(self, levels: Any, rollout: TensorDictBase) -> None:
+        """Learn from an update: its levels [K, P] and the Solver's transitions [K, P, T]."""
+
+    def improve(self, solver: PPO, streams: Sequence[Streams]) -> Improvement:
+        """Prepare for the next cycle, whose first update has not begun."""
+        return Improvement()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put back what :meth:`state_dict` returned."""

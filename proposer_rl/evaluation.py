@@ -1,0 +1,207 @@
+"""How well a per-cell policy does on fixed mazes, exactly or by playing.
+
+Both evaluators have one signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W], generator)``
+gives a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The generator is the
+source of randomness, None for the evaluator's own; the exact evaluator draws nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.nn.functional import one_hot, pad
+
+from proposer_rl.mazes.distance import cells_first, padded_index
+from proposer_rl.mazes.dynamics import MOVES, successors
+from proposer_rl.mazes.env import MazeEnv
+from proposer_rl.mazes.levels import Level, cell_index, cell_position
+
+
+@dataclass(frozen=True)
+class ExactEvaluator:
+    """Expected return and probability of success, without sampling.
+
+    A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs. With
+    p_t(c) the probability of being at cell c before step t + 1 and T the step limit, success is
+    p_T(goal) and the undiscounted return is
+
+        p_T(goal) - step_penalty * sum over t < T of (1 - p_t(goal)),
+
+    the sum being the expected number of steps. Rounding errors are those of float32 sums of
+    ``max_steps`` terms, about 1e-6. No gradient is kept.
+
+    Attributes:
+        max_steps: Step limit of an episode.
+        step_penalty: Cost of a step.
+        greedy: Whether the policy takes the most probable action (of equal ones the first) or
+            samples.
+    """
+
+    max_steps: int = 25
+    step_penalty: float = 0.01
+    greedy: bool = False
+
+    @torch.no_grad()
+    def __call__(
+        self, levels: Level, cell_logits: Tensor, generator: torch.Generator | None = None
+    ) -> TensorDict:
+        """Evaluates one policy in each maze.
+
+        Args:
+            levels: Levels ``[*B]``.
+            cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
+            generator: Unused.
+
+        Returns:
+            ``"return"`` and ``"success"``, float32 ``[*B]`` each.
+        """
+        height, width = levels.walls.shape[-2:]
+        goal = cell_index(levels.goal, width).flatten()  # [N]
+        stay, leave = _transitions(levels, _policy(cell_logits, self.greedy), goal)
+        here = stay.new_zeros(height + 2, width + 2, len(goal))  # the rim stays empty
+        start = padded_index(cell_index(levels.start, width).flatten(), width)
+        here.flatten(0, 1).scatter_(0, start.unsqueeze(0), 1.0)
+        after, goal = torch.zeros_like(here), padded_index(goal, width).unsqueeze(0)
+        success, steps = torch.zeros(2, goal.shape[1], device=goal.device)
+        for _ in range(self.max_steps):
+            steps += 1 - success
+            origin = here[1:-1, 1:-1]
+            torch.mul(origin, stay, out=after[1:-1, 1:-1])
+            for move, chosen in zip(MOVES, leave, strict=True):
+                _shifted(after, move).addcmul_(origin, chosen)
+            here, after = after, here
+            success = here.flatten(0, 1).gather(0, goal).squeeze(0)
+        return _result(levels, success - self.step_penalty * steps, success)
+
+
+@dataclass(frozen=True)
+class RolloutEvaluator:
+    """Mean return and share of successes over episodes played in :class:`MazeEnv`.
+
+    Attributes:
+        max_steps: Step limit of an episode.
+        step_penalty: Cost of a step.
+        episodes: Episodes played in each maze.
+        greedy: Whether the policy takes the most probable action (of equal ones the first) or
+            samples.
+        generator: Source of randomness, on the levels' device; None for the default one.
+    """
+
+    max_steps: int = 25
+    step_penalty: float = 0.01
+    episodes: int = 1
+    greedy: bool = False
+    generator: torch.Generator | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+
+    @torch.no_grad()
+    def __call__(
+        self, levels: Level, cell_logits: Tensor, generator: torch.Generator | None = None
+    ) -> TensorDict:
+        """Evaluates one policy in each maze.
+
+        Args:
+            levels: Levels ``[*B]``.
+            cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
+            generator: Source of randomness, on the levels' device; None for the evaluator's own.
+
+        Returns:
+            ``"return"`` and ``"success"``, float32 ``[*B]`` each.
+        """
+        generator = self.generator if generator is None else generator
+        batch = (self.episodes, *levels.batch_size)
+        env = MazeEnv(
+            levels.expand(batch), max_steps=self.max_steps, step_penalty=self.step_penalty
+        )
+        policy = _policy(cell_logits, self.greedy).flatten(-2).movedim(-2, -1)  # [*B, H*W, 4]
+        policy = policy.expand(self.episodes, *policy.shape)
+        state = env.reset()
+        playing = torch.ones(batch, dtype=torch.bool, device=levels.walls.device)
+        returns, successes = torch.zeros_like(playing, dtype=torch.float32), ~playing
+        for _ in range(self.max_steps):
+            cell = cell_index(state["agent"], levels.walls.shape[-1])[..., None, None]
+            here = policy.gather(-2, cell.expand(*batch, 1, len(MOVES)))  # [episodes, *B, 1, 4]
+            action = here.reshape(-1, len(MOVES)).multinomial(1, generator=generator)
+            state = env.step(state.set("action", action.view(batch)))["next"]
+            returns += state["reward"].squeeze(-1) * playing
+            successes |= state["terminated"].squeeze(-1) & playing
+            playing &= ~state["done"].squeeze(-1)
+        return _result(levels, returns.mean(0), successes.float().mean(0))
+
+
+@torch.no_grad()
+def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tensor:
+    """Follows the most probable actions from the start.
+
+    Args:
+        level: Levels ``[*B]``.
+        cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
+        max_steps: Steps to take.
+
+    Returns:
+        int64 ``[*B, max_steps + 1, 2]``: row and column before each step and after the last;
+        the goal is not left again.
+    """
+    width = level.walls.shape[-1]
+    table = successors(level)  # [*B, 4, H*W]
+    action = cell_logits.argmax(-3).flatten(-2).unsqueeze(-2)  # [*B, 1, H*W]
+    following = table.gather(-2, action).squeeze(-2)
+    goal = cell_index(level.goal, width).unsqueeze(-1)
+    following.scatter_(-1, goal, goal)
+    path = [cell_index(level.start, width).unsqueeze(-1)]
+    for _ in range(max_steps):
+        path.append(following.gather(-1, path[-1]))
+    return cell_position(torch.cat(path, dim=-1), width)
+
+
+def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
+    """Action probabilities, float32 ``[*B, 4, H, W]``."""
+    if greedy:
+        return one_hot(cell_logits.argmax(-3), len(MOVES)).movedim(-1, -3).float()
+    return cell_logits.float().softmax(-3)
+
+
+def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    """Splits a policy into staying and leaving.
+
+    Args:
+        levels: Levels ``[*B]``, N of them.
+        policy: float32 ``[*B, 4, H, W]``.
+        goal: int64 ``[N]``, number of the goal.
+
+    Returns:
+        The probability of staying at a cell, ``[H, W, N]``, and of leaving it by each action,
+        ``[4, H, W, N]``; those of the goal are 1 and 0.
+    """
+    free = pad(cells_first(~levels.walls).float(), (0, 0, 1, 1, 1, 1))  # [H+2, W+2, N]
+    leave = policy.reshape(-1, *policy.shape[-3:]).permute(1, 2, 3, 0).contiguous()
+    leave.flatten(1, 2).scatter_(1, goal.expand(len(MOVES), 1, -1), 0.0)
+    stay = torch.zeros_like(leave[0])
+    stay.flatten(0, 1).scatter_(0, goal.unsqueeze(0), 1.0)
+    for chosen, move in zip(leave, MOVES, strict=True):
+        open_ahead = _shifted(free, move)
+        stay += chosen * (1 - open_ahead)
+        chosen *= open_ahead
+    return stay, leave
+
+
+def _shifted(padded: Tensor, move: tuple[int, int]) -> Tensor:
+    """Views a grid ``[H+2, W+2, N]`` one move on from each cell: ``[H, W, N]``."""
+    (down, right), (height, width) = move, padded.shape[:2]
+    return padded[1 + down : height - 1 + down, 1 + right : width - 1 + right]
+
+
+def _result(levels: Level, returns: Tensor, success: Tensor) -> TensorDict:
+    return TensorDict(
+        {
+            "return": returns.reshape(levels.batch_size),
+            "success": success.reshape(levels.batch_size),
+        },
+        batch_size=levels.batch_size,
+    )

@@ -1,0 +1,29 @@
+"""Mazes: levels, their exact generation, distributions over them, the environment, pictures."""
+
+from __future__ import annotations
+
+from proposer_rl.mazes.distance import distance_field, shortest_path_length
+from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.mazes.dynamics import successors
+from proposer_rl.mazes.env import MazeEnv
+from proposer_rl.mazes.generation import MECHANISMS, check_specifications, generate_levels
+from proposer_rl.mazes.levels import Level, LevelSpec, planes, validate_levels
+from proposer_rl.mazes.rendering import draw_grid, draw_level
+
+__all__ = [
+    "MECHANISMS",
+    "Level",
+    "LevelDistribution",
+    "LevelSpec",
+    "MazeEnv",
+    "SpecificationSpace",
+    "check_specifications",
+    "distance_field",
+    "draw_grid",
+    "draw_level",
+    "generate_levels",
+    "planes",
+    "shortest_path_length",
+    "successors",
+    "validate_levels",
+]

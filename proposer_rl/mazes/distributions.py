@@ -1,0 +1,183 @@
+"""What levels are drawn from: a set of specifications, or a grid of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from proposer_rl.mazes.generation import check_specifications, generate_levels
+from proposer_rl.mazes.levels import Level, LevelSpec
+
+
+class LevelDistribution:
+    """Levels of specifications that are equally likely, numbered in their order.
+
+    Args:
+        specifications: Pairs (obstacle fraction, path length), at least one; see
+            :class:`~proposer_rl.mazes.levels.LevelSpec`.
+        mechanism: ``"uniform"`` or ``"path_first"``; see
+            :func:`~proposer_rl.mazes.generation.generate_levels`.
+        height: H, cells.
+        width: W, cells.
+
+    Raises:
+        ValueError: If a specification cannot be met, or there is none.
+    """
+
+    def __init__(
+        self,
+        specifications: Sequence[tuple[float, int]],
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+    ) -> None:
+        self.specifications = tuple(LevelSpec(*pair) for pair in specifications)
+        self.mechanism = mechanism
+        self.height = height
+        self.width = width
+        check_specifications(self.specifications, height, width, mechanism)
+
+    @property
+    def size(self) -> int:
+        """Number of specifications."""
+        return len(self.specifications)
+
+    def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Looks specifications up.
+
+        Args:
+            index: int64 ``[*B]``, in 0 ... size - 1.
+
+        Returns:
+            Obstacle fractions, float64 ``[*B]``, and path lengths, int64 ``[*B]``.
+
+        Raises:
+            ValueError: If a number is out of range.
+        """
+        self._check(index)
+        fractions, lengths = zip(*self.specifications, strict=True)
+        return (
+            torch.tensor(fractions, dtype=torch.float64, device=index.device)[index],
+            torch.tensor(lengths, device=index.device)[index],
+        )
+
+    def generate(self, index: Tensor, generator: torch.Generator | None = None) -> Level:
+        """Draws one level for each number.
+
+        Args:
+            index: int64 ``[*B]``, in 0 ... size - 1.
+            generator: Source of randomness; None for the default one.
+
+        Returns:
+            Levels ``[*B]``, in the order of the numbers and on their device.
+
+        Raises:
+            ValueError: If a number is out of range.
+        """
+        fraction, length = self.decode(index.cpu())
+        return generate_levels(
+            fraction, length, self.height, self.width, self.mechanism, generator, index.device
+        )
+
+    def sample(
+        self,
+        batch_shape: int | Sequence[int] = (),
+        generator: torch.Generator | None = None,
+        device: torch.device | str | None = None,
+    ) -> Level:
+        """Draws levels of uniformly random specifications.
+
+        Args:
+            batch_shape: ``[*B]``; a number for ``[B]``.
+            generator: Source of randomness; None for the default one.
+            device: Where the levels are returned; None for the generator's device, else the CPU.
+
+        Returns:
+            Levels of batch shape ``[*B]``.
+        """
+        target = _target_device(generator, device)
+        place = target if generator is None else generator.device
+        index = torch.randint(self.size, _shape(batch_shape), generator=generator, device=place)
+        return self.generate(index.to(target), generator)
+
+    def _check(self, index: Tensor) -> None:
+        if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
+            raise ValueError(
+                f"specifications are numbered 0 to {self.size - 1}, "
+                f"got {int(index.min())} to {int(index.max())}"
+            )
+
+
+def _shape(batch_shape: int | Sequence[int]) -> tuple[int, ...]:
+    return (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
+
+
+class SpecificationSpace(LevelDistribution):
+    """The M x N pairs of M obstacle fractions and N path lengths, numbered row by row.
+
+    Number ``i * N + j`` stands for ``(obstacle_fractions[i], path_lengths[j])``.
+
+    Args:
+        obstacle_fractions: M distinct fractions in [0, 1).
+        path_lengths: N distinct numbers of moves.
+        mechanism: As in :class:`LevelDistribution`.
+        height: H, cells.
+        width: W, cells.
+
+    Raises:
+        ValueError: If an entry is repeated or a specification cannot be met.
+    """
+
+    def __init__(
+        self,
+        obstacle_fractions: Sequence[float] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5),
+        path_lengths: Sequence[int] = (2, 4, 6, 8, 10, 12, 14, 16),
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+    ) -> None:
+        self.obstacle_fractions = _distinct("obstacle_fractions", obstacle_fractions)
+        self.path_lengths = _distinct("path_lengths", path_lengths)
+        pairs = list(product(self.obstacle_fractions, self.path_lengths))
+        super().__init__(pairs, mechanism, height, width)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(M, N)."""
+        return len(self.obstacle_fractions), len(self.path_lengths)
+
+    def histogram(self, index: Tensor) -> Tensor:
+        """Counts how often each specification occurs.
+
+        Args:
+            index: int64 of any shape, in 0 ... size - 1.
+
+        Returns:
+            int64 ``[M, N]``.
+
+        Raises:
+            ValueError: If a number is out of range.
+        """
+        self._check(index)
+        return index.flatten().bincount(minlength=self.size).unflatten(0, self.shape)
+
+
+Entry = TypeVar("Entry", float, int)
+
+
+def _distinct(name: str, values: Sequence[Entry]) -> tuple[Entry, ...]:
+    if len(set(values)) < len(values):
+        raise ValueError(f"{name} must be distinct, got {list(values)}")
+    return tuple(values)
+
+
+def _target_device(
+    generator: torch.Generator | None, device: torch.device | str | None
+) -> torch.device:
+    if device is not None:
+        return torch.device(device)
+    return torch.device("cpu") if generator is None else generator.device

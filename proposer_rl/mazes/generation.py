@@ -1,0 +1,265 @@
+"""Batched generation of mazes that meet their specification exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from proposer_rl.mazes.levels import Level, LevelSpec
+from proposer_rl.mazes.path_first import draw_path_first
+from proposer_rl.mazes.uniform import draw_uniform
+
+_Draw = Callable[
+    [Tensor, Tensor, int, int, torch.Generator | None, torch.device], tuple[Tensor, Level]
+]
+
+
+class _Mechanism(NamedTuple):
+    draw: _Draw
+    limit: int  # candidates per level after which a specification counts as impossible
+    chunk: int  # candidates drawn at once on a CPU, so that the working set stays in its cache
+    device_chunk: int  # the same on an accelerator, where few large launches are faster
+
+
+_MECHANISMS = {
+    "uniform": _Mechanism(draw_uniform, 200_000, 8_192, 131_072),
+    "path_first": _Mechanism(draw_path_first, 100_000, 2_048, 32_768),
+}
+MECHANISMS = tuple(_MECHANISMS)
+
+
+def generate_levels(
+    obstacle_fraction: float | Sequence[float] | Tensor,
+    path_length: int | Sequence[int] | Tensor,
+    height: int = 10,
+    width: int = 10,
+    mechanism: str = "uniform",
+    generator: torch.Generator | None = None,
+    device: torch.device | str | None = None,
+) -> Level:
+    """Draws one level for each specification, exactly as specified.
+
+    Every level has ``round(obstacle_fraction * H * W)`` obstacles, a free start, a free goal, and a
+    shortest path of ``path_length`` moves. The product is rounded in float64, halves to the even
+    number, from the fraction as it is passed: where a half matters, pass float64.
+
+    - ``uniform``: obstacles uniform over the cells, start uniform over the free cells, goal uniform
+      over the cells at distance ``path_length`` from it; obstacles and start are drawn again
+      until there is such a cell.
+    - ``path_first``: among obstacles only, a random path without shortcuts is carved from a uniform
+      start; then cells are opened in random order, except those that would make the path from
+      start to goal shorter, until the number of obstacles is met; drawn again if it cannot be.
+
+    Args:
+        obstacle_fraction: Fractions in [0, 1), broadcast with ``path_length`` to ``[*B]``.
+        path_length: Whole numbers of moves, at least 1.
+        height: H, cells.
+        width: W, cells.
+        mechanism: ``"uniform"`` or ``"path_first"``.
+        generator: Source of randomness; None for the default one. The levels are drawn on its
+            device, so that they depend on it alone.
+        device: Where the levels are returned; None for that of ``obstacle_fraction`` or
+            ``path_length`` if either is a tensor, else that of the generator, else the CPU.
+
+    Returns:
+        Levels of batch shape ``[*B]``.
+
+    Raises:
+        ValueError: If an argument is invalid, or if a specification is impossible or so rare that
+            the mechanism did not meet it within a bounded number of candidates; the message names
+            the specification.
+    """
+    target = _target_device(obstacle_fraction, path_length, generator, device)
+    fraction, length = _broadcast(obstacle_fraction, path_length)
+    if mechanism not in _MECHANISMS:
+        raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
+    if height < 1 or width < 1:
+        raise ValueError(f"a grid has at least one row and one column, got {height}x{width}")
+    task = _Task(fraction.flatten(), length.flatten(), height, width, mechanism)
+    place = torch.device(target) if generator is None else generator.device
+    levels = task.solve(generator, place)
+    return levels.reshape(fraction.shape).to(target)
+
+
+def check_specifications(
+    specifications: Iterable[tuple[float, int]],
+    height: int = 10,
+    width: int = 10,
+    mechanism: str = "uniform",
+) -> None:
+    """Proves that specifications can be met, by drawing one level of each.
+
+    Draws from a generator of its own, so that it does not disturb any other random state.
+
+    Args:
+        specifications: Pairs (obstacle fraction, path length); see :class:`LevelSpec`.
+        height: H, cells.
+        width: W, cells.
+        mechanism: As in :func:`generate_levels`.
+
+    Raises:
+        ValueError: As :func:`generate_levels`; also if there is no specification.
+    """
+    specs = [LevelSpec(*specification) for specification in specifications]
+    if not specs:
+        raise ValueError("at least one specification is needed")
+    fractions = torch.tensor([spec.obstacle_fraction for spec in specs], dtype=torch.float64)
+    lengths = torch.tensor([spec.path_length for spec in specs])
+    generator = torch.Generator().manual_seed(0)
+    generate_levels(fractions, lengths, height, width, mechanism, generator)
+
+
+class _Task:
+    """The problems of one call, pooled by distinct specification.
+
+    Specifications are in ascending order of path length, as the mechanisms require. All counts are
+    kept on the CPU; only candidates live on the device.
+    """
+
+    def __init__(
+        self, fraction: Tensor, length: Tensor, height: int, width: int, mechanism: str
+    ) -> None:
+        self.grid = (height, width)
+        self.name = mechanism
+        self.mechanism = _MECHANISMS[mechanism]
+        obstacles = (fraction * (height * width)).round()
+        _check_range(fraction, length)
+        base = height * width + 1
+        specs, spec_of = (length * base + obstacles.long()).unique(return_inverse=True)
+        self.length, self.obstacles = specs // base, specs % base  # [S], ascending in length
+        self.order = spec_of.argsort(stable=True)  # problems, grouped by specification
+        self.wanted = spec_of.bincount(minlength=len(specs))  # [S]
+        self.first = self.wanted.cumsum(0) - self.wanted  # of each group in ``order``
+        self.example = fraction[self.order[self.first]]
+        for spec in range(len(specs)):
+            self._check_necessary(spec)
+
+    def solve(self, generator: torch.Generator | None, device: torch.device) -> Level:
+        """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
+        count, (height, width) = self.order.shape[0], self.grid
+        result = Level(
+            walls=torch.empty(count, height, width, dtype=torch.bool, device=device),
+            start=torch.empty(count, 2, dtype=torch.int64, device=device),
+            goal=torch.empty(count, 2, dtype=torch.int64, device=device),
+            batch_size=[count],
+        )
+        drawn, accepted = torch.zeros_like(self.wanted), torch.zeros_like(self.wanted)
+        filled = torch.zeros_like(self.wanted)
+        while (filled < self.wanted).any():
+            share = self._share(self.wanted - filled, drawn, accepted, device)
+            spec_of = torch.arange(len(share)).repeat_interleave(share)  # [C]
+            kept, level = self.mechanism.draw(
+                self.obstacles[spec_of], self.length[spec_of], height, width, generator, device
+            )
+            spec_of = spec_of[kept.cpu()]  # [A]
+            found = spec_of.bincount(minlength=len(share))
+            rank = torch.arange(len(spec_of)) - (found.cumsum(0) - found)[spec_of]
+            slot = filled[spec_of] + rank
+            used = slot < self.wanted[spec_of]
+            problem = self.order[(self.first[spec_of] + slot)[used]].to(device)
+            _copy(level, used.to(device), result, problem)
+            drawn += share
+            accepted += found
+            filled = torch.minimum(filled + found, self.wanted)
+            self._check_rarity(filled, drawn, accepted)
+        return result
+
+    def _share(
+        self, pending: Tensor, drawn: Tensor, accepted: Tensor, device: torch.device
+    ) -> Tensor:
+        """Candidates of each specification to draw next, as many as should fill what is pending.
+
+        The estimated rate is that of a uniform prior (one success and one failure seen in
+        advance), so a specification never met asks for twice as many each time.
+        """
+        rate = (accepted + 1) / (drawn + 2)
+        share = (1.1 * pending / rate).ceil().long() + 2 * (pending > 0)
+        on_cpu = device.type == "cpu"
+        chunk = self.mechanism.chunk if on_cpu else self.mechanism.device_chunk
+        before = share.cumsum(0) - share
+        return share.minimum((chunk - before).clamp(min=0))
+
+    def _check_necessary(self, spec: int) -> None:
+        """Refuses at once what no level can meet."""
+        height, width = self.grid
+        obstacles, length = int(self.obstacles[spec]), int(self.length[spec])
+        free = height * width - obstacles
+        if free < length + 1:
+            self._refuse(spec, f"a path of {length} moves needs {length + 1} free cells of {free}")
+        if obstacles == 0 and length > height + width - 2:
+            self._refuse(
+                spec, f"without obstacles no two cells are over {height + width - 2} moves apart"
+            )
+
+    def _check_rarity(self, filled: Tensor, drawn: Tensor, accepted: Tensor) -> None:
+        """Gives up on what is met less often than once in ``limit`` candidates."""
+        hopeless = (filled < self.wanted) & (drawn > self.mechanism.limit * (accepted + 1))
+        if hopeless.any():
+            spec = int(hopeless.nonzero()[0])
+            self._refuse(
+                spec,
+                f"it is impossible or rarer than 1 in {self.mechanism.limit:,} candidates "
+                f"({int(accepted[spec])} met in {int(drawn[spec]):,})",
+            )
+
+    def _refuse(self, spec: int, reason: str) -> None:
+        height, width = self.grid
+        raise ValueError(
+            f"cannot make levels with obstacle_fraction={self.example[spec].item():g}, "
+            f"path_length={int(self.length[spec])} on a {height}x{width} grid "
+            f"({int(self.obstacles[spec])} obstacles, mechanism {self.name!r}): {reason}"
+        )
+
+
+def _copy(source: Level, mask: Tensor, destination: Level, index: Tensor) -> None:
+    """Writes the masked source levels to the indexed places."""
+    destination.walls[index] = source.walls[mask]
+    destination.start[index] = source.start[mask]
+    destination.goal[index] = source.goal[mask]
+
+
+def _check_range(fraction: Tensor, length: Tensor) -> None:
+    bad = ~((fraction >= 0) & (fraction < 1))
+    if bad.any():
+        value = fraction[bad][0].item()
+        raise ValueError(f"obstacle_fraction must be at least 0 and below 1, got {value:g}")
+    if (length < 1).any():
+        raise ValueError(f"path_length must be at least 1, got {int(length.min())}")
+
+
+def _broadcast(
+    obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Both arguments as float64 and int64 tensors of one shape on the CPU."""
+    if isinstance(obstacle_fraction, Tensor):
+        fraction = obstacle_fraction.detach().to("cpu", torch.float64)
+    else:
+        fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
+    length = torch.as_tensor(path_length).cpu()
+    if length.is_floating_point() or length.dtype == torch.bool:
+        raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
+    try:
+        fraction, length = torch.broadcast_tensors(fraction, length.long())
+    except RuntimeError as error:
+        raise ValueError(
+            f"obstacle_fraction {list(fraction.shape)} and path_length {list(length.shape)} "
+            "must have shapes that broadcast"
+        ) from error
+    return fraction, length
+
+
+def _target_device(
+    obstacle_fraction: object,
+    path_length: object,
+    generator: torch.Generator | None,
+    device: torch.device | str | None,
+) -> torch.device:
+    if device is not None:
+        return torch.device(device)
+    for argument in (obstacle_fraction, path_length):
+        if isinstance(argument, Tensor):
+            return argument.device
+    return torch.device("cpu") if generator is None else generator.device

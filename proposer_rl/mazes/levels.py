@@ -1,0 +1,180 @@
+"""What a maze is: its specification, its cells, and its text and plane forms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+
+WALL, FREE, START, GOAL = "#", ".", "S", "G"
+
+
+class LevelSpec(NamedTuple):
+    """What is asked of a level.
+
+    Attributes:
+        obstacle_fraction: Obstacles per cell, in [0, 1); a grid of H x W cells has exactly
+            ``round(obstacle_fraction * H * W)`` of them.
+        path_length: Moves on the shortest path from start to goal, at least 1.
+    """
+
+    obstacle_fraction: float
+    path_length: int
+
+
+class Level(TensorClass):
+    """Mazes: walls, one start cell and one goal cell each, of any batch shape ``[*B]``.
+
+    Attributes:
+        walls: bool ``[*B, H, W]``, True where a cell is an obstacle.
+        start: int64 ``[*B, 2]``, row and column of the start cell.
+        goal: int64 ``[*B, 2]``, row and column of the goal cell.
+    """
+
+    walls: Tensor
+    start: Tensor
+    goal: Tensor
+
+    @classmethod
+    def from_text(cls, text: str | Sequence[str]) -> Level:
+        """Reads levels drawn with one character per cell.
+
+        Args:
+            text: One drawing (lines of ``#`` wall, ``.`` free, ``S`` start, ``G`` goal; blank
+                lines and indentation are ignored), or a sequence of drawings of equal size.
+
+        Returns:
+            A level of batch shape ``[]``, or ``[n]`` for a sequence of n drawings.
+
+        Raises:
+            ValueError: If a drawing is not a rectangle, holds another character, or does not
+                have exactly one start and one goal; or if the drawings differ in size.
+        """
+        if isinstance(text, str):
+            return _parse(text)
+        levels = [_parse(drawing) for drawing in text]
+        if len({level.walls.shape for level in levels}) != 1:
+            raise ValueError("from_text needs one or more drawings, all of the same size")
+        return torch.stack(levels)  # type: ignore[arg-type, return-value]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Level:
+        return self.clone()
+
+    def to_text(self) -> Any:
+        """Draws the levels with one character per cell; the inverse of :meth:`from_text`.
+
+        Returns:
+            One string for batch shape ``[]``, else a list (of lists) of strings.
+        """
+        if self.batch_dims:
+            return [level.to_text() for level in self.unbind(0)]
+        cells = [[WALL if wall else FREE for wall in row] for row in self.walls.tolist()]
+        for (row, column), mark in ((self.start.tolist(), START), (self.goal.tolist(), GOAL)):
+            cells[row][column] = mark
+        return "\n".join("".join(row) for row in cells)
+
+
+def planes(level: Level) -> Tensor:
+    """Encodes levels as binary planes.
+
+    Args:
+        level: Levels of batch shape ``[*B]``.
+
+    Returns:
+        float32 ``[*B, 3, H, W]``: obstacles, start, goal.
+    """
+    walls = level.walls
+    return torch.stack(
+        [
+            walls.float(),
+            cell_plane(level.start, walls.shape[-2:]),
+            cell_plane(level.goal, walls.shape[-2:]),
+        ],
+        dim=-3,
+    )
+
+
+def cell_plane(cell: Tensor, grid: Sequence[int]) -> Tensor:
+    """Draws one cell of a grid as a binary plane.
+
+    Args:
+        cell: int64 ``[*B, 2]``, row and column.
+        grid: Height and width.
+
+    Returns:
+        float32 ``[*B, H, W]``, 1 at the cell and 0 elsewhere.
+    """
+    height, width = grid
+    plane = torch.zeros(*cell.shape[:-1], height * width, device=cell.device)
+    plane.scatter_(-1, cell_index(cell, width).unsqueeze(-1), 1.0)
+    return plane.unflatten(-1, (height, width))
+
+
+def cell_index(cell: Tensor, width: int) -> Tensor:
+    """Numbers cells row by row: int64 ``[*B, 2]`` (row, column) to int64 ``[*B]``."""
+    return cell[..., 0] * width + cell[..., 1]
+
+
+def cell_position(index: Tensor, width: int) -> Tensor:
+    """Inverse of :func:`cell_index`: int64 ``[*B]`` to int64 ``[*B, 2]`` (row, column)."""
+    return torch.stack([index // width, index % width], dim=-1)
+
+
+def validate_levels(level: Level) -> None:
+    """Checks levels that were made by hand.
+
+    Args:
+        level: Levels of any batch shape.
+
+    Raises:
+        ValueError: If a shape or dtype is wrong, or if a start or goal lies outside the grid or on
+            an obstacle, or if they coincide; the message says which and how many.
+    """
+    batch, walls = level.batch_size, level.walls
+    if walls.dtype != torch.bool or walls.ndim != len(batch) + 2:
+        raise ValueError(
+            f"walls must be bool [*B, H, W] with *B = {list(batch)}, "
+            f"got {walls.dtype} {list(walls.shape)}"
+        )
+    height, width = walls.shape[-2:]
+    limits = torch.tensor([height, width], device=walls.device)
+    for name, cell in (("start", level.start), ("goal", level.goal)):
+        if cell.dtype != torch.int64 or cell.shape != (*batch, 2):
+            raise ValueError(
+                f"{name} must be int64 {[*batch, 2]}, got {cell.dtype} {list(cell.shape)}"
+            )
+        _refuse(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
+        _refuse(
+            walls.flatten(-2).gather(-1, cell_index(cell, width).unsqueeze(-1)),
+            f"{name} on an obstacle",
+        )
+    _refuse((level.start == level.goal).all(-1), "start and goal on the same cell")
+
+
+def _refuse(bad: Tensor, fault: str) -> None:
+    """Raises ValueError where any entry of a bool tensor is set."""
+    count = int(bad.sum())
+    if count:
+        raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
+
+
+def _parse(drawing: str) -> Level:
+    """Reads one drawing; see :meth:`Level.from_text`."""
+    rows = drawing.split()
+    flat = "".join(rows)
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
+        raise ValueError(f"a level is a rectangle of characters, got\n{drawing}")
+    if set(flat) - {WALL, FREE, START, GOAL}:
+        raise ValueError(f"a level holds only '#', '.', 'S' and 'G', got\n{drawing}")
+    if flat.count(START) != 1 or flat.count(GOAL) != 1:
+        raise ValueError(f"a level has exactly one 'S' and one 'G', got\n{drawing}")
+    width = len(rows[0])
+    return Level(
+        walls=torch.tensor([[mark == WALL for mark in row] for row in rows]),
+        start=torch.tensor(divmod(flat.index(START), width)),
+        goal=torch.tensor(divmod(flat.index(GOAL), width)),
+        batch_size=[],
+    )

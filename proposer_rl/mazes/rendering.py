@@ -1,0 +1,121 @@
+"""Pictures of mazes as arrays of colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from proposer_rl.mazes.levels import Level
+
+# Okabe and Ito's palette, which stays distinct under the common forms of colour blindness.
+WALL_COLOUR = (45, 45, 45)
+FREE_COLOUR = (250, 250, 250)
+LINE_COLOUR = (215, 215, 215)
+START_COLOUR = (0, 114, 178)  # blue
+GOAL_COLOUR = (230, 159, 0)  # orange
+PATH_COLOUR = (204, 121, 167)  # reddish purple
+AGENT_COLOUR = (0, 158, 115)  # bluish green
+
+Cells = Sequence[Sequence[int]] | Tensor
+
+
+def draw_level(
+    level: Level, path: Cells | None = None, agent: Sequence[int] | None = None, cell: int = 16
+) -> Tensor:
+    """Draws one level.
+
+    Args:
+        level: A level of batch shape ``[]``.
+        path: Cells (row, column) to connect by a line, ``[T, 2]``; successive cells are equal or
+            share a side.
+        agent: Row and column at which to draw a round agent.
+        cell: Side of a cell in pixels, at least 4.
+
+    Returns:
+        uint8 ``[H * cell + 1, W * cell + 1, 3]`` on the CPU, with lines one pixel wide between
+        cells.
+
+    Raises:
+        ValueError: If the level is batched or the cells are too small.
+    """
+    if level.batch_dims or cell < 4:
+        raise ValueError(
+            f"draw_level takes one level and cells of 4 pixels or more, got batch shape "
+            f"{list(level.batch_size)} and {cell}"
+        )
+    walls = level.walls.cpu()
+    height, width = walls.shape
+    colours = torch.tensor([FREE_COLOUR, WALL_COLOUR], dtype=torch.uint8)[walls.long()]
+    colours[tuple(level.start.tolist())] = torch.tensor(START_COLOUR, dtype=torch.uint8)
+    colours[tuple(level.goal.tolist())] = torch.tensor(GOAL_COLOUR, dtype=torch.uint8)
+    picture = torch.empty(height * cell + 1, width * cell + 1, 3, dtype=torch.uint8)
+    picture[:-1, :-1] = colours.repeat_interleave(cell, 0).repeat_interleave(cell, 1)
+    picture[::cell] = picture[:, ::cell] = torch.tensor(LINE_COLOUR, dtype=torch.uint8)
+    if path is not None:
+        _draw_path(picture, torch.as_tensor(path).cpu(), cell)
+    if agent is not None:
+        row, column = (int(place) for place in agent)
+        _draw_disc(picture, row, column, cell)
+    return picture
+
+
+def draw_grid(
+    levels: Level,
+    paths: Sequence[Cells | None] | Tensor | None = None,
+    columns: int | None = None,
+    cell: int = 16,
+    gap: int = 8,
+) -> Tensor:
+    """Draws several levels side by side.
+
+    Args:
+        levels: Levels of batch shape ``[n]``, n at least 1.
+        paths: One path (or None) for each level.
+        columns: Levels in a row; None for all of them.
+        cell: Side of a cell in pixels.
+        gap: White pixels between levels.
+
+    Returns:
+        uint8 ``[H', W', 3]`` on the CPU.
+
+    Raises:
+        ValueError: If the levels are not ``[n]``, or the number of paths differs from n.
+    """
+    if levels.batch_dims != 1 or not len(levels):
+        raise ValueError(f"draw_grid takes levels [n], got {list(levels.batch_size)}")
+    count = len(levels)
+    if paths is not None and len(paths) != count:
+        raise ValueError(f"draw_grid takes one path for each of {count} levels, got {len(paths)}")
+    columns = min(columns or count, count)
+    tiles = [
+        draw_level(levels[i], None if paths is None else paths[i], cell=cell) for i in range(count)
+    ]
+    height, width = tiles[0].shape[:2]
+    rows = -(-count // columns)
+    shape = (rows * (height + gap) - gap, columns * (width + gap) - gap, 3)
+    sheet = torch.full(shape, 255, dtype=torch.uint8)
+    for i, tile in enumerate(tiles):
+        top, left = i // columns * (height + gap), i % columns * (width + gap)
+        sheet[top : top + height, left : left + width] = tile
+    return sheet
+
+
+def _draw_path(picture: Tensor, path: Tensor, cell: int) -> None:
+    """Connects the centres of successive cells; changes the picture."""
+    centre = path * cell + cell // 2  # [T, 2]
+    half = max(cell // 10, 1)
+    colour = torch.tensor(PATH_COLOUR, dtype=torch.uint8)
+    for here, there in zip(centre, torch.cat([centre[1:], centre[-1:]]), strict=True):
+        top, left = (torch.minimum(here, there) - half).tolist()
+        bottom, right = (torch.maximum(here, there) + half + 1).tolist()
+        picture[top:bottom, left:right] = colour
+
+
+def _draw_disc(picture: Tensor, row: int, column: int, cell: int) -> None:
+    """Draws the agent in its cell; changes the picture."""
+    offset = torch.arange(cell) - cell // 2
+    inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
+    square = picture[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
+    square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)

@@ -1,0 +1,30 @@
+"""Networks and actor-critics of both agents; they know tensors, not mazes."""
+
+from proposer_rl.models.actor_critic import (
+    ActorCritic,
+    categorical,
+    draw,
+    joint_categorical,
+    uniform_noise,
+)
+from proposer_rl.models.population import Population
+from proposer_rl.models.proposer import ProposerNetwork, fourier_encoding, proposer_actor_critic
+from proposer_rl.models.solver import cell_logits, map_actor_critic, read_maps
+from proposer_rl.models.unet import UNet, orthogonal_
+
+__all__ = [
+    "ActorCritic",
+    "Population",
+    "ProposerNetwork",
+    "UNet",
+    "categorical",
+    "cell_logits",
+    "draw",
+    "fourier_encoding",
+    "joint_categorical",
+    "map_actor_critic",
+    "orthogonal_",
+    "proposer_actor_critic",
+    "read_maps",
+    "uniform_noise",
+]

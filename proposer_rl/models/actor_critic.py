@@ -1,0 +1,163 @@
+"""An actor-critic in two parts: what is computed once per level, and what once per step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution, Independent
+
+
+class ActorCritic(TensorDictModuleBase):
+    """Writes action logits and a state value; its ``encoder`` part depends on the level alone.
+
+    Called as a module it is an ordinary TorchRL actor-critic: a tensordict with one observation per
+    step goes in, logits and value come out. Where the encoder's inputs stay the same throughout a
+    rollout, :meth:`encode` runs it once and :meth:`decode` reads the steps off that context, with
+    the same numbers and T times less arithmetic.
+
+    Args:
+        head: reads the encoder's outputs and the observation of a step, writes ``logits_key`` and
+            ``value_key``. With an encoder, every other input may carry time dimensions behind the
+            batch ones, [*B, *T, ...], and the outputs then carry them too.
+        encoder: reads what is constant within a level; None where nothing is.
+        distribution_class: builds the action's distribution from ``logits=``.
+        copies: K if parameters and data carry independent copies as their first dimension
+            (:class:`~proposer_rl.models.Population`), None for a single network.
+        action_key, log_prob_key, logits_key, value_key: the entries' names.
+    """
+
+    def __init__(
+        self,
+        head: TensorDictModuleBase,
+        encoder: TensorDictModuleBase | None = None,
+        *,
+        distribution_class: Callable[..., Distribution] = Categorical,
+        copies: int | None = None,
+        action_key: str = "action",
+        log_prob_key: str = "action_log_prob",
+        logits_key: str = "logits",
+        value_key: str = "state_value",
+    ) -> None:
+        super().__init__()
+        self.head = head
+        self.encoder = encoder
+        self.distribution_class = distribution_class
+        self.copies = copies
+        self.action_key = action_key
+        self.log_prob_key = log_prob_key
+        self.logits_key = logits_key
+        self.value_key = value_key
+        self.level_keys = list(encoder.in_keys) if encoder is not None else []
+        self.context_keys = list(encoder.out_keys) if encoder is not None else []
+        self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
+        self.in_keys = [*self.level_keys, *self.step_keys]
+        self.out_keys = [logits_key, value_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
+        inputs = tensordict.select(*self.in_keys)
+        if self.encoder is not None:
+            inputs = self.encoder(inputs)
+        return tensordict.update(self.head(inputs), keys_to_update=self.out_keys)
+
+    def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The context of levels [*B] (or [K, *B]): what :meth:`decode` needs of them."""
+        if self.encoder is None:
+            return TensorDict({}, tensordict.batch_size, device=tensordict.device)
+        return self.encoder(tensordict.select(*self.level_keys)).select(*self.context_keys)
+
+    def decode(self, tensordict: TensorDictBase, context: TensorDictBase) -> TensorDictBase:
+        """Write logits and values of steps [*B, *T], given their levels' context [*B].
+
+        Without an encoder the context is empty and every step is computed by itself.
+        """
+        inputs = tensordict.select(*self.step_keys)
+        if self.encoder is not None:
+            # The time dimensions become features, so that context and steps share their batch.
+            inputs.batch_size = context.batch_size
+            inputs.update(context)
+        outputs = self.head(inputs)
+        for key in self.out_keys:
+            tensordict.set(key, outputs.get(key))
+        return tensordict
+
+    def distribution(self, tensordict: TensorDictBase) -> Distribution:
+        """The action's distribution, given a tensordict with logits."""
+        return self.distribution_class(logits=tensordict.get(self.logits_key))
+
+    def sampler(self) -> ProbabilisticTensorDictModule:
+        """The module that turns logits into an action and its log-probability."""
+        return ProbabilisticTensorDictModule(
+            in_keys={"logits": self.logits_key},
+            out_keys=[self.action_key],
+            distribution_class=self.distribution_class,
+            return_log_prob=True,
+            log_prob_key=self.log_prob_key,
+        )
+
+    def actor(self) -> ProbabilisticTensorDictSequential:
+        """This actor-critic as a TorchRL policy, for collectors and losses of other code."""
+        return ProbabilisticTensorDictSequential(self, self.sampler())
+
+    def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
+        """Actor and critic that take logits and values as they stand in a tensordict.
+
+        For a TorchRL loss whose caller has run this module already, so that actor and critic share
+        one forward pass.
+        """
+        logits = TensorDictModule(nn.Identity(), [self.logits_key], [self.logits_key])
+        value = TensorDictModule(nn.Identity(), [self.value_key], [self.value_key])
+        return ProbabilisticTensorDictSequential(logits, self.sampler()), value
+
+
+def joint_categorical(logits: Tensor) -> Distribution:
+    """P categorical draws as one event: log-probabilities and entropies are summed over P."""
+    return Independent(Categorical(logits=logits, validate_args=False), 1)
+
+
+def categorical(logits: Tensor) -> Distribution:
+    """Categorical draws, each an event of its own."""
+    return Categorical(logits=logits, validate_args=False)
+
+
+def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
+    """Sample by inverting the cumulative distribution function at ``uniform``.
+
+    Torch's distributions take no generator. This way the random numbers are data, which can be
+    drawn for a whole rollout at once and from one generator per copy.
+
+    Args:
+        distribution: categorical, or any other with ``icdf``; possibly ``Independent``.
+        uniform: numbers in [0, 1), one for each element of a sample.
+    """
+    if isinstance(distribution, Independent):
+        return draw(distribution.base_dist, uniform)
+    if isinstance(distribution, Categorical):
+        cumulative = distribution.probs.cumsum(-1)
+        threshold = uniform.unsqueeze(-1) * cumulative[..., -1:]
+        index = (cumulative <= threshold).sum(-1)
+        return index.clamp_(max=cumulative.shape[-1] - 1)
+    return distribution.icdf(uniform)
+
+
+def uniform_noise(
+    shape: torch.Size, steps: int, generators: list[torch.Generator] | None, device: torch.device
+) -> Tensor:
+    """Uniform numbers [T, *shape] for T steps; slice [:, k] comes from the k-th generator.
+
+    Without generators all of it comes from torch's default one.
+    """
+    if generators is None:
+        return torch.rand(steps, *shape, device=device)
+    return torch.stack(
+        [torch.rand(steps, *shape[1:], generator=g, device=device) for g in generators], 1
+    )

@@ -1,0 +1,89 @@
+"""The Solver: a network over whole levels whose maps are read at the agent's cell."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from proposer_rl.models.actor_critic import ActorCritic, categorical
+from proposer_rl.models.population import Population
+
+
+def map_actor_critic(
+    network: nn.Module,
+    *,
+    per_step: bool = False,
+    planes_key: str = "planes",
+    agent_key: str = "agent",
+) -> ActorCritic:
+    """Actor-critic of a network that maps planes [*B, C, H, W] to action and value maps.
+
+    Args:
+        network: returns logits [*B, A, H, W] and values [*B, 1, H, W]; a
+            :class:`~proposer_rl.models.Population` of such networks takes B = [K, ...].
+        per_step: True if the planes change from step to step (the agent is drawn on one of them);
+            False if they belong to the level, which then costs one forward pass per rollout.
+        planes_key: entry of the planes.
+        agent_key: entry of the agent's row and column, int64 [*B, 2].
+    """
+    maps = TensorDictModule(network, [planes_key], ["policy_map", "value_map"])
+    head = TensorDictModule(
+        read_maps, ["policy_map", "value_map", agent_key], ["logits", "state_value"]
+    )
+    copies = network.copies if isinstance(network, Population) else None
+    build = partial(ActorCritic, distribution_class=categorical, copies=copies)
+    if not per_step:
+        return build(head, maps)
+    head = TensorDictSequential(maps, head, selected_out_keys=["logits", "state_value"])
+    return build(head)
+
+
+def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Tensor, Tensor]:
+    """Read logits and values at the agents' cells.
+
+    Args:
+        policy_map: float [*B, A, H, W].
+        value_map: float [*B, 1, H, W].
+        agent: int64 rows and columns, [*B, 2] or [*B, *T, 2] for several steps of each level.
+
+    Returns:
+        Logits [*B, *T, A] and values [*B, *T, 1].
+    """
+    maps = torch.cat([policy_map, value_map], -3).flatten(-2)  # [*B, A + 1, H * W]
+    levels = maps.shape[:-2]
+    cell = agent[..., 0] * policy_map.shape[-1] + agent[..., 1]  # [*B, *T]
+    index = cell.reshape(*levels, 1, -1).expand(*levels, maps.shape[-2], -1)
+    read = maps.gather(-1, index).transpose(-1, -2).reshape(*cell.shape, -1)  # [*B, *T, A + 1]
+    return read[..., :-1], read[..., -1:]
+
+
+@torch.no_grad()
+def cell_logits(solver: ActorCritic, planes: Tensor) -> Tensor:
+    """Action logits at every cell of levels: what the Solver would do wherever it stood.
+
+    Args:
+        solver: from :func:`map_actor_critic`.
+        planes: the levels without the agent, float [*B, C, H, W], with copies [K, *B, C, H, W].
+
+    Returns:
+        float [*B, A, H, W].
+    """
+    batch = planes.shape[:-3]
+    if solver.encoder is not None:
+        (planes_key,) = solver.level_keys
+        return solver.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
+    planes_key, agent_key = solver.step_keys
+    height, width = planes.shape[-2:]
+    cells = []
+    for row in range(height):
+        for column in range(width):
+            drawn = torch.zeros_like(planes[..., :1, :, :])
+            drawn[..., row, column] = 1.0
+            agent = torch.tensor([row, column], device=planes.device).expand(*batch, 2)
+            step = {planes_key: torch.cat([planes, drawn], -3), agent_key: agent}
+            cells.append(solver(TensorDict(step, batch))["logits"])
+    return torch.stack(cells, -1).unflatten(-1, (height, width))

@@ -1,0 +1,325 @@
+"""Proximal policy optimisation of one agent, or of K independent copies of it at once.
+
+TorchRL's ``Collector``, ``GAE`` and ``ClipPPOLoss`` do the work. What is added here: the level's
+context is computed once per rollout and once per epoch, K copies train in one leading dimension as
+if each were alone, and everything that training changes can be taken out and put back.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import torch
+from annotated_types import Ge, Gt, Interval
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from proposer_rl.models import ActorCritic, draw, uniform_noise
+from proposer_rl.settings import settings
+
+
+class Update(NamedTuple):
+    """What one PPO update was made of: the rollout [*B, T] and the scalars of its training."""
+
+    rollout: TensorDictBase
+    metrics: TensorDict
+
+
+@settings
+class PPOSettings:
+    """PPO's numbers; the defaults are the paper's for the Solver.
+
+    Attributes:
+        horizon: steps T collected from every environment before an update.
+        updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
+        epochs: gradient steps of an update, each on the full batch.
+        learning_rate, adam_eps: Adam's step size and denominator offset.
+        gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
+        clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
+        entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
+        max_grad_norm: largest gradient norm of one copy.
+        normalize_advantage: standardise advantages over each copy's batch.
+    """
+
+    horizon: Annotated[int, Ge(1)] = 25
+    updates: Annotated[int, Ge(1)] = 1
+    epochs: Annotated[int, Ge(1)] = 8
+    learning_rate: Annotated[float, Gt(0)] = 2.5e-4
+    adam_eps: Annotated[float, Gt(0)] = 1e-5
+    gamma: Annotated[float, Interval(ge=0, le=1)] = 0.99
+    lmbda: Annotated[float, Interval(ge=0, le=1)] = 0.95
+    clip_epsilon: Annotated[float, Interval(gt=0, lt=1)] = 0.2
+    entropy_coeff: Annotated[float, Ge(0)] = 0.01
+    critic_coeff: Annotated[float, Ge(0)] = 0.5
+    max_grad_norm: Annotated[float, Gt(0)] = 1.0
+    normalize_advantage: bool = True
+
+
+class PPO:
+    """An agent, the environment it acts in, and its optimiser.
+
+    Args:
+        env: batch [*B]; with copies, B = [K, ...]. Entries that the agent's encoder reads must
+            stay the same until the environment is reset.
+        agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
+            independent copies, which decides over what losses, advantages and norms are taken.
+        settings: PPO's numbers.
+
+    Raises:
+        ValueError: if the environment's first dimension is not the agent's number of copies.
+    """
+
+    def __init__(self, env: EnvBase, agent: ActorCritic, settings: PPOSettings) -> None:
+        if agent.copies is not None and env.batch_size[:1] != (agent.copies,):
+            raise ValueError(
+                f"the agent has {agent.copies} copies, so the environment's first dimension must "
+                f"be {agent.copies}; its batch size is {list(env.batch_size)}"
+            )
+        self.env = env
+        self.agent = agent
+        self.settings = settings
+        self._policy = _RolloutPolicy(agent)
+        self._collector = Collector(
+            _without(env, agent.level_keys),
+            self._policy,
+            frames_per_batch=env.batch_size.numel() * settings.horizon,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            use_buffers=False,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        self._gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None)
+        actor, critic = agent.readout()
+        self._loss = ClipPPOLoss(
+            actor,
+            critic,
+            clip_epsilon=settings.clip_epsilon,
+            entropy_coeff=settings.entropy_coeff,
+            critic_coeff=settings.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=settings.normalize_advantage,
+            normalize_advantage_exclude_dims=() if agent.copies is None else (0,),
+            functional=False,
+            reduction="none",
+            # TorchRL's takes the variance over the first dimension alone; see _gradient_step.
+            log_explained_variance=False,
+        )
+        self._loss.set_keys(
+            action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
+        )
+        self._parameters = list(agent.parameters())
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=settings.learning_rate, eps=settings.adam_eps, fused=True
+        )
+        self._start_adam()
+
+    def update(self, generators: list[torch.Generator] | None = None) -> Update:
+        """Collect one batch and train on it.
+
+        Args:
+            generators: see :meth:`collect`.
+        """
+        rollout = self.collect(generators)
+        return Update(rollout, self.optimise(rollout))
+
+    def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
+        """Reset the environment and act for a horizon.
+
+        Args:
+            generators: one for each index of the environment's first dimension, from which its
+                actions are drawn; None for torch's default generator.
+
+        Returns:
+            A complete TorchRL rollout [*B, T]: observations (those of the level expanded along
+            time, which takes no memory), actions, log-probabilities, values and ``next``.
+        """
+        with torch.no_grad():
+            level = self.env.reset().select(*self.agent.level_keys)
+            context = self.agent.encode(level)
+            shape = self.env.full_action_spec[self.agent.action_key].shape
+            noise = uniform_noise(shape, self.settings.horizon, generators, level.device)
+            self._policy.begin(context, noise)
+            rollout = self._collector.rollout()
+            self._set_next_values(rollout, context)
+        for key, entry in level.items(include_nested=True, leaves_only=True):
+            along_time = entry.unsqueeze(level.ndim)
+            rollout.set(key, along_time.expand(*rollout.shape, *entry.shape[level.ndim :]))
+        return rollout
+
+    def optimise(self, rollout: TensorDictBase) -> TensorDict:
+        """Train on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
+
+        Writes ``advantage`` and ``value_target`` into the rollout.
+
+        Returns:
+            Scalars averaged over the gradient steps: ``loss_objective``, ``loss_entropy``,
+            ``loss_critic`` (the mean over copies of their weighted losses), ``entropy``,
+            ``kl_approx``, ``clip_fraction``, ``explained_variance`` and ``grad_norm``.
+        """
+        level = rollout.select(*self.agent.level_keys)[..., 0]
+        steps = []
+        for update in range(self.settings.updates):
+            if update:
+                self._set_values(rollout, level)
+            self._gae(rollout)
+            batch = rollout.select(
+                *self.agent.step_keys,
+                self.agent.action_key,
+                self.agent.log_prob_key,
+                "advantage",
+                "value_target",
+            )
+            steps += [self._gradient_step(batch, level) for _ in range(self.settings.epochs)]
+        return torch.stack(steps).mean(0)
+
+    def snapshot(self) -> TensorDict:
+        """A copy of weights and Adam's state, batch [K] with copies and [] without.
+
+        ``snapshot[k]`` is copy ``k``; ``snapshot[[k] * 16]`` is 16 copies of it.
+        """
+        batch = self._batch
+        entries: dict[str, TensorDict] = {}
+        for name, parameter in self.agent.named_parameters():
+            state = self._adam.state[parameter]
+            entries[name] = TensorDict(
+                {
+                    "value": parameter.detach().clone(),
+                    "exp_avg": state["exp_avg"].clone(),
+                    "exp_avg_sq": state["exp_avg_sq"].clone(),
+                    "step": state["step"].expand(batch).clone(),
+                },
+                batch,
+            )
+        return TensorDict(entries, batch)
+
+    def restore(self, snapshot: TensorDictBase) -> None:
+        """Put a snapshot of as many copies back.
+
+        Raises:
+            ValueError: if its batch, a parameter's name or shape, or Adam's steps do not fit.
+        """
+        if snapshot.batch_size != self._batch:
+            raise ValueError(
+                f"the snapshot must have batch size {list(self._batch)}, "
+                f"got {list(snapshot.batch_size)}"
+            )
+        names = [name for name, _ in self.agent.named_parameters()]
+        if sorted(names) != sorted(snapshot.keys()):
+            raise ValueError("the snapshot belongs to another network: its parameters differ")
+        for name, parameter in self.agent.named_parameters():
+            entry = snapshot[name]
+            step = entry["step"].flatten()
+            if entry["value"].shape != parameter.shape or not bool((step == step[0]).all()):
+                raise ValueError(f"the snapshot's {name} does not fit: another shape or Adam step")
+            state = self._adam.state[parameter]
+            parameter.data.copy_(entry["value"])
+            state["exp_avg"].copy_(entry["exp_avg"])
+            state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
+            state["step"].copy_(step[0])
+
+    @property
+    def _batch(self) -> torch.Size:
+        return torch.Size([] if self.agent.copies is None else [self.agent.copies])
+
+    def _start_adam(self) -> None:
+        # Adam makes its state at the first step; made at once, a snapshot is always complete.
+        for parameter in self._parameters:
+            self._adam.state[parameter] = {
+                "step": torch.zeros((), device=parameter.device),
+                "exp_avg": torch.zeros_like(parameter),
+                "exp_avg_sq": torch.zeros_like(parameter),
+            }
+
+    @torch.no_grad()
+    def _set_values(self, rollout: TensorDictBase, level: TensorDictBase) -> None:
+        context = self.agent.encode(level)
+        steps = self.agent.decode(rollout.select(*self.agent.step_keys), context)
+        rollout.set(self.agent.value_key, steps.get(self.agent.value_key))
+        self._set_next_values(rollout, context)
+
+    def _set_next_values(self, rollout: TensorDictBase, context: TensorDictBase) -> None:
+        after = self.agent.decode(rollout.get("next").select(*self.agent.step_keys), context)
+        rollout.set(("next", self.agent.value_key), after.get(self.agent.value_key))
+
+    def _gradient_step(self, batch: TensorDictBase, level: TensorDictBase) -> TensorDict:
+        steps = self.agent.decode(batch.copy(), self.agent.encode(level))
+        losses = self._loss(steps)
+        # [K] or []: each copy's loss is the mean over its own batch, as if it were alone.
+        terms = {
+            key: losses[key].flatten(len(self._batch)).mean(-1)
+            for key in ("loss_objective", "loss_entropy", "loss_critic")
+        }
+        self._adam.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, self.agent.copies)
+        self._adam.step()
+        metrics = {key: term.detach().mean() for key, term in terms.items()}
+        for key in ("entropy", "kl_approx", "clip_fraction"):
+            metrics[key] = losses[key].detach().mean()
+        value = steps.get(self.agent.value_key).detach()
+        metrics["explained_variance"] = self._explained_variance(value, steps["value_target"])
+        return TensorDict({**metrics, "grad_norm": norm.mean()})
+
+    def _explained_variance(self, value: Tensor, target: Tensor) -> Tensor:
+        """Share of the targets' variance that the values explain, the mean over copies."""
+        residual, total = (
+            x.flatten(len(self._batch)).var(-1, correction=0) for x in (target - value, target)
+        )
+        return (1 - residual / total.clamp_min(1e-12)).mean()
+
+
+class _RolloutPolicy(TensorDictModuleBase):
+    """What the collector calls: reads the steps off the context and draws actions from noise."""
+
+    def __init__(self, agent: ActorCritic) -> None:
+        super().__init__()
+        # In a tuple: the agent's parameters are not the policy's, so the collector leaves them be.
+        self._agent = (agent,)
+        self.in_keys = agent.step_keys
+        self.out_keys = [agent.action_key, agent.log_prob_key, agent.value_key]
+
+    def begin(self, context: TensorDictBase, noise: Tensor) -> None:
+        self._context = context
+        self._noise = iter(noise)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        (agent,) = self._agent
+        step = agent.decode(tensordict.select(*agent.step_keys), self._context)
+        distribution = agent.distribution(step)
+        action = draw(distribution, next(self._noise))
+        tensordict.set(agent.action_key, action)
+        tensordict.set(agent.log_prob_key, distribution.log_prob(action))
+        return tensordict.set(agent.value_key, step.get(agent.value_key))
+
+
+def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
+    """Scale gradients (in place) so that no copy's norm exceeds ``max_norm``.
+
+    Args:
+        parameters: with copies, each [K, ...].
+        max_norm: largest norm over all parameters of one copy.
+        copies: K, or None if the parameters belong to a single network.
+
+    Returns:
+        The norms before clipping, [K] or [].
+    """
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    if copies is None:
+        return nn.utils.clip_grad_norm_(parameters, max_norm)
+    squares = torch.stack([g.flatten(1).square().sum(1) for g in gradients])
+    norm = squares.sum(0).sqrt()  # [K]
+    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+    for gradient in gradients:
+        gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
+    return norm
+
+
+def _without(env: EnvBase, keys: list[str]) -> EnvBase:
+    """The environment without entries that the collector would copy at every step."""
+    return TransformedEnv(env, ExcludeTransform(*keys)) if keys else env

@@ -1,0 +1,276 @@
+"""The maze task: all that the maze-free training loops need to know of mazes, from settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import torch
+from annotated_types import Ge, Interval, Len
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator
+from proposer_rl.mazes import (
+    Level,
+    LevelDistribution,
+    MazeEnv,
+    SpecificationSpace,
+    planes,
+    shortest_path_length,
+)
+from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.rewards import first_episode_success
+from proposer_rl.settings import settings
+from proposer_rl.streams import Streams
+
+ACTIONS = 4
+RECORDED_LEVELS = 8
+
+Mechanism = Literal["uniform", "path_first"]
+Fraction = Annotated[float, Interval(ge=0, lt=1)]
+PathLength = Annotated[int, Ge(1)]
+
+
+@settings
+class MazeSettings:
+    """The inner environment.
+
+    Attributes:
+        height, width: the grid, in cells.
+        max_steps: steps after which an episode is truncated.
+        step_penalty: what every step costs.
+        observe_agent: draw the agent on a fourth plane; then every step needs its own forward pass.
+    """
+
+    height: Annotated[int, Ge(1)] = 10
+    width: Annotated[int, Ge(1)] = 10
+    max_steps: Annotated[int, Ge(1)] = 25
+    step_penalty: Annotated[float, Ge(0)] = 0.01
+    observe_agent: bool = False
+
+
+@settings
+class DistributionSettings:
+    """Levels drawn evenly from (obstacle fraction, path length) pairs, by one mechanism."""
+
+    specifications: Annotated[list[tuple[Fraction, PathLength]], Len(1)]
+    mechanism: Mechanism = "uniform"
+
+
+@settings
+class SpaceSettings:
+    """The Proposer's choices: every obstacle fraction with every path length."""
+
+    obstacle_fractions: Annotated[list[Fraction], Len(1)]
+    path_lengths: Annotated[list[PathLength], Len(1)]
+    mechanism: Mechanism = "uniform"
+
+
+@settings
+class SolverSettings:
+    """The Solver's U-Net and how it is trained.
+
+    Attributes:
+        channels: of each resolution, finest first.
+        groups: of every GroupNorm; divides each of the channels.
+        policy_gain, value_gain: gains of the heads' orthogonal initialisation.
+        problems: levels P of an update.
+        ppo: PPO's numbers.
+    """
+
+    channels: Annotated[list[Annotated[int, Ge(1)]], Len(1)]
+    groups: Annotated[int, Ge(1)] = 8
+    policy_gain: Annotated[float, Ge(0)] = 0.01
+    value_gain: Annotated[float, Ge(0)] = 1.0
+    problems: Annotated[int, Ge(1)] = 128
+    ppo: PPOSettings = PPOSettings()
+
+
+@settings
+class EvaluationSettings:
+    """How the Solver is measured, apart from its training.
+
+    Attributes:
+        levels: number of levels of each distribution, the same in every run.
+        seed: from which they are drawn.
+        reward: evaluator of the Proposer's validation levels: exact, or Monte-Carlo episodes.
+        episodes: Monte-Carlo episodes per level.
+    """
+
+    levels: Annotated[int, Ge(1)] = 512
+    seed: Annotated[int, Ge(0)] = 0
+    reward: Literal["exact", "rollout"] = "exact"
+    episodes: Annotated[int, Ge(1)] = 1
+
+
+class MazeTask:
+    """Solvers, levels and measurements of one maze configuration.
+
+    Args:
+        maze: the inner environment.
+        distributions: by name; all are measured on.
+        target: the name of the one that the Solver is to master.
+        space: the Proposer's choices.
+        solver: network and training of the Solver.
+        evaluation: measurements.
+        device: where everything lives.
+        precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
+
+    Raises:
+        ValueError: if ``target`` is no distribution, or levels cannot be made as specified.
+    """
+
+    def __init__(
+        self,
+        *,
+        maze: MazeSettings,
+        distributions: Mapping[str, DistributionSettings],
+        target: str,
+        space: SpaceSettings,
+        solver: SolverSettings,
+        evaluation: EvaluationSettings,
+        device: torch.device | str = "cpu",
+        precision: str = "fp32",
+    ) -> None:
+        if target not in distributions:
+            raise ValueError(f"target must be one of {sorted(distributions)}, got {target!r}")
+        self.maze = maze
+        self.solver = solver
+        self.device = torch.device(device)
+        self.precision = precision
+        grid = (maze.height, maze.width)
+        self.distributions = {
+            name: LevelDistribution(d.specifications, d.mechanism, *grid)
+            for name, d in distributions.items()
+        }
+        self.target = self.distributions[target]
+        self.space = SpecificationSpace(
+            space.obstacle_fractions, space.path_lengths, space.mechanism, *grid
+        )
+        rules = (maze.max_steps, maze.step_penalty)
+        self._sampled = ExactEvaluator(*rules)
+        self._greedy = ExactEvaluator(*rules, greedy=True)
+        self._reward_evaluator: ExactEvaluator | RolloutEvaluator = (
+            self._sampled
+            if evaluation.reward == "exact"
+            else RolloutEvaluator(*rules, episodes=evaluation.episodes)
+        )
+        self._measured_on = {
+            name: distribution.sample(
+                evaluation.levels,
+                Streams(evaluation.seed, "evaluation", name).generator(),
+                device=self.device,
+            )
+            for name, distribution in self.distributions.items()
+        }
+
+    def solvers(self, streams: Sequence[Streams]) -> PPO:
+        """A population with one Solver for each of K streams, and its environment [K, P]."""
+        copies, problems = len(streams), self.solver.problems
+        weights = iter(streams)
+
+        def make() -> nn.Module:
+            with next(weights).as_default("weights"):
+                return UNet(
+                    in_channels=4 if self.maze.observe_agent else 3,
+                    head_channels=(ACTIONS, 1),
+                    channels=self.solver.channels,
+                    groups=self.solver.groups,
+                    head_gains=(self.solver.policy_gain, self.solver.value_gain),
+                )
+
+        network = Population(make, copies, self.precision).to(self.device)
+        agent = map_actor_critic(network, per_step=self.maze.observe_agent)
+        # Placeholders of the right shape; every update sets its own levels.
+        level = self._measured_on[next(iter(self._measured_on))][:1]
+        env = MazeEnv(
+            level.expand(copies, problems),
+            max_steps=self.maze.max_steps,
+            step_penalty=self.maze.step_penalty,
+            observe_agent=self.maze.observe_agent,
+        )
+        return PPO(env, agent, self.solver.ppo)
+
+    def generate(self, choices: Tensor, generators: list[torch.Generator]) -> Level:
+        """Levels [K, P] of the Proposer's choices, int64 [K, P]."""
+        levels: list[Any] = [
+            self.space.generate(choice, generator)
+            for choice, generator in zip(choices, generators, strict=True)
+        ]
+        stacked: Any = torch.stack(levels)
+        return stacked
+
+    def sample_target(self, count: int, generator: torch.Generator) -> Level:
+        """Levels [count] of the target distribution."""
+        return self.target.sample(count, generator)
+
+    def sample_space(self, count: int, generator: torch.Generator) -> Level:
+        """Levels [count], evenly from the Proposer's space."""
+        return self.space.sample(count, generator)
+
+    def evaluate(
+        self, solver: ActorCritic, levels: Level, generator: torch.Generator
+    ) -> TensorDictBase:
+        """Return and success of K Solvers on levels [E], [K, E], as the reward counts them."""
+        return self._reward_evaluator(*_with_logits(solver, levels), generator)
+
+    def probe(self, solver: ActorCritic, levels: Level) -> Tensor:
+        """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
+        copies, logits = _with_logits(solver, levels)
+        return torch.cat([planes(copies), logits], -3)
+
+    def measure(self, solver: ActorCritic) -> TensorDict:
+        """Exact means over the fixed levels of every distribution, each [K].
+
+        Entries, for each distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
+        policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one.
+        """
+        results: dict[str, Tensor] = {}
+        for name, levels in self._measured_on.items():
+            copies, logits = _with_logits(solver, levels)
+            for policy, evaluator in (("", self._sampled), ("greedy_", self._greedy)):
+                for key, value in evaluator(copies, logits).items():
+                    results[f"{name}_{policy}{key}"] = value.mean(1)
+        return TensorDict(results, [solver.copies])
+
+    def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
+        """What the Solvers trained on and how they fared there, each [K] from [K, P]."""
+        lengths = shortest_path_length(levels).float()
+        return TensorDict(
+            {
+                "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
+                "path_length": lengths.mean(-1),
+                "path_length_sd": lengths.std(-1, correction=0),
+                "train_success": first_episode_success(rollout).float().mean(-1),
+            },
+            levels.batch_size[:1],
+        )
+
+    def records(self, levels: Level, rollout: TensorDictBase) -> list[list[dict[str, Any]]]:
+        """The first levels of each copy's batch and the Solver's first episode there, for JSON."""
+        return [
+            [
+                {
+                    "level": levels[copy, problem].to_text().splitlines(),
+                    "path": _first_episode(rollout[copy, problem]),
+                }
+                for problem in range(min(RECORDED_LEVELS, levels.batch_size[1]))
+            ]
+            for copy in range(levels.batch_size[0])
+        ]
+
+
+def _with_logits(solver: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
+    """Levels [E] once for each of K Solvers, [K, E], with the logits of every cell."""
+    copies = levels.expand(solver.copies, *levels.batch_size)
+    return copies, cell_logits(solver, planes(copies))
+
+
+def _first_episode(steps: TensorDictBase) -> list[list[int]]:
+    """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
+    ended = steps["next", "done"].squeeze(-1).tolist()
+    count = ended.index(True) + 1 if True in ended else len(ended)
+    cells = steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()
+    return cells

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from proposer_rl.mazes import Level, draw_grid, draw_level
+from proposer_rl.mazes.rendering import (
+    AGENT_COLOUR,
+    FREE_COLOUR,
+    GOAL_COLOUR,
+    LINE_COLOUR,
+    PATH_COLOUR,
+    START_COLOUR,
+    WALL_COLOUR,
+)
+
+LEVEL = Level.from_text("S.#\n..G")
+COLOURS = {"S": START_COLOUR, "G": GOAL_COLOUR, "#": WALL_COLOUR, ".": FREE_COLOUR}
+
+
+def colour(picture: torch.Tensor, row: int, column: int, cell: int) -> tuple[int, ...]:
+    """At the centre of a cell."""
+    return tuple(picture[row * cell + cell // 2, column * cell + cell // 2].tolist())
+
+
+@pytest.mark.parametrize("cell", [4, 7, 16])
+def test_cells_have_their_colours(cell: int) -> None:
+    picture = draw_level(LEVEL, cell=cell)
+    assert (picture.shape, picture.dtype) == ((2 * cell + 1, 3 * cell + 1, 3), torch.uint8)
+    for row, line in enumerate(LEVEL.to_text().split("\n")):
+        for column, mark in enumerate(line):
+            assert colour(picture, row, column, cell) == COLOURS[mark]
+    assert tuple(picture[cell, 1].tolist()) == tuple(picture[1, -1].tolist()) == LINE_COLOUR
+
+
+def test_path_connects_cells_and_leaves_the_others() -> None:
+    path = [(0, 0), (0, 1), (1, 1), (1, 1)]
+    picture = draw_level(LEVEL, path, cell=10)
+    for cell in path:
+        assert colour(picture, *cell, 10) == PATH_COLOUR
+    assert tuple(picture[5, 10].tolist()) == PATH_COLOUR  # also on the line between two cells
+    assert colour(picture, 1, 0, 10) == FREE_COLOUR
+    assert colour(picture, 1, 2, 10) == GOAL_COLOUR
+    assert torch.equal(picture, draw_level(LEVEL, torch.tensor(path), cell=10))
+
+
+def test_agent_lies_within_its_cell() -> None:
+    plain, picture = draw_level(LEVEL, cell=12), draw_level(LEVEL, agent=[1, 1], cell=12)
+    changed = (plain != picture).any(-1).nonzero()
+    assert colour(picture, 1, 1, 12) == AGENT_COLOUR
+    assert changed.amin(0).tolist() > [12, 12] and changed.amax(0).tolist() < [24, 24]
+
+
+def test_grid_tiles_levels_row_by_row() -> None:
+    levels = Level.from_text(["S.#\n..G", "G.#\n..S", "S..\nG##"])
+    paths = [None, [(0, 0), (0, 1)], None]
+    sheet = draw_grid(levels, paths, columns=2, cell=8, gap=3)
+    height, width = 17, 25
+    assert sheet.shape == (2 * height + 3, 2 * width + 3, 3)
+    corners = [(0, 0), (0, width + 3), (height + 3, 0)]
+    for level, path, (top, left) in zip(levels, paths, corners, strict=True):
+        tile = sheet[top : top + height, left : left + width]
+        assert torch.equal(tile, draw_level(level, path, cell=8))
+    assert (sheet[height + 3 :, width:] == 255).all() and (sheet[height : height + 3] == 255).all()
+    assert draw_grid(levels, cell=8, gap=3).shape == (height, 3 * width + 6, 3)
+
+
+def test_wrong_shapes_are_refused() -> None:
+    levels = Level.from_text(["S.G", "G.S"])
+    with pytest.raises(ValueError, match=r"\[2\]"):
+        draw_level(levels)
+    with pytest.raises(ValueError, match="3"):
+        draw_level(levels[0], cell=3)
+    with pytest.raises(ValueError, match=r"\[\]"):
+        draw_grid(levels[0])
+    with pytest.raises(ValueError, match="2 levels, got 1"):
+        draw_grid(levels, [None])

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from proposer_rl.models import UNet
+
+
+@pytest.mark.parametrize(("height", "width"), [(10, 10), (4, 4), (13, 7), (21, 21)])
+def test_maps_have_the_resolution_of_the_input(height: int, width: int) -> None:
+    policy, value = UNet(channels=(8, 16, 16), groups=4)(torch.rand(2, 3, height, width))
+    assert policy.shape == (2, 4, height, width)
+    assert value.shape == (2, 1, height, width)
+
+
+def test_leading_dimensions_are_a_batch() -> None:
+    network = UNet(channels=(8, 16, 16), groups=4)
+    planes = torch.rand(2, 3, 3, 6, 6)
+    policy, _ = network(planes)
+    single, _ = network(planes[1, 2])
+    torch.testing.assert_close(policy[1, 2], single)
+
+
+def test_parameters_of_the_papers_network() -> None:
+    def double(fan_in: int, out: int) -> int:
+        return 9 * fan_in * out + 9 * out * out + 2 * out + 4 * out  # weights, biases, norms
+
+    expected = (
+        double(3, 64) + double(64, 128) + double(128, 256)
+        + double(256 + 128, 128) + double(128 + 64, 64)
+        + 64 * 5 + 5
+    )  # fmt: skip
+    assert sum(p.numel() for p in UNet().parameters()) == expected == 1_885_957
+
+
+def test_every_layer_is_orthogonal() -> None:
+    network = UNet(channels=(8, 16, 16), groups=4, head_gains=(0.01, 1.0))
+    gains = {id(network.heads[0]): 0.01, id(network.heads[1]): 1.0}
+    layers = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
+    assert len(layers) == 12
+    for layer in layers:
+        weight = layer.weight.detach().flatten(1)
+        if weight.shape[0] > weight.shape[1]:
+            weight = weight.T
+        square = gains.get(id(layer), 2**0.5) ** 2 * torch.eye(len(weight))
+        torch.testing.assert_close(weight @ weight.T, square, rtol=1e-4, atol=1e-5)
+        assert layer.bias is not None and not layer.bias.any()
+
+
+def test_refuses_channels_that_groups_do_not_divide() -> None:
+    with pytest.raises(ValueError, match=r"multiples of groups=8, got \[12, 16\]"):
+        UNet(channels=(12, 16), groups=8)

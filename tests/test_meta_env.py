@@ -1,0 +1,173 @@
+"""The meta-environment against a plain loop that trains one Solver."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from proposer_rl.evaluation import ExactEvaluator
+from proposer_rl.mazes import Level, MazeEnv, SpecificationSpace, planes
+from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.rewards import Reward, performance_gain, task_difficulty
+from proposer_rl.streams import Streams
+
+K, P, C, E, L = 3, 4, 2, 6, 5
+SPACE = SpecificationSpace([0.0, 0.2], [2, 4], height=5, width=5)
+EVALUATE = ExactEvaluator(max_steps=8)
+
+
+def target(count: int, generator: torch.Generator) -> Level:
+    return SPACE.generate(torch.full((count,), 3), generator)
+
+
+def generate(choices: torch.Tensor, generators: list[torch.Generator]) -> Level:
+    return torch.stack([SPACE.generate(c, g) for c, g in zip(choices, generators, strict=True)])
+
+
+def evaluate(solver, levels: Level, generator: torch.Generator) -> TensorDict:
+    copies = levels.expand(solver.copies, *levels.batch_size)
+    return EVALUATE(copies, cell_logits(solver, planes(copies)))
+
+
+def probe(solver, levels: Level) -> torch.Tensor:
+    drawn = planes(levels.expand(solver.copies, *levels.batch_size))
+    return torch.cat([drawn, cell_logits(solver, drawn)], -3)
+
+
+def solvers(copies: int, learning_rate: float = 3e-3) -> PPO:
+    torch.manual_seed(0)
+    population = Population(lambda: UNet(channels=(8, 8), groups=4), copies)
+    env = MazeEnv(SPACE.sample((copies, P)), max_steps=8)
+    settings = PPOSettings(horizon=8, epochs=2, learning_rate=learning_rate)
+    return PPO(env, map_actor_critic(population), settings)
+
+
+def meta_env(reward: Reward = performance_gain, **options) -> SolverTrainingEnv:
+    sizes = {"episode_length": L, "validation_levels": E, "probe_levels": C, "choices": SPACE.size}
+    return SolverTrainingEnv(
+        solvers(K),
+        generate=generate,
+        target=target,
+        evaluate=evaluate,
+        probe=probe,
+        reward=reward,
+        **{**sizes, **options},
+    )
+
+
+def play(env: SolverTrainingEnv, actions: torch.Tensor) -> TensorDict:
+    """Step through actions [L, K, P]; the transitions [K, L]."""
+    state, steps = env.reset(), []
+    for action in actions:
+        step, state = env.step_and_maybe_reset(state.set("action", action))
+        steps.append(step)
+    return torch.stack(steps, 1)
+
+
+def some_actions() -> torch.Tensor:
+    return torch.randint(SPACE.size, (L, K, P), generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("probes", [0, C])
+def test_specs(probes: int) -> None:
+    check_env_specs(meta_env(probe_levels=probes), break_when_any_done="both")
+
+
+def test_an_episode_is_a_plain_loop_over_one_solver() -> None:
+    env, start, streams, actions = meta_env(), solvers(1).snapshot(), Streams(9), some_actions()
+    env.fork(start[0], streams)
+    steps = play(env, actions)
+    validation = target(E, streams.generator("validation"))
+    for k in range(K):
+        solver = solvers(1)
+        solver.restore(start)
+        returns = [evaluate(solver.agent, validation, None)["return"].mean()]
+        for step in range(L):
+            levels = SPACE.generate(actions[step, k], streams.generator("levels", 0, step, k))
+            solver.env.set_levels(levels[None])
+            solver.update([streams.generator("actions", 0, step, k)])
+            returns.append(evaluate(solver.agent, validation, None)["return"].mean())
+        gains = torch.stack(returns).diff()
+        torch.testing.assert_close(steps["next", "reward"][k, :, 0], gains, rtol=1e-3, atol=1e-5)
+        assert gains.abs().max() > 1e-3
+        own = probe(solver.agent, env.probes)[0]
+        torch.testing.assert_close(steps["next", "probes"][k, -1], own, rtol=1e-3, atol=1e-4)
+
+
+def test_rewards_sum_to_the_total_gain_on_the_one_validation_batch() -> None:
+    env = meta_env()
+    env.fork(solvers(1).snapshot()[0], Streams(2))
+    validation = env.validation.clone()
+    steps = play(env, some_actions())
+    assert (env.validation == validation).all()
+    final = evaluate(env.solvers.agent, validation, None)["return"].mean(1)
+    initial = evaluate(solvers(1).agent, validation, None)["return"].mean(1)
+    torch.testing.assert_close(steps["next", "reward"].sum((1, 2)), final - initial)
+
+
+def test_all_copies_start_as_the_forked_solver() -> None:
+    env = meta_env()
+    solver = solvers(1)
+    solver.update([torch.Generator().manual_seed(5)])
+    env.fork(solver.snapshot()[0], Streams(2))
+    state = env.reset()
+    assert (state["probes"] == state["probes"][:1]).all()
+    assert (state["validation_return"] == state["validation_return"][0]).all()
+    assert (env.solvers.snapshot() == solver.snapshot()[[0] * K]).all()
+
+
+def test_the_same_fork_and_actions_reproduce_rewards_bit_for_bit() -> None:
+    env, start = meta_env(), solvers(1).snapshot()[0]
+    runs = []
+    for streams in (Streams(4), Streams(4), Streams(5)):
+        env.fork(start, streams)
+        runs.append(play(env, some_actions())["next", "reward"])
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+
+
+def test_episodes_of_one_fork_start_alike_but_draw_anew() -> None:
+    env = meta_env()
+    env.fork(solvers(1).snapshot()[0], Streams(4))
+    first, second = play(env, some_actions()), play(env, some_actions())
+    assert torch.equal(first["probes"][:, 0], second["probes"][:, 0])
+    assert not torch.equal(first["next", "reward"], second["next", "reward"])
+
+
+def test_trained_solvers_stay_readable_after_the_automatic_reset() -> None:
+    env = meta_env()
+    env.fork(solvers(1).snapshot()[0], Streams(4))
+    steps = play(env, some_actions())
+    assert steps["next", "done"][:, -1].all() and not steps["next", "done"][:, :-1].any()
+    after = evaluate(env.solvers.agent, env.validation, None)["return"].mean(1)
+    torch.testing.assert_close(after, steps["next", "validation_return"][:, -1, 0])
+
+
+def test_any_reward_can_be_paid() -> None:
+    env = meta_env(task_difficulty)
+    env.fork(solvers(1).snapshot()[0], Streams(4))
+    reward = play(env, some_actions())["next", "reward"]
+    assert ((reward >= 0) & (reward <= 1)).all() and reward.std() > 0
+
+
+def test_every_step_is_reported() -> None:
+    calls = []
+    env = meta_env(on_step=lambda: calls.append(1))
+    play(env, some_actions())
+    assert len(calls) == L
+
+
+def test_refuses_sizes_and_solvers_that_make_no_sense() -> None:
+    with pytest.raises(ValueError, match=r"episode_length.* got 0, 6, 4, 2"):
+        meta_env(episode_length=0)
+    ppo = solvers(1)
+    ppo.agent.copies = None
+    with pytest.raises(ValueError, match="must be a population"):
+        SolverTrainingEnv(
+            ppo, generate=generate, target=target, evaluate=evaluate, probe=probe,
+            reward=performance_gain, choices=4,
+        )  # fmt: skip

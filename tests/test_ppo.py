@@ -1,0 +1,251 @@
+"""PPO against plain formulas: advantages, losses, gradients, copies together and apart."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.distributions import Categorical
+from torchrl.objectives import ClipPPOLoss
+
+from proposer_rl.mazes import Level, MazeEnv, generate_levels
+from proposer_rl.models import Population, UNet, map_actor_critic
+from proposer_rl.ppo import PPO, PPOSettings, clip_gradients_
+
+P, T = 6, 12
+SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
+
+
+def levels(copies: int, seed: int = 0) -> Level:
+    generator = torch.Generator().manual_seed(seed)
+    return generate_levels(torch.full((copies, P), 0.2), 2, 5, 5, generator=generator)
+
+
+def learner(copies: int = 1, settings: PPOSettings = SETTINGS, observe_agent: bool = False) -> PPO:
+    torch.manual_seed(3)
+
+    def make() -> UNet:
+        return UNet(in_channels=4 if observe_agent else 3, channels=(8, 16), groups=4)
+
+    agent = map_actor_critic(Population(make, copies), per_step=observe_agent)
+    env = MazeEnv(levels(copies), max_steps=5, observe_agent=observe_agent)
+    return PPO(env, agent, settings)
+
+
+def generators(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+def hand_gae(rollout: TensorDict, gamma: float, lmbda: float) -> Tensor:
+    """Advantages by the recursion from the last step to the first, one environment at a time."""
+    value, following = rollout["state_value"], rollout["next", "state_value"]
+    reward, terminated = rollout["next", "reward"], rollout["next", "terminated"]
+    done = rollout["next", "done"]
+    advantage = torch.zeros_like(value)
+    for k in range(value.shape[0]):
+        for p in range(value.shape[1]):
+            after = 0.0
+            for t in reversed(range(value.shape[2])):
+                at = (k, p, t, 0)
+                bootstrap = 0.0 if terminated[at] else float(following[at])
+                delta = float(reward[at]) + gamma * bootstrap - float(value[at])
+                after = delta + (0.0 if done[at] else gamma * lmbda * after)
+                advantage[at] = after
+    return advantage
+
+
+def test_advantages_equal_a_hand_recursion_with_both_kinds_of_end() -> None:
+    ppo = learner(copies=2)
+    rollout = ppo.collect(generators(0, 1))
+    ends = rollout["next"]
+    assert ends["terminated"][:, :, :-1].any() and ends["truncated"][:, :, :-1].any()
+    ppo.optimise(rollout)
+    expected = hand_gae(rollout, SETTINGS.gamma, SETTINGS.lmbda)
+    torch.testing.assert_close(rollout["advantage"], expected, rtol=1e-4, atol=1e-5)
+    target = expected + rollout["state_value"]
+    torch.testing.assert_close(rollout["value_target"], target, rtol=1e-4, atol=1e-5)
+
+
+def test_values_are_those_of_the_states_before_and_after_each_step() -> None:
+    ppo = learner()
+    rollout = ppo.collect(generators(0))
+    for part, inputs in ((rollout, rollout), (rollout["next"], rollout["next"])):
+        state = TensorDict({"planes": rollout["planes"], "agent": inputs["agent"]}, rollout.shape)
+        expected = ppo.agent(state)["state_value"].detach()
+        torch.testing.assert_close(part["state_value"], expected, rtol=1e-4, atol=1e-5)
+
+
+def plain_loss(ppo: PPO, batch: TensorDict, k: int, settings: PPOSettings) -> Tensor:
+    """PPO's clipped loss of one copy, one forward pass per transition, from the formulas."""
+    state = batch.select("planes", "agent")
+    output = ppo.agent(state)
+    distribution = Categorical(logits=output["logits"][k])
+    ratio = (distribution.log_prob(batch["action"][k]) - batch["action_log_prob"][k]).exp()
+    advantage = batch["advantage"][k].squeeze(-1)
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    low, high = 1 - settings.clip_epsilon, 1 + settings.clip_epsilon
+    surrogate = torch.min(ratio * advantage, ratio.clamp(low, high) * advantage).mean()
+    error = (output["state_value"][k] - batch["value_target"][k]).square().mean()
+    entropy = distribution.entropy().mean()
+    return -surrogate + settings.critic_coeff * error - settings.entropy_coeff * entropy
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
+def test_loss_and_gradients_equal_the_formulas_per_transition(observe_agent: bool) -> None:
+    settings = PPOSettings(horizon=T, epochs=2, max_grad_norm=1e9)
+    ppo = learner(copies=2, settings=settings, observe_agent=observe_agent)
+    rollout = ppo.collect(generators(0, 1))
+    ppo.optimise(rollout)  # the policy moves on, so that ratios differ from one
+    plain = sum(plain_loss(ppo, rollout, k, settings) for k in range(2))
+    parameters = list(ppo.agent.parameters())
+    expected = torch.autograd.grad(plain, parameters)
+    metrics = ppo._gradient_step(
+        rollout, rollout.select(*ppo.agent.level_keys)[..., 0]
+    )  # leaves its gradients on the parameters
+    total = sum(metrics[f"loss_{part}"] for part in ("objective", "entropy", "critic")) * 2
+    torch.testing.assert_close(total, plain.detach(), rtol=1e-4, atol=1e-5)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_torchrls_loss_on_the_ordinary_actor_gives_the_same_gradients() -> None:
+    """The agent as others compose it: stock ClipPPOLoss, one observation per step."""
+    settings = PPOSettings(horizon=T, epochs=1, max_grad_norm=1e9)
+    ppo = learner(settings=settings)
+    rollout = ppo.collect(generators(0))
+    start = ppo.snapshot()
+    ppo.optimise(rollout)
+    gradients = [p.grad.clone() for p in ppo.agent.parameters()]
+    ppo.restore(start)
+    loss = ClipPPOLoss(
+        ppo.agent.actor(),
+        ppo.agent,
+        clip_epsilon=settings.clip_epsilon,
+        entropy_coeff=settings.entropy_coeff,
+        critic_coeff=settings.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+        functional=False,
+    )
+    ppo.agent.zero_grad()
+    losses = loss(rollout)
+    sum(losses[f"loss_{part}"] for part in ("objective", "entropy", "critic")).backward()
+    for parameter, gradient in zip(ppo.agent.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_copies_together_train_as_each_alone() -> None:
+    copies = 3
+    together = learner(copies)
+    start = together.snapshot()
+    finals, rewards = [], []
+    for k in range(copies):
+        alone = learner(1)
+        alone.restore(start[[k]])
+        for update in range(4):
+            alone.env.set_levels(levels(copies, seed=update)[k : k + 1])
+            rollout = alone.update(generators(10 * update + k)).rollout
+        finals.append(alone.snapshot())
+        rewards.append(rollout["next", "reward"])
+    for update in range(4):
+        together.env.set_levels(levels(copies, seed=update))
+        rollout = together.update(generators(*(10 * update + k for k in range(copies)))).rollout
+    assert torch.equal(rollout["next", "reward"], torch.cat(rewards))
+    end = together.snapshot()
+    moved = False
+    for name in end.keys():
+        apart = torch.cat([final[name]["value"] for final in finals])
+        torch.testing.assert_close(end[name]["value"], apart, rtol=1e-4, atol=1e-6)
+        moved |= not torch.allclose(apart, start[name]["value"], rtol=1e-3, atol=1e-4)
+    assert moved
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_gradients_are_clipped_per_copy(copies: int) -> None:
+    shapes = [(4, 3), (5,), (2, 2, 2)]
+    stacked = [torch.nn.Parameter(torch.zeros(copies, *shape)) for shape in shapes]
+    scale = torch.tensor([0.01, 1.0, 100.0])[:copies]
+    for parameter in stacked:
+        parameter.grad = torch.randn(parameter.shape) * scale.view(-1, *[1] * (parameter.ndim - 1))
+    apart = [[copy.deepcopy(p.grad[k]) for p in stacked] for k in range(copies)]
+    norms = clip_gradients_(stacked, 0.5, copies)
+    for k in range(copies):
+        own = [torch.nn.Parameter(torch.zeros_like(g)) for g in apart[k]]
+        for parameter, gradient in zip(own, apart[k], strict=True):
+            parameter.grad = gradient
+        torch.testing.assert_close(norms[k], torch.nn.utils.clip_grad_norm_(own, 0.5))
+        for parameter, alone in zip(stacked, own, strict=True):
+            torch.testing.assert_close(parameter.grad[k], alone.grad)
+
+
+def test_a_rollout_shares_the_levels_memory_and_equals_stepping_by_hand() -> None:
+    ppo = learner()
+    rollout = ppo.collect(generators(4))
+    assert rollout["planes"].shape == (1, P, T, 3, 5, 5)
+    assert rollout["planes"].stride(2) == 0
+    state = ppo.env.reset()
+    for t in range(T):
+        assert torch.equal(rollout["agent"][:, :, t], state["agent"])
+        state, after = ppo.env.step_and_maybe_reset(state.set("action", rollout["action"][:, :, t]))
+        assert torch.equal(rollout["next", "reward"][:, :, t], state["next", "reward"])
+        state = after
+
+
+def test_a_restored_snapshot_trains_on_bit_for_bit() -> None:
+    ppo = learner(copies=2)
+    ppo.update(generators(0, 1))
+    snapshot = ppo.snapshot()
+    ends = []
+    for _ in range(2):
+        ppo.restore(snapshot)
+        rollout = ppo.update(generators(2, 3)).rollout
+        ends.append((ppo.snapshot(), rollout["action"]))
+    assert torch.equal(ends[0][1], ends[1][1])
+    assert (ends[0][0] == ends[1][0]).all()
+    assert not (ends[0][0] == snapshot).all()
+
+
+def test_a_copy_can_be_forked() -> None:
+    ppo, many = learner(copies=2), learner(copies=3)
+    ppo.update(generators(0, 1))
+    many.restore(ppo.snapshot()[[1] * 3])
+    for name, entry in ppo.snapshot().items():
+        for key in ("value", "exp_avg", "exp_avg_sq", "step"):
+            for copied in many.snapshot()[name][key]:
+                assert torch.equal(copied, entry[key][1])
+
+
+def test_restore_refuses_what_does_not_fit() -> None:
+    ppo = learner(copies=2)
+    with pytest.raises(ValueError, match=r"batch size \[2\], got \[3\]"):
+        ppo.restore(ppo.snapshot()[[0, 0, 0]])
+    other = ppo.snapshot()
+    name = next(iter(other.keys()))
+    with pytest.raises(ValueError, match="another network"):
+        ppo.restore(other.exclude(name))
+    other[name]["step"] += torch.tensor([0.0, 1.0])
+    with pytest.raises(ValueError, match="another shape or Adam step"):
+        ppo.restore(other)
+
+
+def test_refuses_an_environment_of_another_size() -> None:
+    agent = learner(copies=2).agent
+    with pytest.raises(ValueError, match=r"agent has 2 copies.*batch size is \[3, 6\]"):
+        PPO(MazeEnv(levels(3)), agent, SETTINGS)
+
+
+def test_more_updates_on_one_batch_recompute_the_advantages() -> None:
+    once, twice = learner(), learner(settings=PPOSettings(horizon=T, epochs=3, updates=2))
+    rollout = once.collect(generators(0))
+    first = rollout.clone()
+    once.optimise(first)
+    second = rollout.clone()
+    twice.restore(once.snapshot().apply(torch.clone))
+    twice.optimise(second)
+    assert not torch.allclose(first["advantage"], second["advantage"])
+    torch.testing.assert_close(
+        second["advantage"], hand_gae(second, 0.99, 0.95), rtol=1e-4, atol=1e-5
+    )
