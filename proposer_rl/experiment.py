@@ -167,9 +167,10 @@ class Experiment:
             place = {"cycle": self.cycles, "updates": self.updates, "meta_frames": self.meta_frames}
             self.folder.append("proposer.jsonl", {**place, **outcome.metrics})
         self.cycles += 1
-        if outcome.updates:
-            self.updates = min(self.updates + outcome.updates, self.schedule.updates)
+        if outcome.advance is not None:
+            self.updates = min(self.updates + outcome.advance.updates, self.schedule.updates)
             self._measure()
+            self._record(outcome.advance.levels, outcome.advance.update)
         if outcome.metrics:
             # Improving can be nearly all of a cycle's work, so it is saved at once.
             self._save()

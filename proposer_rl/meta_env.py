@@ -134,10 +134,11 @@ class SolverTrainingEnv(EnvBase):
         self.solvers.env.set_levels(levels)
         # A collector steps its environment without gradients; this one learns inside.
         with torch.enable_grad():
-            rollout, _ = self.solvers.update(self._generators("actions"))
+            update = self.solvers.update(self._generators("actions"))
+        self.last_training = (levels, update)
         self._steps_done += 1
         before, self._return = self._return, self._validation_return()
-        step = TrainingStep(levels, rollout, self.solvers.agent, before, self._return)
+        step = TrainingStep(levels, update.rollout, self.solvers.agent, before, self._return)
         reward = self._reward(step)
         self._on_step()
         after = self._observe(self._return, self.see(self.solvers.agent))

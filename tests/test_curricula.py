@@ -75,7 +75,7 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
     before = curriculum.proposer.snapshot()
     outcome = curriculum.improve(solver, [Streams(0, "cycle", 0)])
     assert outcome.meta_frames == K * P * 8 * L
-    assert outcome.updates == 0
+    assert outcome.advance is None
     metrics = outcome.metrics
     assert len(metrics["total_gain"]) == K
     # The reward is the gain, so over an episode both add up to the same.
@@ -94,9 +94,11 @@ def test_what_becomes_of_the_solver(advance: str) -> None:
     copies = curriculum.env.solvers.snapshot()
     equal = [bool((solver.snapshot()[0] == copies[k]).all()) for k in range(K)]
     if advance == "train":
-        assert (solver.snapshot() == before).all() and outcome.updates == 0
+        assert (solver.snapshot() == before).all() and outcome.advance is None
     else:
-        assert sum(equal) == 1 and outcome.updates == L
+        assert sum(equal) == 1 and outcome.advance.updates == L
+        assert outcome.advance.levels.batch_size == (1, P)
+        assert outcome.advance.update.rollout.batch_size == (1, P, 8)
     if advance == "best":
         gains = outcome.metrics["total_gain"]
         assert equal.index(True) == gains.index(max(gains))

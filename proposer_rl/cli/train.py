@@ -9,12 +9,13 @@ import shlex
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -31,6 +32,7 @@ from proposer_rl.run_folder import RunFolder
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask
 
+INPUT_ERRORS = (ConfigError, CheckpointError)
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -41,18 +43,32 @@ def main() -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         _main()
-    except (ConfigError, CheckpointError, HydraException, OmegaConfBaseException) as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
+    except (*INPUT_ERRORS, HydraException, OmegaConfBaseException) as error:
+        _refuse(error)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
-    config = read_config(hydra_config)
-    experiment = build(config, Path(HydraConfig.get().runtime.output_dir))
-    return run(experiment, config)
+    try:
+        config = read_config(hydra_config)
+        experiment = build(config, Path(HydraConfig.get().runtime.output_dir))
+        return run(experiment, config)
+    except INPUT_ERRORS as error:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise  # Hydra goes on with the other runs and fails at the end.
+        _refuse(error)
+
+
+def _refuse(error: Exception) -> NoReturn:
+    """Say in one line what is wrong with the input, and exit."""
+    if isinstance(error, MissingConfigException) and error.options:
+        message = f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
+    else:
+        message = _one_line(error)
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(BAD_INPUT)
 
 
 def build(config: RunConfig, path: Path) -> Experiment:
@@ -225,8 +241,8 @@ def _summary_text(config: RunConfig, result: dict[str, Any]) -> str:
     )
     return (
         f"{config.method}, seed {config.seed}: {outcome}; {final:.1%} at the end. "
-        f"Cost: {result['frames'] / 1e6:.2f} M frames of the Solver, "
-        f"{result['meta_frames'] / 1e6:.2f} M of its copies, {result['seconds']:.0f} s."
+        f"Cost: {result['frames']:,} frames of the Solver, "
+        f"{result['meta_frames']:,} of its copies, {result['seconds']:.0f} s."
     )
 
 

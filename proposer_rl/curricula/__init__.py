@@ -1,10 +1,11 @@
 """What the Solver trains on."""
 
-from proposer_rl.curricula.base import Curriculum, Improvement
+from proposer_rl.curricula.base import Advance, Curriculum, Improvement
 from proposer_rl.curricula.proposer import ProposerCurriculum, total_gain
 from proposer_rl.curricula.sampling import SamplingCurriculum, ScheduleCurriculum
 
 __all__ = [
+    "Advance",
     "Curriculum",
     "Improvement",
     "ProposerCurriculum",

@@ -8,8 +8,23 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from proposer_rl.ppo import PPO
+from proposer_rl.ppo import PPO, Update
 from proposer_rl.streams import Streams
+
+
+@dataclass
+class Advance:
+    """Updates that the Solver has got from a curriculum itself, instead of the cycle's.
+
+    Attributes:
+        updates: how many.
+        levels: those of the last one, [K, P].
+        update: the last one's rollout, [K, P, T], and metrics.
+    """
+
+    updates: int
+    levels: Any
+    update: Update
 
 
 @dataclass
@@ -19,12 +34,12 @@ class Improvement:
     Attributes:
         metrics: of the cycle, ready for JSON; empty if nothing was done.
         meta_frames: inner environment steps that it cost, beyond the Solver's own.
-        updates: Solver updates that it has made itself, instead of the cycle's.
+        advance: None if the Solver is as it was.
     """
 
     metrics: dict[str, Any] = field(default_factory=dict)
     meta_frames: int = 0
-    updates: int = 0
+    advance: Advance | None = None
 
 
 class Curriculum:

@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Curriculum, Improvement
+from proposer_rl.curricula.base import Advance, Curriculum, Improvement
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import draw
-from proposer_rl.ppo import PPO
+from proposer_rl.ppo import PPO, Update
 from proposer_rl.streams import Streams
 
 ADVANCES = ("train", "best", "random")
@@ -70,10 +70,10 @@ class ProposerCurriculum(Curriculum):
         )
         training = self.proposer.optimise(rollout)
         gains = total_gain(rollout)
-        updates = self._advance(solver, gains, stream)
         inner = env.solvers
         frames = inner.env.batch_size.numel() * inner.settings.horizon * env.episode_length
-        return Improvement(self._metrics(rollout, gains, training), frames, updates)
+        advance = self._advance(solver, gains, stream)
+        return Improvement(self._metrics(rollout, gains, training), frames, advance)
 
     @torch.no_grad()
     def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
@@ -103,9 +103,9 @@ class ProposerCurriculum(Curriculum):
         self.proposer.restore(saved)
         self.env.draw_levels(Streams(*state["streams"]))
 
-    def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> int:
+    def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
-            return 0
+            return None
         copies = gains.shape[0]
         if self.advance == "best":
             chosen = int(gains.argmax())
@@ -113,7 +113,9 @@ class ProposerCurriculum(Curriculum):
             generator = stream.generator("advance")
             chosen = int(torch.randint(copies, (), generator=generator))
         solver.restore(self.env.solvers.snapshot()[[chosen]])
-        return self.env.episode_length
+        levels, (rollout, metrics) = self.env.last_training
+        own = Update(rollout[[chosen]], metrics)
+        return Advance(self.env.episode_length, levels[[chosen]], own)
 
     def _metrics(
         self, rollout: TensorDictBase, gains: Tensor, training: TensorDict
