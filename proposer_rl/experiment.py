@@ -142,7 +142,7 @@ class Experiment:
                 (
                     int(row["updates"])
                     for row in rows
-                    if row["seed"] == seed and float(row[headline]) >= threshold
+                    if row["seed"] == seed and row[headline] >= threshold
                 ),
                 None,
             )

@@ -16,10 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 Number = int | float
-Cell = Number | str
 
-# A quoted cell is text, in which a quote is doubled; a bare one is a number.
-_CELL = re.compile(r'"((?:[^"]|"")*)"|([^",]*)')
 _PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 
 
@@ -39,7 +36,7 @@ class RunFolder:
 
         Args:
             name: the table's file name, ending in ``.csv`` or ``.jsonl``.
-            row: for ``.csv`` numbers and text, with the same keys in every row of the table (the
+            row: for ``.csv`` numbers, with the same keys in every row of the table (the
                 first row makes the header); for ``.jsonl`` whatever JSON can hold.
 
         Raises:
@@ -105,7 +102,7 @@ class RunFolder:
         return sorted([*self.path.glob("*.csv"), *self.path.glob("*.jsonl")])
 
 
-def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Cell]]:
+def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
     """Reads a ``.csv`` table of a run's folder.
 
     Returns:
@@ -198,24 +195,13 @@ def _format_cell(path: Path, column: str, value: object) -> str:
         return float.__repr__(value)  # the shortest text that reads back as the same number
     if isinstance(value, int) and not isinstance(value, bool):
         return int.__repr__(value)
-    if isinstance(value, str) and "\n" not in value and "\r" not in value:
-        return '"' + value.replace('"', '""') + '"'
     raise ValueError(
-        f"{path}: column {column!r} takes int, float or one line of text, not {value!r} "
-        f"({type(value).__name__})"
+        f"{path}: column {column!r} takes int or float, not {value!r} ({type(value).__name__})"
     )
 
 
-def _parse_row(where: str, header: list[str], line: str) -> dict[str, Cell]:
-    cells: list[Cell] = []
-    position = -1
-    while position < len(line):
-        match = _CELL.match(line, position + 1)
-        if match is None or line[match.end() : match.end() + 1] not in ("", ","):
-            raise ValueError(f"{where}: a quote in the middle of a cell: {line[:60]}")
-        text, number = match.groups()
-        cells.append(_parse_number(where, number) if text is None else text.replace('""', '"'))
-        position = match.end()
+def _parse_row(where: str, header: list[str], line: str) -> dict[str, Number]:
+    cells = [_parse_number(where, text) for text in line.split(",")]
     if len(cells) != len(header):
         raise ValueError(f"{where}: {len(cells)} cells under {len(header)} columns")
     return dict(zip(header, cells, strict=True))
@@ -229,7 +215,7 @@ def _parse_number(where: str, text: str) -> Number:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{where}: {text!r} is neither a number nor quoted text") from None
+        raise ValueError(f"{where}: {text!r} is not a number") from None
 
 
 def _to_json(path: Path, value: object, indent: int | None = None) -> str:
