@@ -42,7 +42,7 @@ class ProposerSettings:
     lookahead: Annotated[int, Ge(1)] = 50
     validation_levels: Annotated[int, Ge(1)] = 75
     probe_levels: Annotated[int, Ge(0)] = 16
-    ratio: Literal["joint", "per_problem"] = "joint"
+    ratio: Literal["joint", "per_problem"] = "per_problem"
     advance: Literal["train", "best", "random"] = "train"
     context: Annotated[int, Ge(1)] = 128
     hidden: Annotated[int, Ge(1)] = 128

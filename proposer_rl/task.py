@@ -93,12 +93,14 @@ class EvaluationSettings:
     """How the Solver is measured, apart from its training.
 
     Attributes:
+        distributions: names of the distributions that are measured on.
         levels: number of levels of each distribution, the same in every run.
         seed: from which they are drawn.
         reward: evaluator of the Proposer's validation levels: exact, or Monte-Carlo episodes.
         episodes: Monte-Carlo episodes per level.
     """
 
+    distributions: Annotated[list[str], Len(1)]
     levels: Annotated[int, Ge(1)] = 512
     seed: Annotated[int, Ge(0)] = 0
     reward: Literal["exact", "rollout"] = "exact"
@@ -110,7 +112,7 @@ class MazeTask:
 
     Args:
         maze: the inner environment.
-        distributions: by name; all are measured on.
+        distributions: by name.
         target: the name of the one that the Solver is to master.
         space: the Proposer's choices.
         solver: network and training of the Solver.
@@ -119,7 +121,7 @@ class MazeTask:
         precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
 
     Raises:
-        ValueError: if ``target`` is no distribution, or levels cannot be made as specified.
+        ValueError: if a name is no distribution's, or levels cannot be made as specified.
     """
 
     def __init__(
@@ -134,8 +136,9 @@ class MazeTask:
         device: torch.device | str = "cpu",
         precision: str = "fp32",
     ) -> None:
-        if target not in distributions:
-            raise ValueError(f"target must be one of {sorted(distributions)}, got {target!r}")
+        for name in (target, *evaluation.distributions):
+            if name not in distributions:
+                raise ValueError(f"{name!r} is none of the distributions {sorted(distributions)}")
         self.maze = maze
         self.solver = solver
         self.device = torch.device(device)
@@ -158,12 +161,12 @@ class MazeTask:
             else RolloutEvaluator(*rules, episodes=evaluation.episodes)
         )
         self._measured_on = {
-            name: distribution.sample(
+            name: self.distributions[name].sample(
                 evaluation.levels,
                 Streams(evaluation.seed, "evaluation", name).generator(),
                 device=self.device,
             )
-            for name, distribution in self.distributions.items()
+            for name in evaluation.distributions
         }
 
     def solvers(self, streams: Sequence[Streams]) -> PPO:
@@ -222,9 +225,9 @@ class MazeTask:
         return torch.cat([planes(copies), logits], -3)
 
     def measure(self, solver: ActorCritic) -> TensorDict:
-        """Exact means over the fixed levels of every distribution, each [K].
+        """Exact means over the fixed levels of each distribution measured on, each [K].
 
-        Entries, for each distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
+        Entries, by the distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
         policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one.
         """
         results: dict[str, Tensor] = {}

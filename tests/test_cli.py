@@ -108,7 +108,7 @@ def test_every_ablation_composes_and_is_built(ablation: str, tmp_path: Path) -> 
     config = composed("+method=perf_gain", *SMOKE, f"+ablation={ablation}")
     assert config.ablation == ablation
     plain = composed("+method=perf_gain", *SMOKE)
-    if ablation not in ("lookahead_50", "probes_16", "ratio_joint"):
+    if ablation not in ("lookahead_50", "probes_16", "ratio_per_problem"):
         changed = config.model_dump(exclude={"ablation"}) != plain.model_dump(exclude={"ablation"})
         assert changed
     build(config, tmp_path / "run")
@@ -116,7 +116,8 @@ def test_every_ablation_composes_and_is_built(ablation: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("ablation", ["observe_agent", "evaluator_rollout", "advance_best"])
 def test_ablations_that_change_the_loop_run(ablation: str, train) -> None:
-    assert train("+method=perf_gain", *SMOKE, f"+ablation={ablation}", "hydra.run.dir=run") == 0
+    arguments = ["+method=perf_gain", *SMOKE, f"+ablation={ablation}"]
+    assert train(*arguments, "hydra.run.dir=run") == 0
     assert read_csv("run/metrics.csv")[-1]["updates"] == 6
 
 
@@ -131,8 +132,6 @@ def test_an_interrupted_run_resumes_as_if_it_had_never_stopped(
     method: str, crash_after: int, train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = [f"+method={method}", *SMOKE]
-    if method == "hand_made":
-        arguments.append("curriculum.until=[3]")
     assert train(*arguments, "hydra.run.dir=whole") == 0
     done = []
     with monkeypatch.context() as patch:
@@ -206,7 +205,12 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
             "learning_rate=-1: input should be gre",
         ),
         (["+method=target", "solver.problems=0"], "solver.problems=0: input should be greater"),
-        (["+method=target", "target=elsewhere"], "target must be one of ['id', 'ood'], got 'else"),
+        (["+method=target", "target=elsewhere"], "target: must be among ['id', 'mix', 'ood'], got"),
+        (["+method=target", "evaluation.distributions=[far]"], "evaluation.distributions: must be"),
+        (
+            ["+method=target", "schedule.headline=fun"],
+            "headline='fun': must be one of ['id_success'",
+        ),
         (["+method=target", "maze.height=2"], "halve a 2x10 maze to nothing"),
         (["+method=target", "solver.channels=[12]"], "must be multiples of solver.groups=8"),
         (["+method=target", "device=abacus"], "device='abacus': must be auto, cpu or a usable"),
@@ -214,6 +218,10 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
         (["+method=hand_made", "curriculum.until=[3, 2]"], "2 stages need 1 ascending positive"),
         (["+method=hand_made", "curriculum.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
         (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer() got an unexpected"),
+        (
+            ["+method=perf_gain", "+ablation=lookahead_10", "+scale=quick"],
+            "+scale: must come before +ablation",
+        ),
         (["+method=perf_gain", "proposer.ppo.horizon=3"], "must equal proposer.lookahead=50"),
         (
             ["+method=perf_gain", "proposer.advance=best", "schedule.cycle_length=5"],
@@ -239,7 +247,7 @@ def test_the_papers_values_are_the_defaults_of_the_code() -> None:
     assert config.maze == MazeSettings()
     assert config.solver.ppo == PPOSettings()
     assert config.schedule == Schedule()
-    assert config.evaluation == EvaluationSettings()
+    assert config.evaluation == EvaluationSettings(distributions=["id", "ood"])
     for part in (config.solver, config.proposer):
         for field in fields(part):
             if isinstance(field.default, int | float | str):

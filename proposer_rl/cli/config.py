@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,6 +58,7 @@ class RunConfig(BaseModel):
     maze: MazeSettings
     distributions: dict[str, DistributionSettings]
     target: str
+    hand_made_until: list[Annotated[int, Field(ge=1)]]
     space: SpaceSettings
     solver: SolverSettings
     proposer: ProposerSettings
@@ -68,6 +69,15 @@ class RunConfig(BaseModel):
     @model_validator(mode="after")
     def _agree(self) -> RunConfig:
         proposer, schedule, solver = self.proposer, self.schedule, self.solver
+        known, measured = sorted(self.distributions), self.evaluation.distributions
+        for key, names in (("target", [self.target]), ("evaluation.distributions", measured)):
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                raise ValueError(f"{key}: must be among {known}, got {unknown[0]!r}")
+        policies = ("success", "greedy_success", "return", "greedy_return")
+        headlines = [f"{name}_{policy}" for name in measured for policy in policies]
+        if schedule.headline not in headlines:
+            raise ValueError(f"schedule.headline={schedule.headline!r}: must be one of {headlines}")
         if proposer.advance != "train" and schedule.cycle_length != proposer.lookahead:
             raise ValueError(
                 f"schedule.cycle_length={schedule.cycle_length} must equal proposer.lookahead="
@@ -108,6 +118,20 @@ def read_config(config: DictConfig) -> RunConfig:
         return RunConfig.model_validate(values)
     except ValidationError as error:
         raise ConfigError(_first_line(error)) from error
+
+
+def check_order(overrides: Sequence[str]) -> None:
+    """Refuse an order in which a scale would undo an ablation: later groups win.
+
+    Args:
+        overrides: as given on the command line.
+
+    Raises:
+        ConfigError: if ``+scale=`` comes after ``+ablation=``.
+    """
+    groups = [override.partition("=")[0] for override in overrides]
+    if "+ablation" in groups and "+scale" in groups[groups.index("+ablation") :]:
+        raise ConfigError("+scale: must come before +ablation, or it would undo the ablation")
 
 
 def methods() -> list[str]:

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from proposer_rl.checkpoint import CheckpointError
-from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, read_config
+from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.loggers import make_log
 from proposer_rl.cli.picture import draw_run
 from proposer_rl.curricula import Curriculum
@@ -52,6 +52,7 @@ def main() -> None:
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
     try:
+        check_order(HydraConfig.get().overrides.task)
         config = read_config(hydra_config)
         experiment = build(config, Path(HydraConfig.get().runtime.output_dir))
         return run(experiment, config)

@@ -94,7 +94,7 @@ def fourier_encoding(problems: int, bands: int) -> Tensor:
 
 
 def proposer_actor_critic(
-    network: nn.Module, ratio: str = "joint", *, probes_key: str = "probes"
+    network: nn.Module, ratio: str = "per_problem", *, probes_key: str = "probes"
 ) -> ActorCritic:
     """Actor-critic of a network that maps probes to logits [*B, P, N] and a value [*B, 1].
 

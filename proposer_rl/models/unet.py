@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
@@ -78,10 +79,32 @@ class UNet(nn.Module):
         skips.pop()
         for block in self.up:
             skip = skips.pop()
-            x = F.interpolate(x, skip.shape[-2:], mode="bilinear", align_corners=False)
-            x = block(torch.cat([skip, x], 1))
+            x = block(torch.cat([skip, upsample(x, skip.shape[-2:])], 1))
         maps = (head(x) for head in self.heads)
         return tuple(m.reshape(*leading, *m.shape[1:]) for m in maps)
+
+
+def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
+    """Interpolate maps [B, C, h, w] bilinearly to [B, C, H, W], as ``F.interpolate`` does.
+
+    One product with a constant matrix: on small maps its backward pass takes a fraction of the time
+    of the kernel's, and the result stays in the channels-last layout.
+    """
+    height, width = size
+    pixels = maps.permute(0, 2, 3, 1).flatten(1, 2)  # [B, h * w, C]
+    weights = _interpolation(*maps.shape[-2:], height, width, maps.device).to(maps.dtype)
+    return (weights @ pixels).unflatten(1, (height, width)).permute(0, 3, 1, 2)
+
+
+@lru_cache(maxsize=64)
+def _interpolation(
+    height: int, width: int, to_height: int, to_width: int, device: torch.device
+) -> Tensor:
+    """Weights of every input pixel in every output pixel, float32 [H * W, h * w]."""
+    with torch.inference_mode(False), torch.autocast(device.type, enabled=False):
+        pixels = torch.eye(height * width, device=device).unflatten(1, (1, height, width))
+        columns = F.interpolate(pixels, (to_height, to_width), mode="bilinear")
+        return columns.flatten(1).T.contiguous()
 
 
 def orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:

@@ -3,8 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from proposer_rl.models import UNet
+from proposer_rl.models.unet import upsample
 
 
 @pytest.mark.parametrize(("height", "width"), [(10, 10), (4, 4), (13, 7), (21, 21)])
@@ -51,3 +53,18 @@ def test_every_layer_is_orthogonal() -> None:
 def test_refuses_channels_that_groups_do_not_divide() -> None:
     with pytest.raises(ValueError, match=r"multiples of groups=8, got \[12, 16\]"):
         UNet(channels=(12, 16), groups=8)
+
+
+@pytest.mark.parametrize("small", [(1, 1), (2, 2), (5, 5), (3, 6)])
+@pytest.mark.parametrize("large", [(4, 5), (10, 10), (7, 13)])
+def test_upsampling_is_bilinear_interpolation(
+    small: tuple[int, int], large: tuple[int, int]
+) -> None:
+    maps = torch.rand(2, 3, *small, requires_grad=True)
+    weights = torch.rand(2, 3, *large)
+    results = []
+    for result in (upsample(maps, large), F.interpolate(maps, large, mode="bilinear")):
+        (gradient,) = torch.autograd.grad((result * weights).sum(), maps)
+        results.append((result, gradient))
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other)
