@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +23,8 @@ class Population(nn.Module):
     gradient that it would have alone.
 
     Args:
-        make: builds one network, without buffers; called once per copy, in order.
+        make: builds one network, without buffers, that maps tensors to one tensor or a tuple of
+            them; called once per copy, in order.
         copies: number of copies K.
         precision: ``"fp32"``, or ``"bf16"`` for autocast of the networks' arithmetic (parameters,
             gradients and outputs stay float32).
@@ -49,46 +54,120 @@ class Population(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
-        parameters = list(self.stacked)
-        apply = _apply_batched if parameters[0].is_cuda else _apply_in_turn
-        with _autocast(self.precision, parameters[0].device):
-            outputs = apply(self._template[0], self.names, parameters, inputs)
-        return _map(Tensor.float, outputs)
+        stacked = list(self.stacked)
+        if stacked[0].is_cuda:
+            apply = apply_batched
+        elif self.copies > 1 and torch.get_num_threads() > 1:
+            apply = apply_on_cores
+        else:
+            apply = apply_in_turn
+        call = _Call(self._template[0], self.names, self.precision)
+        outputs = apply(call, stacked, inputs)
+        return outputs[0] if len(outputs) == 1 else outputs
 
 
-def _apply_in_turn(
-    network: nn.Module, names: Sequence[str], stacked: Sequence[Tensor], inputs: Sequence[Tensor]
-) -> Any:
-    """One copy after the other: the fastest way on a CPU, and the reference for every other way."""
+class _Call(NamedTuple):
+    """The network with the parameters of one copy: what all the ways below have in common."""
+
+    network: nn.Module
+    names: Sequence[str]
+    precision: str
+
+    def __call__(self, member: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        parameters = dict(zip(self.names, member, strict=True))
+        with _autocast(self.precision, member[0].device):
+            outputs = functional_call(self.network, parameters, tuple(inputs))
+        if isinstance(outputs, Tensor):
+            outputs = (outputs,)
+        return tuple(output.float() for output in outputs)
+
+
+def apply_in_turn(
+    call: _Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """One copy after the other: the plain way, and the reference for the others."""
     # unbind, not indexing: its backward is one stack, not K additions into full-sized zeros.
     members = zip(*(parameter.unbind() for parameter in stacked), strict=True)
-    outputs = [
-        functional_call(network, dict(zip(names, member, strict=True)), tuple(x[k] for x in inputs))
-        for k, member in enumerate(members)
-    ]
-    if isinstance(outputs[0], Tensor):
-        return torch.stack(outputs)
+    outputs = [call(member, [x[k] for x in inputs]) for k, member in enumerate(members)]
     return tuple(torch.stack(slices) for slices in zip(*outputs, strict=True))
 
 
-def _apply_batched(
-    network: nn.Module, names: Sequence[str], stacked: Sequence[Tensor], inputs: Sequence[Tensor]
-) -> Any:
+def apply_batched(
+    call: _Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
     """All copies in each kernel (convolutions become grouped ones): few launches, for a GPU."""
 
-    def one(member: tuple[Tensor, ...], *slices: Tensor) -> Any:
-        return functional_call(network, dict(zip(names, member, strict=True)), slices)
+    def one(member: tuple[Tensor, ...], slices: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        return call(member, slices)
 
-    return vmap(one)(tuple(stacked), *inputs)
+    return vmap(one)(tuple(stacked), tuple(inputs))
+
+
+def apply_on_cores(
+    call: _Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Each copy on one core: small maps keep a core busy, but not several at once."""
+    with_graph = torch.is_grad_enabled()  # unknown inside, where gradients are always off
+    return _OnCores.apply(call, with_graph, len(inputs), *inputs, *stacked)
+
+
+class _OnCores(torch.autograd.Function):
+    """Forward and backward of the copies in threads, each through a graph of its own."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, call: _Call, with_graph: bool, n_inputs: int, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        def one(k: int) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+            leaves = [
+                x[k].detach().requires_grad_(with_graph and needs)
+                for x, needs in zip(tensors, ctx.needs_input_grad[3:], strict=True)
+            ]
+            own = call._replace(network=_own_network(call.network))
+            with torch.set_grad_enabled(with_graph):
+                outputs = own(leaves[n_inputs:], leaves[:n_inputs])
+            return outputs, leaves
+
+        results = list(_cores().map(one, range(len(tensors[-1]))))
+        # The graphs live in ctx, not among its saved tensors: they are made here and freed with it.
+        ctx.graphs = results
+        outputs = zip(*(outputs for outputs, _ in results), strict=True)
+        return tuple(torch.stack([o.detach() for o in slices]) for slices in outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        needs = ctx.needs_input_grad[3:]
+
+        def one(k: int) -> list[Tensor]:
+            outputs, leaves = ctx.graphs[k]
+            wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
+            return list(torch.autograd.grad(outputs, wanted, [g[k] for g in gradients]))
+
+        results = zip(*_cores().map(one, range(len(ctx.graphs))), strict=True)
+        stacked = iter([torch.stack(slices) for slices in results])
+        ctx.graphs = None
+        return None, None, None, *(next(stacked) if need else None for need in needs)
+
+
+@cache
+def _cores() -> ThreadPoolExecutor:
+    """Threads that each compute on one core; as many as torch would use for one operation."""
+    threads = torch.get_num_threads()
+    return ThreadPoolExecutor(threads, "copy", initializer=torch.set_num_threads, initargs=(1,))
+
+
+_networks = threading.local()
+
+
+def _own_network(network: nn.Module) -> nn.Module:
+    """This thread's own copy of a template: functional calls put parameters into it meanwhile."""
+    own = getattr(_networks, "of", None)
+    if own is None or own[0] is not network:
+        own = _networks.of = (network, copy.deepcopy(network))
+    return own[1]
 
 
 def _autocast(precision: str, device: torch.device) -> AbstractContextManager[Any]:
     if precision == "fp32":
         return nullcontext()
     return torch.autocast(device.type, torch.bfloat16)
-
-
-def _map(function: Callable[[Tensor], Tensor], outputs: Any) -> Any:
-    if isinstance(outputs, Tensor):
-        return function(outputs)
-    return tuple(function(output) for output in outputs)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import nn
 
 from proposer_rl.models import Population, UNet
-from proposer_rl.models.population import _apply_batched, _apply_in_turn
+from proposer_rl.models.population import (
+    _Call,
+    apply_batched,
+    apply_in_turn,
+    apply_on_cores,
+)
 
 
 def small_unet() -> UNet:
@@ -40,17 +47,33 @@ def test_outputs_and_gradients_equal_those_of_networks_apart() -> None:
             torch.testing.assert_close(stacked.grad[k], parameter.grad, rtol=1e-4, atol=1e-6)
 
 
-def test_the_batched_way_equals_the_way_in_turn() -> None:
-    population = together(3)
-    planes = torch.rand(3, 4, 3, 7, 9)
-    arguments = (population._template[0], population.names, list(population.stacked), (planes,))
+@pytest.mark.parametrize("way", [apply_batched, apply_on_cores])
+def test_every_way_equals_one_copy_after_the_other(way: Callable) -> None:
+    population = together(5)
+    planes = torch.rand(5, 4, 3, 7, 9, requires_grad=True)
+    call = _Call(population._template[0], population.names, "fp32")
     results = {}
-    for apply in (_apply_in_turn, _apply_batched):
-        outputs = apply(*arguments)
+    for apply in (apply_in_turn, way):
+        outputs = apply(call, list(population.stacked), (planes,))
         loss = sum(output.square().sum() for output in outputs)
-        results[apply] = (*outputs, *torch.autograd.grad(loss, list(population.stacked)))
+        gradients = torch.autograd.grad(loss, [planes, *population.stacked])
+        with torch.no_grad():
+            results[apply] = (*outputs, *gradients, *apply(call, population.stacked, (planes,)))
     for one, other in zip(*results.values(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
+def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> None:
+    population, planes = together(6), torch.rand(6, 4, 3, 6, 6)
+    call = _Call(population._template[0], population.names, "fp32")
+    runs = []
+    for _ in range(3):
+        outputs = apply_on_cores(call, list(population.stacked), (planes,))
+        loss = sum(output.square().sum() for output in outputs)
+        runs.append([*outputs, *torch.autograd.grad(loss, list(population.stacked))])
+    assert all(parameter.grad is None for parameter in population.stacked)
+    for run in runs[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(run, runs[0], strict=True))
 
 
 def test_one_copy_does_not_see_another() -> None:
