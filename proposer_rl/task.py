@@ -119,6 +119,7 @@ class MazeTask:
         evaluation: measurements.
         device: where everything lives.
         precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
+        cores: Solvers of a population computed at once on a CPU; None for all cores.
 
     Raises:
         ValueError: if a name is no distribution's, or levels cannot be made as specified.
@@ -135,6 +136,7 @@ class MazeTask:
         evaluation: EvaluationSettings,
         device: torch.device | str = "cpu",
         precision: str = "fp32",
+        cores: int | None = None,
     ) -> None:
         for name in (target, *evaluation.distributions):
             if name not in distributions:
@@ -143,6 +145,7 @@ class MazeTask:
         self.solver = solver
         self.device = torch.device(device)
         self.precision = precision
+        self.cores = cores
         grid = (maze.height, maze.width)
         self.distributions = {
             name: LevelDistribution(d.specifications, d.mechanism, *grid)
@@ -184,7 +187,7 @@ class MazeTask:
                     head_gains=(self.solver.policy_gain, self.solver.value_gain),
                 )
 
-        network = Population(make, copies, self.precision).to(self.device)
+        network = Population(make, copies, self.precision, self.cores).to(self.device)
         agent = map_actor_critic(network, per_step=self.maze.observe_agent)
         # Placeholders of the right shape; every update sets its own levels.
         level = self._measured_on[next(iter(self._measured_on))][:1]

@@ -54,6 +54,7 @@ class RunConfig(BaseModel):
     device: str
     precision: Literal["fp32", "bf16"]
     threads: Annotated[int, Field(ge=1)] | None
+    cores: Annotated[int, Field(ge=1)] | None
     progress: bool
     maze: MazeSettings
     distributions: dict[str, DistributionSettings]

@@ -95,6 +95,7 @@ def build(config: RunConfig, path: Path) -> Experiment:
             evaluation=config.evaluation,
             device=device,
             precision=config.precision,
+            cores=config.cores,
         )
         curriculum = _curriculum(config, task)
     except ValueError as error:
@@ -185,7 +186,7 @@ def _device(name: str) -> torch.device:
 def _check_same_run(folder: RunFolder, config: RunConfig) -> None:
     """Refuse to go on with a run that was started with other settings."""
     # What may differ: where and how it is computed and shown, and a longer schedule.
-    free = {"device", "threads", "progress", "logger"}
+    free = {"device", "threads", "cores", "progress", "logger"}
     now = config.model_dump(mode="json", exclude=free)
     now["schedule"].pop("updates")
     file = folder.path / "config.json"

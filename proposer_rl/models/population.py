@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,15 +29,25 @@ class Population(nn.Module):
         copies: number of copies K.
         precision: ``"fp32"``, or ``"bf16"`` for autocast of the networks' arithmetic (parameters,
             gradients and outputs stay float32).
+        cores: copies that are computed at once on a CPU, each by one thread; None for as many as
+            the process may use. The numbers are those of one thread whatever the cores.
 
     Raises:
-        ValueError: for fewer than one copy, an unknown precision, or a network with buffers.
+        ValueError: for fewer than one copy or core, an unknown precision, or a network with
+            buffers.
     """
 
-    def __init__(self, make: Callable[[], nn.Module], copies: int, precision: str = "fp32") -> None:
+    def __init__(
+        self,
+        make: Callable[[], nn.Module],
+        copies: int,
+        precision: str = "fp32",
+        cores: int | None = None,
+    ) -> None:
         super().__init__()
-        if copies < 1:
-            raise ValueError(f"copies must be at least 1, got {copies}")
+        cores = available_cores() if cores is None else cores
+        if min(copies, cores) < 1:
+            raise ValueError(f"copies and cores must be at least 1, got {copies} and {cores}")
         if precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be 'fp32' or 'bf16', got {precision!r}")
         members = [make() for _ in range(copies)]
@@ -44,6 +55,7 @@ class Population(nn.Module):
             raise ValueError("a Population's network must not have buffers")
         self.copies = copies
         self.precision = precision
+        self.cores = cores
         self.names = [name for name, _ in members[0].named_parameters()]
         self.stacked = nn.ParameterList(
             nn.Parameter(torch.stack([p.detach() for p in parameters]))
@@ -55,14 +67,13 @@ class Population(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
         stacked = list(self.stacked)
-        if stacked[0].is_cuda:
-            apply = apply_batched
-        elif self.copies > 1 and torch.get_num_threads() > 1:
-            apply = apply_on_cores
-        else:
-            apply = apply_in_turn
         call = _Call(self._template[0], self.names, self.precision)
-        outputs = apply(call, stacked, inputs)
+        if stacked[0].is_cuda:
+            outputs = apply_batched(call, stacked, inputs)
+        elif self.copies > 1 and self.cores > 1:
+            outputs = apply_on_cores(call, stacked, inputs, self.cores)
+        else:
+            outputs = apply_in_turn(call, stacked, inputs)
         return outputs[0] if len(outputs) == 1 else outputs
 
 
@@ -104,11 +115,11 @@ def apply_batched(
 
 
 def apply_on_cores(
-    call: _Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
+    call: _Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor], cores: int
 ) -> tuple[Tensor, ...]:
     """Each copy on one core: small maps keep a core busy, but not several at once."""
     with_graph = torch.is_grad_enabled()  # unknown inside, where gradients are always off
-    return _OnCores.apply(call, with_graph, len(inputs), *inputs, *stacked)
+    return _OnCores.apply(call, _pool(cores), with_graph, len(inputs), *inputs, *stacked)
 
 
 class _OnCores(torch.autograd.Function):
@@ -116,44 +127,55 @@ class _OnCores(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, call: _Call, with_graph: bool, n_inputs: int, *tensors: Tensor
+        ctx: Any,
+        call: _Call,
+        pool: ThreadPoolExecutor,
+        with_graph: bool,
+        n_inputs: int,
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         def one(k: int) -> tuple[tuple[Tensor, ...], list[Tensor]]:
             leaves = [
                 x[k].detach().requires_grad_(with_graph and needs)
-                for x, needs in zip(tensors, ctx.needs_input_grad[3:], strict=True)
+                for x, needs in zip(tensors, ctx.needs_input_grad[4:], strict=True)
             ]
             own = call._replace(network=_own_network(call.network))
             with torch.set_grad_enabled(with_graph):
                 outputs = own(leaves[n_inputs:], leaves[:n_inputs])
             return outputs, leaves
 
-        results = list(_cores().map(one, range(len(tensors[-1]))))
+        results = list(pool.map(one, range(len(tensors[-1]))))
         # The graphs live in ctx, not among its saved tensors: they are made here and freed with it.
-        ctx.graphs = results
+        ctx.graphs, ctx.pool = results, pool
         outputs = zip(*(outputs for outputs, _ in results), strict=True)
         return tuple(torch.stack([o.detach() for o in slices]) for slices in outputs)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        needs = ctx.needs_input_grad[3:]
+        needs = ctx.needs_input_grad[4:]
 
         def one(k: int) -> list[Tensor]:
             outputs, leaves = ctx.graphs[k]
             wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
             return list(torch.autograd.grad(outputs, wanted, [g[k] for g in gradients]))
 
-        results = zip(*_cores().map(one, range(len(ctx.graphs))), strict=True)
+        results = zip(*ctx.pool.map(one, range(len(ctx.graphs))), strict=True)
         stacked = iter([torch.stack(slices) for slices in results])
         ctx.graphs = None
-        return None, None, None, *(next(stacked) if need else None for need in needs)
+        return None, None, None, None, *(next(stacked) if need else None for need in needs)
+
+
+def available_cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @cache
-def _cores() -> ThreadPoolExecutor:
-    """Threads that each compute on one core; as many as torch would use for one operation."""
-    threads = torch.get_num_threads()
-    return ThreadPoolExecutor(threads, "copy", initializer=torch.set_num_threads, initargs=(1,))
+def _pool(cores: int) -> ThreadPoolExecutor:
+    """Threads that each compute on one core."""
+    return ThreadPoolExecutor(cores, "copy", initializer=torch.set_num_threads, initargs=(1,))
 
 
 _networks = threading.local()

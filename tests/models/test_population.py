@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -26,9 +27,9 @@ def apart(copies: int) -> list[UNet]:
     return [small_unet() for _ in range(copies)]
 
 
-def together(copies: int, precision: str = "fp32") -> Population:
+def together(copies: int, precision: str = "fp32", cores: int | None = None) -> Population:
     torch.manual_seed(7)
-    return Population(small_unet, copies, precision)
+    return Population(small_unet, copies, precision, cores)
 
 
 def test_outputs_and_gradients_equal_those_of_networks_apart() -> None:
@@ -47,7 +48,7 @@ def test_outputs_and_gradients_equal_those_of_networks_apart() -> None:
             torch.testing.assert_close(stacked.grad[k], parameter.grad, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("way", [apply_batched, apply_on_cores])
+@pytest.mark.parametrize("way", [apply_batched, partial(apply_on_cores, cores=4)])
 def test_every_way_equals_one_copy_after_the_other(way: Callable) -> None:
     population = together(5)
     planes = torch.rand(5, 4, 3, 7, 9, requires_grad=True)
@@ -68,12 +69,31 @@ def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> No
     call = _Call(population._template[0], population.names, "fp32")
     runs = []
     for _ in range(3):
-        outputs = apply_on_cores(call, list(population.stacked), (planes,))
+        outputs = apply_on_cores(call, list(population.stacked), (planes,), cores=4)
         loss = sum(output.square().sum() for output in outputs)
         runs.append([*outputs, *torch.autograd.grad(loss, list(population.stacked))])
     assert all(parameter.grad is None for parameter in population.stacked)
     for run in runs[1:]:
         assert all(torch.equal(one, other) for one, other in zip(run, runs[0], strict=True))
+
+
+def test_the_number_of_cores_changes_no_bit() -> None:
+    def trained(cores: int) -> list[torch.Tensor]:
+        population, planes = together(5, cores=cores), torch.rand(5, 4, 3, 6, 6)
+        adam = torch.optim.Adam(population.parameters())
+        for _ in range(5):
+            adam.zero_grad()
+            policy, value = population(planes)
+            (policy.square().mean() + value.square().mean()).backward()
+            adam.step()
+        return [parameter.detach() for parameter in population.parameters()]
+
+    results = []
+    for cores in (1, 2, 5):
+        torch.manual_seed(1)
+        results.append(trained(cores))
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
 
 
 def test_one_copy_does_not_see_another() -> None:
@@ -103,7 +123,8 @@ def test_a_network_with_one_output_gives_one_output() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((small_unet, 0), "copies must be at least 1, got 0"),
+        ((small_unet, 0), "copies and cores must be at least 1, got 0 and"),
+        ((small_unet, 1, "fp32", 0), "copies and cores must be at least 1, got 1 and 0"),
         ((small_unet, 1, "fp8"), "precision must be 'fp32' or 'bf16', got 'fp8'"),
         ((lambda: nn.BatchNorm1d(3), 1), "must not have buffers"),
     ],
