@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -120,6 +121,8 @@ class Experiment:
             desc="Solver updates",
             disable=not self._progress,
             smoothing=0,
+            # A file gets a line now and then, not thousands.
+            mininterval=0.1 if sys.stderr.isatty() else 30,
             dynamic_ncols=True,
         )
         with bar:

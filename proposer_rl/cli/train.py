@@ -137,26 +137,32 @@ def run(experiment: Experiment, config: RunConfig) -> float:
 
 
 class EpisodeBar:
-    """A progress bar for the steps of a meta-episode, redrawn for every episode."""
+    """A progress bar for the steps of a meta-episode, redrawn for every episode.
+
+    Args:
+        steps: of an episode.
+        enabled: whether to draw it; it is drawn on a terminal only.
+    """
 
     def __init__(self, steps: int, enabled: bool) -> None:
         self._steps = steps
-        self._enabled = enabled
+        self._enabled = enabled and sys.stderr.isatty()
         self._bar: tqdm | None = None
 
     def __call__(self) -> None:
         """Count one step."""
+        if not self._enabled:
+            return
         if self._bar is None:
             self._bar = tqdm(
                 total=self._steps,
                 desc="  rollouts of the copies",
                 leave=False,
                 position=1,
-                disable=not self._enabled,
                 dynamic_ncols=True,
             )
         self._bar.update()
-        if self._bar.n >= self._steps or not self._enabled:
+        if self._bar.n >= self._steps:
             self._bar.close()
             self._bar = None
 
