@@ -22,6 +22,7 @@ LAYERS = [
     {"task"},
     {"methods"},
     {"cli"},
+    {"bench"},
 ]
 RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 

@@ -52,9 +52,19 @@ def shortest_path_length(level: Level) -> Tensor:
     Returns:
         int64 ``[*B]``, -1 where the goal cannot be reached.
     """
-    field = distance_field(level.walls, level.start)
-    goal = cell_index(level.goal, field.shape[-1])
-    return field.flatten(-2).gather(-1, goal.unsqueeze(-1)).squeeze(-1)
+    height, width = level.walls.shape[-2:]
+    start, goal = (cell_index(cell, width).flatten() for cell in (level.start, level.goal))
+    frontier, unvisited = _begin(cells_first(~level.walls), start)
+    spare = torch.zeros_like(frontier)
+    length = torch.where(start == goal, 0, -1)
+    goal = padded_index(goal, width).unsqueeze(0)
+    for step in range(1, height * width):
+        _spread(frontier, spare, unvisited)
+        frontier, spare = spare, frontier
+        length.masked_fill_(frontier.flatten(0, 1).gather(0, goal).squeeze(0), step)
+        if step % _STEPS_BETWEEN_CHECKS == 0 and not (frontier.any() and (length < 0).any()):
+            break
+    return length.reshape(level.batch_size)
 
 
 def cells_first(grid: Tensor) -> Tensor:

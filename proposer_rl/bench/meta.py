@@ -1,0 +1,170 @@
+"""One meta-environment step against its parts, and the memory of a run."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from proposer_rl.bench.results import Options, Result, Row, Spread, Table
+from proposer_rl.bench.scales import PAPER, QUICK, TINY, Scale
+from proposer_rl.bench.timing import interleave, ratio, threads
+from proposer_rl.curricula import ProposerCurriculum
+from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.methods import Parts, proposer
+from proposer_rl.ppo import PPO
+from proposer_rl.rewards import performance_gain
+from proposer_rl.streams import Streams
+from proposer_rl.task import MazeTask
+
+PARTS = ("generation", "update", "evaluation", "probing")
+
+
+def meta_step(options: Options) -> Result:
+    """A step through TorchRL's interface against what it is made of, called by hand."""
+    if options.tiny:
+        scales = {"tiny": TINY}
+    else:
+        scales = {"quick": QUICK.with_copies(16)}
+        if options.size == "full":
+            scales["paper"] = PAPER
+    rows, tables = [], []
+    for name, scale in scales.items():
+        task = scale.task(options)
+        env = _proposer(task, scale).env
+        parts = _Parts(task, env)
+        with threads(scale.threads):
+            seconds = interleave(
+                {"step": _Step(env), "parts": parts},
+                options.few if scale is PAPER else options.repeats,
+                options.device,
+            )
+        size = f"K = {scale.proposer.rollouts}, {name} values, {scale.precision(options)}"
+        rows.append(
+            Row(
+                f"a meta-environment step, {size}",
+                "the sum of its parts",
+                ratio(seconds["step"], seconds["parts"]),
+                "x",
+                target=None if options.tiny else 1.05,
+                at_most=True,
+                samples=seconds,
+            )
+        )
+        tables.append(parts.table(f"Parts of a meta-environment step, {size}"))
+    return Result(rows, tables)
+
+
+class _Step:
+    """A step with random actions, as a collector makes it."""
+
+    def __init__(self, env: SolverTrainingEnv) -> None:
+        self.env = env
+        self.state = env.reset()
+
+    @torch.no_grad()
+    def __call__(self) -> None:
+        action = self.env.action_spec.rand()
+        _, self.state = self.env.step_and_maybe_reset(self.state.set("action", action))
+
+
+class _Parts:
+    """What a step consists of, without the environment around it."""
+
+    def __init__(self, task: MazeTask, env: SolverTrainingEnv) -> None:
+        self.task = task
+        self.solvers = env.solvers
+        self.validation, self.probes = env.validation, env.probes
+        self.action_spec = env.action_spec
+        self.generators = [
+            Streams(copy, "bench").generator(device=task.device)
+            for copy in range(env.batch_size[0])
+        ]
+        self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
+
+    def __call__(self) -> None:
+        for part in PARTS:
+            timings = interleave({part: getattr(self, part)}, 1, str(self.task.device), warmup=0)
+            self.seconds[part] += timings[part]
+
+    def generation(self) -> None:
+        self.levels = self.task.generate(self.action_spec.rand(), self.generators)
+
+    def update(self) -> None:
+        self.solvers.env.set_levels(self.levels)
+        self.solvers.update(self.generators)
+
+    @torch.no_grad()
+    def evaluation(self) -> None:
+        self.task.evaluate(self.solvers.agent, self.validation, self.generators[0])
+
+    @torch.no_grad()
+    def probing(self) -> None:
+        self.task.probe(self.solvers.agent, self.probes)
+
+    def table(self, title: str) -> Table:
+        """Milliseconds of each part."""
+        whole = sum(Spread.of(times).median for times in self.seconds.values())
+        lines = []
+        for part, times in self.seconds.items():
+            took = Spread.of(times)
+            cells = [f"{1e3 * s:.1f}" for s in (took.median, took.low, took.high)]
+            lines.append([part, f"{took.median / whole:.1%}", *cells])
+        return Table(title, ["part", "share", "median ms", "from", "to"], lines)
+
+
+def memory(options: Options) -> Result:
+    """Peak resident memory of what a run does at the paper's values.
+
+    The steps of a meta-episode follow one another in the same memory; so two are run, and the
+    Proposer is trained on an episode of full length that repeats them.
+    """
+    name, scale = ("tiny", TINY) if options.tiny else ("paper", PAPER)
+    length, steps = scale.proposer.lookahead, 2
+    task = scale.task(options)
+    before = peak_memory()
+    short = replace(scale, proposer=replace(scale.proposer, lookahead=steps))
+    curriculum = _proposer(task, short)
+    # The Solver itself, its levels and measurements are in memory beside its copies.
+    solver = task.solvers([Streams(0, "solver")])
+    curriculum.env.fork(solver.snapshot()[0], Streams(1))
+    rollout = curriculum.proposer.collect()
+    after_steps = peak_memory()
+    long = rollout[:, torch.arange(length) % steps]
+    trainer = PPO(
+        curriculum.env,
+        curriculum.proposer.agent,
+        replace(curriculum.proposer.settings, updates=1, epochs=2),
+    )
+    trainer.optimise(long)
+    task.measure(solver.agent)
+    peak = peak_memory()
+    row = Row(
+        f"peak memory of a run, K = {scale.proposer.rollouts}, {name} values",
+        f"resident, {scale.precision(options)}",
+        Spread.of([peak / 2**30]),
+        "GiB",
+        target=None if options.tiny else 4.0,
+        at_most=True,
+    )
+    lines = [
+        ["libraries and the task", f"{before / 2**30:.2f}"],
+        ["... and meta-environment steps", f"{after_steps / 2**30:.2f}"],
+        ["... and the Proposer's training", f"{peak / 2**30:.2f}"],
+    ]
+    return Result([row], [Table("Peak resident memory", ["after", "GiB"], lines)])
+
+
+def peak_memory() -> int:
+    """Most bytes of memory that this process has had at any time."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # macOS counts bytes, every other system kibibytes.
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _proposer(task: MazeTask, scale: Scale) -> ProposerCurriculum:
+    curriculum: Any = proposer(Parts(task, scale.proposer, seed=0), performance_gain)
+    return curriculum

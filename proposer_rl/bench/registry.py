@@ -1,0 +1,53 @@
+"""The benchmarks by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from proposer_rl.bench.ceiling import against_convolutions
+from proposer_rl.bench.environment import environment_steps
+from proposer_rl.bench.evaluation import exact_evaluation
+from proposer_rl.bench.learning import learning_curves
+from proposer_rl.bench.levels import generation, shortest_paths
+from proposer_rl.bench.meta import memory, meta_step
+from proposer_rl.bench.results import Options, Result
+from proposer_rl.bench.solver import against_plain, overhead, population, precisions
+
+
+class Benchmark(NamedTuple):
+    """A benchmark: what it is about, what runs it, and when it runs without being named.
+
+    Attributes:
+        about: one line for a list.
+        run: the measurement.
+        on: ``"default"``, ``"full"`` (only with the full sizes) or ``"request"``.
+    """
+
+    about: str
+    run: Callable[[Options], Result]
+    on: str = "default"
+
+
+BENCHMARKS = {
+    "levels": Benchmark("levels generated per second", generation),
+    "shortest_paths": Benchmark("shortest paths against networkx and scipy", shortest_paths),
+    "environment": Benchmark("environment steps against Gymnasium", environment_steps),
+    "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),
+    "overhead": Benchmark("what of a Solver update is not the network", overhead),
+    "precision": Benchmark("a Solver update in bf16 against fp32", precisions),
+    "ceiling": Benchmark(
+        "a Solver update against its convolutions alone, and a profile", against_convolutions
+    ),
+    "meta": Benchmark("a meta-environment step against its parts", meta_step),
+    "population": Benchmark("K Solvers in one update against one after another", population),
+    "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
+    "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
+    "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),
+}
+
+
+def selected(names: list[str], full: bool) -> list[str]:
+    """The names given, or without any those that run by default."""
+    allowed = {"default", "full"} if full else {"default"}
+    return names or [name for name, benchmark in BENCHMARKS.items() if benchmark.on in allowed]

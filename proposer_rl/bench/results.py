@@ -1,0 +1,119 @@
+"""What a benchmark is asked and what it answers: plain data that goes through JSON and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from statistics import median
+from typing import Any, Literal
+
+Size = Literal["tiny", "normal", "full"]
+Unit = Literal["x", "%", "/s", "GiB"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every benchmark is told.
+
+    Attributes:
+        repeats: rounds of interleaved timings.
+        precision: of the Solver's network where a benchmark does not compare both; ``auto`` for the
+            faster one.
+        device: where the Solver and its levels live.
+        size: ``tiny`` to see that everything runs, ``full`` for the paper's values throughout.
+    """
+
+    repeats: int = 5
+    precision: str = "auto"
+    device: str = "cpu"
+    size: Size = "normal"
+
+    @property
+    def few(self) -> int:
+        """Rounds of a benchmark of which one takes many seconds."""
+        return (self.repeats + 1) // 2
+
+    @property
+    def tiny(self) -> bool:
+        """Whether only the code is tried, not the machine."""
+        return self.size == "tiny"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and range of one number over the rounds."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: list[float]) -> Spread:
+        """The spread of at least one number."""
+        return cls(median(values), min(values), max(values))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        what: what was measured.
+        against: what it was measured against, or a remark on an absolute number.
+        value: the measurement, in ``unit``; shares in % are fractions here.
+        unit: of the value and the target.
+        target: what is to be reached; None for information only.
+        at_most: whether the target is an upper bound.
+        samples: the timings behind it, in seconds, by name and in the order of the rounds.
+    """
+
+    what: str
+    against: str
+    value: Spread
+    unit: Unit
+    target: float | None = None
+    at_most: bool = False
+    samples: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the median meets the target; None without one."""
+        if self.target is None:
+            return None
+        if self.at_most:
+            return self.value.median <= self.target
+        return self.value.median >= self.target
+
+
+@dataclass(frozen=True)
+class Table:
+    """Details behind the rows: a header and lines of as many cells."""
+
+    title: str
+    header: list[str]
+    lines: list[list[str]]
+
+
+@dataclass
+class Result:
+    """All that one benchmark found."""
+
+    rows: list[Row]
+    tables: list[Table] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain dicts, each row with whether it reached its target."""
+        content = asdict(self)
+        for entry, row in zip(content["rows"], self.rows, strict=True):
+            entry["reached"] = row.reached
+        return content
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Result:
+        """What :meth:`to_json` gave; further entries are ignored."""
+        rows = []
+        for entry in content["rows"]:
+            fields = {key: value for key, value in entry.items() if key != "reached"}
+            rows.append(Row(**{**fields, "value": Spread(**entry["value"])}))
+        tables = [Table(**table) for table in content["tables"]]
+        return cls(rows, tables, list(content["notes"]))

@@ -1,0 +1,234 @@
+"""The benchmarks at tiny sizes: that they run and say what they measured, not how fast."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from proposer_rl.bench.__main__ import main
+from proposer_rl.bench.ceiling import convolutions
+from proposer_rl.bench.environment import bare_dynamics, draw_actions, through_torchrl
+from proposer_rl.bench.plain import PlainPPO, PlainUNet
+from proposer_rl.bench.plain_env import PlainMaze
+from proposer_rl.bench.profiling import kind_of
+from proposer_rl.bench.registry import BENCHMARKS, selected
+from proposer_rl.bench.report import summary
+from proposer_rl.bench.results import Options, Result, Row, Spread
+from proposer_rl.bench.scales import PAPER, QUICK, TINY, Scale, Solvers
+from proposer_rl.bench.timing import interleave, ratio
+from proposer_rl.cli.config import CONFIG_FOLDER, read_config
+from proposer_rl.mazes import MazeEnv, generate_levels
+from proposer_rl.streams import Streams
+
+TRIED = Options(repeats=2, precision="fp32", size="tiny")
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Call the command in a folder of its own; returns its exit code."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["proposer-bench", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    return call
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_every_benchmark_measures_something(name: str) -> None:
+    result = BENCHMARKS[name].run(TRIED)
+    for row in result.rows:
+        assert row.what and row.against
+        assert row.target is None and row.reached is None  # nothing is claimed at this size
+        assert row.value.low <= row.value.median <= row.value.high
+        assert math.isfinite(row.value.median)
+    assert result.rows or result.notes
+    again = Result.from_json(json.loads(json.dumps(result.to_json())))
+    assert again == result
+
+
+def test_the_command_writes_a_table_and_a_file(bench, capsys, tmp_path: Path) -> None:
+    arguments = ["--tiny", "--repeats", "1", "--threads", "1", "--precision", "fp32"]
+    assert bench("shortest_paths", "levels", *arguments, "--output", "b.json") == 0
+    printed = capsys.readouterr()
+    assert "| what" in printed.out and "networkx" in printed.out
+    assert "[2/2] levels:" in printed.err
+    content = json.loads((tmp_path / "b.json").read_text())
+    assert list(content["benchmarks"]) == ["shortest_paths", "levels"]
+    assert content["options"] == {
+        "repeats": 1,
+        "precision": "fp32",
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+        "size": "tiny",
+    }
+    assert content["machine"]["cores"] and content["versions"]["torch"] == torch.__version__
+    for measured in content["benchmarks"].values():
+        assert measured["seconds"] > 0 and measured["threads"] == 1
+        assert measured["peak_memory"] > 50 * 2**20  # torch alone takes more
+        assert Result.from_json(measured["result"]).rows
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_benchmark_that_fails_does_not_stop_the_others(
+    bench, capsys, monkeypatch, tmp_path: Path
+) -> None:
+    # In the worker's own process nothing but the arguments can be changed from here.
+    monkeypatch.setattr("proposer_rl.bench.__main__.selected", lambda *_: ["absent", "levels"])
+    monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
+    assert bench("--tiny", "--repeats", "1", "--threads", "1") == 1
+    assert "KeyError: 'absent'" in capsys.readouterr().err
+    content = json.loads((tmp_path / "bench.json").read_text())
+    assert "error" in content["benchmarks"]["absent"]
+    assert content["benchmarks"]["levels"]["result"]["rows"]
+
+
+def test_lists_the_benchmarks(bench, capsys) -> None:
+    assert bench("--list") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(BENCHMARKS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["level"], "error: unknown benchmark 'level'; choose among: levels, "),
+        (["levels", "--output", "nowhere/b.json"], "there is no folder nowhere"),
+        (["levels", "--device", "abacus"], "error: --device abacus: "),
+        (["levels", "--repeats", "0"], "must be at least 1, got 0"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> None:
+    assert bench(*arguments) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_long_benchmarks_run_on_request() -> None:
+    assert "learning" not in selected([], full=True)
+    assert "memory" in selected([], full=True)
+    assert not {"memory", "learning"} & set(selected([], full=False))
+    assert selected(["learning"], full=False) == ["learning"]
+
+
+@pytest.mark.parametrize(("name", "scale"), [("paper", PAPER), ("quick", QUICK), ("smoke", TINY)])
+def test_the_sizes_are_those_of_the_configuration(name: str, scale: Scale) -> None:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        config = read_config(compose("train", ["+method=perf_gain", f"+scale={name}"]))
+    assert scale.maze == config.maze
+    assert scale.space == config.space
+    assert scale.solver == config.solver
+    assert scale.proposer == config.proposer
+    assert scale.threads == config.threads
+    for key, distribution in scale.distributions.items():
+        assert distribution == config.distributions[key]
+
+
+def test_the_plain_way_learns_the_same_numbers() -> None:
+    """Same rollout, same weights: the reference and the library's PPO end in the same weights."""
+    # Coarsest maps of 2x2 and two channels per group: what GroupNorm sees is then not constant,
+    # for otherwise gradients are rounding errors, which Adam would blow up.
+    scale = replace(
+        TINY.with_solver(channels=[16, 16, 16]), maze=replace(TINY.maze, height=8, width=8)
+    )
+    solvers = Solvers(scale.task(TRIED))
+    solvers.next_levels()
+    solvers.ppo.env.reset()
+    network = PlainUNet(scale.solver.channels)
+    own = list(solvers.ppo.agent.parameters())
+    for plain, parameter in zip(network.parameters(), own, strict=True):
+        plain.data.copy_(parameter.data[0])
+    start = [parameter.detach().clone() for parameter in own]
+    env = MazeEnv(solvers.ppo.env.levels[0], max_steps=scale.maze.max_steps)
+    reference = PlainPPO(env, network, scale.solver.ppo)
+    rollout = reference.collect()
+    reference.advantages(rollout)
+    metrics = solvers.ppo.optimise(rollout.clone().unsqueeze(0))
+    epochs = [reference.epoch(rollout) for _ in range(scale.solver.ppo.epochs)]
+    for part in ("objective", "critic", "entropy"):
+        expected = torch.stack([terms[part].detach() for terms in epochs]).mean()
+        torch.testing.assert_close(metrics[f"loss_{part}"], expected, rtol=1e-4, atol=1e-6)
+    for plain, parameter in zip(network.parameters(), own, strict=True):
+        torch.testing.assert_close(plain, parameter[0], rtol=1e-3, atol=1e-5)
+    assert any(not torch.allclose(p, b, atol=1e-4) for p, b in zip(own, start, strict=True))
+
+
+def test_three_environments_play_alike() -> None:
+    levels = generate_levels(torch.full((16,), 0.2), 3, 6, 6)
+    actions = draw_actions(60, 16, "cpu")
+    env = MazeEnv(levels, max_steps=25)
+    torch.testing.assert_close(through_torchrl(env, actions), bare_dynamics(levels, actions))
+    level = levels[0]
+    maze = PlainMaze(
+        level.walls.numpy(), tuple(level.start.tolist()), tuple(level.goal.tolist()), 25, 0.01
+    )
+    seen, _ = maze.reset()
+    single = MazeEnv(levels[:1], max_steps=25)
+    state = single.reset()
+    assert np.array_equal(seen["planes"], state["planes"][0].numpy())
+    for action in actions[:, 0]:
+        seen, reward, terminated, truncated, _ = maze.step(int(action))
+        step, state = single.step_and_maybe_reset(state.set("action", action[None]))
+        after = step["next"]
+        assert seen["agent"].tolist() == after["agent"][0].tolist()
+        assert reward == pytest.approx(float(after["reward"]))
+        assert (terminated, truncated) == (bool(after["terminated"]), bool(after["truncated"]))
+        if terminated or truncated:
+            maze.reset()
+
+
+def test_the_convolutions_are_those_of_the_solver() -> None:
+    layers = convolutions([64, 128, 256], 128, 10, 10)
+    solver = PAPER.task(TRIED).solvers([Streams(0)])
+    weights = [p for p in solver.agent.parameters() if p.ndim == 5]
+    expected = sorted(tuple(weight.shape[1:4]) for weight in weights)
+    assert sorted((c.outputs, c.inputs, c.kernel) for c in layers) == expected
+    assert [layer.first for layer in layers].count(True) == 1
+    assert sum(c.training_flops for c in layers) * 8 == pytest.approx(0.26e12, rel=0.2)
+
+
+def test_interleaving_alternates_and_pairs_rounds() -> None:
+    called: list[str] = []
+    seconds = interleave(
+        {name: lambda name=name: called.append(name) for name in "ab"}, repeats=3, warmup=1
+    )
+    assert "".join(called) == "abababab"
+    assert {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3}
+    assert ratio([1.0, 4.0, 9.0], [1.0, 2.0, 3.0]) == Spread(2.0, 1.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "at_most", "reached"), [(1.0, False, "no"), (3.0, False, "yes"), (3.0, True, "no")]
+)
+def test_a_row_says_whether_its_target_is_reached(value, at_most, reached) -> None:
+    row = Row("this", "that", Spread.of([value]), "x", target=2.0, at_most=at_most)
+    assert summary([Result([row])]).splitlines()[-1].split("|")[-2].strip() == reached
+
+
+@pytest.mark.parametrize(
+    ("operation", "kind"),
+    [
+        ("mkldnn_convolution", "convolution"),
+        ("native_group_norm_backward", "normalisation"),
+        ("linalg_vector_norm", "optimiser and gradient norm"),
+        ("Optimizer.step#Adam.step", "optimiser and gradient norm"),
+        ("bmm", "upsampling and matrix products"),
+        ("cat", "copies, casts, concatenation"),
+        ("scatter_", "other operations"),
+    ],
+)
+def test_kinds_of_operations(operation: str, kind: str) -> None:
+    assert kind_of(operation) == kind
