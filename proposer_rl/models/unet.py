@@ -9,16 +9,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from proposer_rl.models.convolution import Conv3x3
+
 
 class DoubleConv(nn.Sequential):
     """Twice: 3x3 convolution, GroupNorm, ReLU."""
 
     def __init__(self, in_channels: int, out_channels: int, groups: int) -> None:
         super().__init__(
-            nn.Conv2d(in_channels, out_channels, 3, padding=1),
+            Conv3x3(in_channels, out_channels),
             nn.GroupNorm(groups, out_channels),
             nn.ReLU(inplace=True),
-            nn.Conv2d(out_channels, out_channels, 3, padding=1),
+            Conv3x3(out_channels, out_channels),
             nn.GroupNorm(groups, out_channels),
             nn.ReLU(inplace=True),
         )
