@@ -70,7 +70,7 @@ class Population(nn.Module):
         call = _Call(self._template[0], self.names, self.precision)
         if stacked[0].is_cuda:
             outputs = apply_batched(call, stacked, inputs)
-        elif self.copies > 1 and self.cores > 1:
+        elif self.copies > 1:
             outputs = apply_on_cores(call, stacked, inputs, self.cores)
         else:
             outputs = apply_in_turn(call, stacked, inputs)
@@ -157,7 +157,9 @@ class _OnCores(torch.autograd.Function):
         def one(k: int) -> list[Tensor]:
             outputs, leaves = ctx.graphs[k]
             wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
-            return list(torch.autograd.grad(outputs, wanted, [g[k] for g in gradients]))
+            slopes = [g[k] for g in gradients]
+            # A parameter that the network does not use has a gradient of zero.
+            return list(torch.autograd.grad(outputs, wanted, slopes, materialize_grads=True))
 
         results = zip(*ctx.pool.map(one, range(len(ctx.graphs))), strict=True)
         stacked = iter([torch.stack(slices) for slices in results])

@@ -96,6 +96,26 @@ def test_the_number_of_cores_changes_no_bit() -> None:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
 
 
+def test_a_parameter_that_is_not_used_has_no_slope() -> None:
+    class Half(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.used, self.spare = nn.Linear(3, 2), nn.Linear(3, 2)
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return self.used(x)
+
+    population = Population(Half, 3)
+    population(torch.rand(3, 4, 3)).sum().backward()
+    moved = [bool(parameter.grad.any()) for parameter in population.stacked]
+    assert dict(zip(population.names, moved, strict=True)) == {
+        "used.weight": True,
+        "used.bias": True,
+        "spare.weight": False,
+        "spare.bias": False,
+    }
+
+
 def test_one_copy_does_not_see_another() -> None:
     population = together(2)
     planes = torch.rand(2, 3, 3, 6, 6)
