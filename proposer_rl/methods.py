@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated, Literal, NamedTuple
 
-from annotated_types import Ge, Len
+from annotated_types import Ge, Gt, Len
+from torch import nn
+from torch.distributions import Distribution
 
+from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import (
     Curriculum,
     ProposerCurriculum,
@@ -15,10 +18,21 @@ from proposer_rl.curricula import (
     ScheduleCurriculum,
 )
 from proposer_rl.meta_env import SolverTrainingEnv
-from proposer_rl.models import ProposerNetwork, proposer_actor_critic
+from proposer_rl.models import (
+    ActorCritic,
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    joint_categorical,
+    normal,
+    proposer_actor_critic,
+)
 from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
 from proposer_rl.rewards import Reward
 from proposer_rl.settings import settings
+from proposer_rl.solver_view import SolverView
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask
 
@@ -30,20 +44,36 @@ class ProposerSettings:
     Attributes:
         rollouts: copies K of the Solver that are trained side by side.
         lookahead: updates L of a meta-episode.
+        updates_per_step: updates for which an action holds; divides ``lookahead``.
         validation_levels: size E of the batch that the gain is measured on.
         probe_levels: number C of target levels through which the Solver is seen.
-        ratio: PPO's ratio over the P draws together, or for each draw.
+        observes: what is seen beside the probes.
+        common_random_numbers: whether the copies differ by their actions alone.
+        proposals: an action's meaning: the choice of every problem, or a mixture of choices.
+        ratio: of ``problems``: PPO's ratio over the P draws together, or for each draw.
+        directions: of a ``mixture``: what an action's numbers stand for.
+        spread: of a ``mixture``: standard deviation of the first policy.
+        own_action: what the Solver itself trains on: a sample of the policy or its mode.
         advance: what becomes of the Solver after a meta-episode.
+        advantage: by a critic (``gae``), or against the mean of the other ``copies``.
         context, hidden, channels, bands: sizes of the network.
         ppo: PPO's numbers; its horizon is ``lookahead``.
     """
 
     rollouts: Annotated[int, Ge(1)] = 16
     lookahead: Annotated[int, Ge(1)] = 50
+    updates_per_step: Annotated[int, Ge(1)] = 1
     validation_levels: Annotated[int, Ge(1)] = 75
     probe_levels: Annotated[int, Ge(0)] = 16
+    observes: list[Literal["validation_return", "progress"]] = field(default_factory=list)
+    common_random_numbers: bool = False
+    proposals: Literal["problems", "mixture"] = "problems"
     ratio: Literal["joint", "per_problem"] = "per_problem"
+    directions: Literal["linear", "quadratic", "all"] = "linear"
+    spread: Annotated[float, Gt(0)] = 1.0
+    own_action: Literal["sample", "mode"] = "sample"
     advance: Literal["train", "best", "random"] = "train"
+    advantage: Literal["gae", "copies"] = "gae"
     context: Annotated[int, Ge(1)] = 128
     hidden: Annotated[int, Ge(1)] = 128
     channels: Annotated[list[Annotated[int, Ge(1)]], Len(1)]
@@ -93,29 +123,79 @@ def proposer(parts: Parts, reward: Reward) -> Curriculum:
     """Train on the proposals of an agent that is rewarded for each of the Solver's updates."""
     task, chosen = parts.task, parts.proposer
     streams = Streams(parts.seed, "proposer")
+    action = ACTIONS[chosen.proposals](task, chosen)
     env = SolverTrainingEnv(
         task.solvers([streams] * chosen.rollouts),
-        generate=task.generate,
-        target=task.sample_target,
-        evaluate=task.evaluate,
-        probe=task.probe,
+        view=_view(task, chosen),
+        proposals=action.proposals,
         reward=reward,
-        choices=task.space.size,
         episode_length=chosen.lookahead,
-        validation_levels=chosen.validation_levels,
-        probe_levels=chosen.probe_levels,
+        updates_per_step=chosen.updates_per_step,
+        common_random_numbers=chosen.common_random_numbers,
         on_step=parts.on_step,
     )
     with streams.as_default("weights"):
-        network = ProposerNetwork(
-            env.observation_spec["probes"].shape[2],
-            problems=task.solver.problems,
-            choices=task.space.size,
-            context=chosen.context,
-            hidden=chosen.hidden,
-            channels=chosen.channels,
-            bands=chosen.bands,
-        ).to(task.device)
-    agent = proposer_actor_critic(network, chosen.ratio)
-    ppo = PPO(env, agent, replace(chosen.ppo, horizon=chosen.lookahead))
-    return ProposerCurriculum(ppo, advance=chosen.advance, histogram=task.space.histogram)
+        agent = _agent(task, chosen, action)
+    numbers = replace(chosen.ppo, horizon=env.steps)
+    advantage = CopiesBaseline(numbers.gamma) if chosen.advantage == "copies" else None
+    return ProposerCurriculum(
+        PPO(env, agent, numbers, advantage),
+        own_action=chosen.own_action,
+        advance=chosen.advance,
+        table=lambda counts: counts.unflatten(0, task.space.shape),
+    )
+
+
+class _Action(NamedTuple):
+    """What an action means, the head that makes it of a context, and its distribution."""
+
+    proposals: Proposals
+    head: Callable[[int], nn.Module]
+    distribution: Callable[..., Distribution]
+
+
+def _problems(task: MazeTask, chosen: ProposerSettings) -> _Action:
+    size, problems = task.space.size, task.solver.problems
+    return _Action(
+        ProblemChoices(size, task.generate),
+        lambda width: ProblemHead(width, problems, size, hidden=chosen.hidden, bands=chosen.bands),
+        joint_categorical if chosen.ratio == "joint" else categorical,
+    )
+
+
+def _mixture(task: MazeTask, chosen: ProposerSettings) -> _Action:
+    directions = task.directions(chosen.directions)
+    return _Action(
+        Mixture(directions, task.generate),
+        lambda width: MixtureHead(
+            width, directions.shape[0], hidden=chosen.hidden, spread=chosen.spread
+        ),
+        normal,
+    )
+
+
+ACTIONS = {"problems": _problems, "mixture": _mixture}
+
+
+def _view(task: MazeTask, chosen: ProposerSettings) -> SolverView:
+    return SolverView(
+        target=task.sample_target,
+        evaluate=task.evaluate,
+        probe=task.probe,
+        validation_levels=chosen.validation_levels,
+        probe_levels=chosen.probe_levels,
+        device=task.device,
+    )
+
+
+def _agent(task: MazeTask, chosen: ProposerSettings, action: _Action) -> ActorCritic:
+    numbers = len(chosen.observes)
+    network = ProposerNetwork(
+        action.head(chosen.context + numbers),
+        task.probe_channels,
+        numbers=numbers,
+        context=chosen.context,
+        hidden=chosen.hidden,
+        channels=chosen.channels,
+    ).to(task.device)
+    return proposer_actor_critic(network, action.distribution, ["probes", *chosen.observes])

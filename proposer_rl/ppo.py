@@ -7,6 +7,7 @@ if each were alone, and everything that training changes can be taken out and pu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import torch
@@ -69,12 +70,20 @@ class PPO:
         agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
             independent copies, which decides over what losses, advantages and norms are taken.
         settings: PPO's numbers.
+        advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
+            TorchRL's :class:`GAE` with the settings' numbers.
 
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of copies.
     """
 
-    def __init__(self, env: EnvBase, agent: ActorCritic, settings: PPOSettings) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        advantage: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> None:
         if agent.copies is not None and env.batch_size[:1] != (agent.copies,):
             raise ValueError(
                 f"the agent has {agent.copies} copies, so the environment's first dimension must "
@@ -94,7 +103,9 @@ class PPO:
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-        self._gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None)
+        self._advantage = advantage or GAE(
+            gamma=settings.gamma, lmbda=settings.lmbda, value_network=None
+        )
         actor, critic = agent.readout()
         self._loss = ClipPPOLoss(
             actor,
@@ -167,7 +178,7 @@ class PPO:
         for update in range(self.settings.updates):
             if update:
                 self._set_values(rollout, level)
-            self._gae(rollout)
+            self._advantage(rollout)
             batch = rollout.select(
                 *self.agent.step_keys,
                 self.agent.action_key,

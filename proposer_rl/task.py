@@ -26,6 +26,7 @@ from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 
 ACTIONS = 4
+PLANES = 3
 RECORDED_LEVELS = 8
 
 Mechanism = Literal["uniform", "path_first"]
@@ -180,7 +181,7 @@ class MazeTask:
         def make() -> nn.Module:
             with next(weights).as_default("weights"):
                 return UNet(
-                    in_channels=4 if self.maze.observe_agent else 3,
+                    in_channels=PLANES + self.maze.observe_agent,
                     head_channels=(ACTIONS, 1),
                     channels=self.solver.channels,
                     groups=self.solver.groups,
@@ -208,6 +209,21 @@ class MazeTask:
         stacked: Any = torch.stack(levels)
         return stacked
 
+    def directions(self, kind: str) -> Tensor:
+        """What the numbers of a mixture add to the log-shares of the space, float [D, M * N].
+
+        Args:
+            kind: ``"linear"``: more obstacles and longer paths (D = 2); ``"quadratic"``: also the
+                squares and the product of both, so that a mixture can favour the middle (D = 5);
+                ``"all"``: every specification by itself (D = M * N).
+        """
+        if kind == "all":
+            return torch.eye(self.space.size, device=self.device)
+        x, y = self.space.coordinates.to(self.device).unbind(-1)
+        linear = [x, y]
+        quadratic = [*linear, x.square(), y.square(), x * y]
+        return torch.stack({"linear": linear, "quadratic": quadratic}[kind])
+
     def sample_target(self, count: int, generator: torch.Generator) -> Level:
         """Levels [count] of the target distribution."""
         return self.target.sample(count, generator)
@@ -226,6 +242,9 @@ class MazeTask:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
         copies, logits = _with_logits(solver, levels)
         return torch.cat([planes(copies), logits], -3)
+
+    probe_channels = PLANES + ACTIONS
+    """Channels of a probe."""
 
     def measure(self, solver: ActorCritic) -> TensorDict:
         """Exact means over the fixed levels of each distribution measured on, each [K].

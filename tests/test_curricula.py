@@ -2,30 +2,50 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import nn
 
+from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import (
     Curriculum,
+    FrozenProposer,
+    Improvement,
     ProposerCurriculum,
     SamplingCurriculum,
     ScheduleCurriculum,
+    load_agent,
 )
-from proposer_rl.models import ProposerNetwork, proposer_actor_critic
+from proposer_rl.models import (
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    normal,
+    proposer_actor_critic,
+)
 from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.streams import Streams
-from tests.test_meta_env import SPACE, K, L, P, meta_env, solvers
+from tests.test_meta_env import SPACE, K, L, P, meta_env, mixture, solvers
 
 
 def sample(count: int, generator: torch.Generator):
     return SPACE.sample((count,), generator)
 
 
-def proposer(advance: str = "train", ratio: str = "per_problem", **ppo) -> ProposerCurriculum:
-    env = meta_env()
+def network(head: nn.Module) -> ProposerNetwork:
+    return ProposerNetwork(head, 7, context=8, hidden=8, channels=(8, 8))
+
+
+def proposer(
+    advance: str = "train", *, own_action: str = "sample", mix: bool = False, **options
+) -> ProposerCurriculum:
+    """A Proposer of problem choices, or of mixtures that hold for the options' updates."""
+    env = meta_env(**({"proposals": mixture()} if mix else {}), **options)
     torch.manual_seed(0)
-    network = ProposerNetwork(7, P, SPACE.size, context=8, hidden=8, channels=(8, 8))
-    settings = PPOSettings(horizon=L, gamma=1.0, epochs=2, **ppo)
-    ppo = PPO(env, proposer_actor_critic(network, ratio), settings)
-    return ProposerCurriculum(ppo, advance=advance, histogram=SPACE.histogram)
+    head = MixtureHead(8, SPACE.size, hidden=8) if mix else ProblemHead(8, P, SPACE.size, hidden=8)
+    settings = PPOSettings(horizon=env.steps, gamma=1.0, epochs=2)
+    agent = proposer_actor_critic(network(head), normal if mix else categorical)
+    ppo = PPO(env, agent, settings, CopiesBaseline(1.0) if mix else None)
+    return ProposerCurriculum(ppo, advance=advance, own_action=own_action)
 
 
 def test_a_copys_levels_depend_on_its_stream_alone() -> None:
@@ -82,7 +102,7 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
     torch.testing.assert_close(
         torch.tensor(metrics["total_gain"]), torch.tensor(metrics["total_reward"])
     )
-    assert sum(map(sum, metrics["histogram"])) == K * L * P
+    assert sum(metrics["histogram"]) == K * L * P
     assert not (curriculum.proposer.snapshot() == before).all()
 
 
@@ -114,24 +134,71 @@ def test_proposals_are_a_function_of_solver_proposer_and_stream() -> None:
     assert (one == same).all() and not (one == other).all()
 
 
-def test_a_restored_proposer_proposes_and_improves_alike() -> None:
-    original, solver = proposer(), solvers(1)
+@pytest.mark.parametrize("mix", [False, True])
+def test_a_restored_proposer_proposes_and_improves_alike(mix: bool) -> None:
+    options = {"mix": True, "episode_length": 4, "updates_per_step": 4} if mix else {}
+    original, solver = proposer(**options), solvers(1)
     original.improve(solver, [Streams(0, "cycle", 0)])
-    resumed = proposer()
+    original.propose(solver, [Streams(0, "update", 0)])
+    original.observe(None, None)
+    resumed = proposer(**options)
     resumed.load_state_dict(original.state_dict())
     for curriculum in (original, resumed):
-        curriculum.levels = curriculum.propose(solver, [Streams(0, "update", 3)])
+        # In the middle of a step of 4 updates the action is that of its first.
+        curriculum.levels = curriculum.propose(solver, [Streams(0, "update", 1)])
         curriculum.outcome = curriculum.improve(solver, [Streams(0, "cycle", 1)])
     assert (original.levels == resumed.levels).all()
     assert original.outcome == resumed.outcome
 
 
+def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
+    options = {"mix": True, "episode_length": 4, "updates_per_step": 2}
+    actions = {}
+    for own in ("sample", "mode"):
+        curriculum, solver = proposer(own_action=own, **options), solvers(1)
+        curriculum.improve(solver, [Streams(0, "cycle", 0)])
+        actions[own] = []
+        for update in range(4):
+            curriculum.propose(solver, [Streams(0, "update", update)])
+            curriculum.observe(None, None)
+            actions[own].append(curriculum.state_dict()["action"])
+    first, same, other, _ = actions["sample"]
+    assert torch.equal(first, same) and not torch.equal(first, other)
+    expected = curriculum.agent(curriculum.view.observe(solver.agent, 0.5))["logits"][..., 0]
+    torch.testing.assert_close(actions["mode"][2], expected)
+
+
+def test_a_frozen_proposer_proposes_what_it_learnt_and_costs_nothing() -> None:
+    learnt, solver = proposer(), solvers(1)
+    learnt.improve(solver, [Streams(0, "cycle", 0)])
+    head = ProblemHead(8, P, SPACE.size, hidden=8)
+    agent = proposer_actor_critic(network(head), categorical)
+    load_agent(agent, learnt.proposer.snapshot())
+    env = meta_env()
+    frozen = FrozenProposer(agent, env.view, env.proposals, episode_length=L)
+    assert frozen.improve(solver, [Streams(0, "cycle", 0)]) == Improvement()
+    for update in range(3):
+        levels = [
+            curriculum.propose(solver, [Streams(0, "update", update)])
+            for curriculum in (learnt, frozen)
+        ]
+        assert (levels[0] == levels[1]).all()
+
+
+def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:
+    agent = proposer_actor_critic(network(MixtureHead(8, 3, hidden=8)), normal)
+    with pytest.raises(ValueError, match="belongs to another network"):
+        load_agent(agent, proposer().proposer.snapshot())
+
+
 def test_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match=r"advance must be one of .* got 'all'"):
         proposer("all")
+    with pytest.raises(ValueError, match=r"own_action must be one of .* got 'mean'"):
+        proposer(own_action="mean")
     with pytest.raises(ValueError, match="must be a SolverTrainingEnv"):
         ProposerCurriculum(solvers(1))
-    with pytest.raises(ValueError, match="horizon 4 must be the meta-environment's episode"):
+    with pytest.raises(ValueError, match="horizon 4 must be the meta-environment's number of"):
         settings = PPOSettings(horizon=4)
-        agent = proposer_actor_critic(ProposerNetwork(7, P, SPACE.size))
+        agent = proposer_actor_critic(network(ProblemHead(8, P, SPACE.size)), categorical)
         ProposerCurriculum(PPO(meta_env(), agent, settings))

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
     {"mazes", "models", "run_folder", "checkpoint", "settings", "streams"},
-    {"ppo", "evaluation", "rewards", "report"},
+    {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
     {"meta_env"},
     {"curricula"},
     {"experiment"},
@@ -30,7 +30,7 @@ RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 NEIGHBOURS = {("checkpoint", "run_folder")}
 
 # These work with any environment and any level: they are reused where there are no mazes.
-KNOW_NO_MAZES = {"ppo", "meta_env", "experiment"}
+KNOW_NO_MAZES = {"ppo", "advantages", "proposals", "solver_view", "meta_env", "experiment"}
 
 # Everything but the command line takes plain arguments.
 CONFIGURATION = {"hydra", "omegaconf", "pydantic"}

@@ -12,7 +12,9 @@ from proposer_rl.mazes import Level, MazeEnv, SpecificationSpace, planes
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.proposals import Mixture, ProblemChoices
 from proposer_rl.rewards import Reward, performance_gain, task_difficulty
+from proposer_rl.solver_view import SolverView
 from proposer_rl.streams import Streams
 
 K, P, C, E, L = 3, 4, 2, 6, 5
@@ -46,21 +48,31 @@ def solvers(copies: int, learning_rate: float = 3e-3) -> PPO:
     return PPO(env, map_actor_critic(population), settings)
 
 
-def meta_env(reward: Reward = performance_gain, **options) -> SolverTrainingEnv:
-    sizes = {"episode_length": L, "validation_levels": E, "probe_levels": C, "choices": SPACE.size}
-    return SolverTrainingEnv(
-        solvers(K),
-        generate=generate,
+def view(probe_levels: int = C) -> SolverView:
+    return SolverView(
         target=target,
         evaluate=evaluate,
         probe=probe,
-        reward=reward,
-        **{**sizes, **options},
+        validation_levels=E,
+        probe_levels=probe_levels,
     )
 
 
+def meta_env(
+    reward: Reward = performance_gain, *, probe_levels: int = C, **options
+) -> SolverTrainingEnv:
+    parts = {"proposals": ProblemChoices(SPACE.size, generate), "episode_length": L}
+    return SolverTrainingEnv(
+        solvers(K), view=view(probe_levels), reward=reward, **{**parts, **options}
+    )
+
+
+def mixture() -> Mixture:
+    return Mixture(torch.eye(SPACE.size), generate)
+
+
 def play(env: SolverTrainingEnv, actions: torch.Tensor) -> TensorDict:
-    """Step through actions [L, K, P]; the transitions [K, L]."""
+    """Step through actions [T, K, ...]; the transitions [K, T]."""
     state, steps = env.reset(), []
     for action in actions:
         step, state = env.step_and_maybe_reset(state.set("action", action))
@@ -72,9 +84,18 @@ def some_actions() -> torch.Tensor:
     return torch.randint(SPACE.size, (L, K, P), generator=torch.Generator().manual_seed(1))
 
 
-@pytest.mark.parametrize("probes", [0, C])
-def test_specs(probes: int) -> None:
-    check_env_specs(meta_env(probe_levels=probes), break_when_any_done="both")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"probe_levels": 0},
+        {"proposals": mixture()},
+        {"episode_length": 6, "updates_per_step": 3},
+        {"common_random_numbers": True},
+    ],
+)
+def test_specs(options: dict) -> None:
+    check_env_specs(meta_env(**options), break_when_any_done="both")
 
 
 def test_an_episode_is_a_plain_loop_over_one_solver() -> None:
@@ -87,23 +108,23 @@ def test_an_episode_is_a_plain_loop_over_one_solver() -> None:
         solver.restore(start)
         returns = [evaluate(solver.agent, validation, None)["return"].mean()]
         for step in range(L):
-            levels = SPACE.generate(actions[step, k], streams.generator("levels", 0, step, k))
+            levels = SPACE.generate(actions[step, k], streams.generator(0, step, k, "levels"))
             solver.env.set_levels(levels[None])
-            solver.update([streams.generator("actions", 0, step, k)])
+            solver.update([streams.generator(0, step, k, "actions")])
             returns.append(evaluate(solver.agent, validation, None)["return"].mean())
         gains = torch.stack(returns).diff()
         torch.testing.assert_close(steps["next", "reward"][k, :, 0], gains, rtol=1e-3, atol=1e-5)
         assert gains.abs().max() > 1e-3
-        own = probe(solver.agent, env.probes)[0]
+        own = probe(solver.agent, env.view.probes)[0]
         torch.testing.assert_close(steps["next", "probes"][k, -1], own, rtol=1e-3, atol=1e-4)
 
 
 def test_rewards_sum_to_the_total_gain_on_the_one_validation_batch() -> None:
     env = meta_env()
     env.fork(solvers(1).snapshot()[0], Streams(2))
-    validation = env.validation.clone()
+    validation = env.view.validation.clone()
     steps = play(env, some_actions())
-    assert (env.validation == validation).all()
+    assert (env.view.validation == validation).all()
     final = evaluate(env.solvers.agent, validation, None)["return"].mean(1)
     initial = evaluate(solvers(1).agent, validation, None)["return"].mean(1)
     torch.testing.assert_close(steps["next", "reward"].sum((1, 2)), final - initial)
@@ -143,7 +164,7 @@ def test_trained_solvers_stay_readable_after_the_automatic_reset() -> None:
     env.fork(solvers(1).snapshot()[0], Streams(4))
     steps = play(env, some_actions())
     assert steps["next", "done"][:, -1].all() and not steps["next", "done"][:, :-1].any()
-    after = evaluate(env.solvers.agent, env.validation, None)["return"].mean(1)
+    after = evaluate(env.solvers.agent, env.view.validation, None)["return"].mean(1)
     torch.testing.assert_close(after, steps["next", "validation_return"][:, -1, 0])
 
 
@@ -161,13 +182,67 @@ def test_every_step_is_reported() -> None:
     assert len(calls) == L
 
 
-def test_refuses_sizes_and_solvers_that_make_no_sense() -> None:
-    with pytest.raises(ValueError, match=r"episode_length.* got 0, 6, 4, 2"):
-        meta_env(episode_length=0)
+def test_an_action_that_holds_is_the_same_action_repeated() -> None:
+    actions = some_actions()[:2]
+    held = meta_env(episode_length=4, updates_per_step=2)
+    each = meta_env(episode_length=4)
+    played = []
+    for env, script in ((held, actions), (each, actions.repeat_interleave(2, 0))):
+        env.fork(solvers(1).snapshot()[0], Streams(3))
+        played.append(play(env, script))
+    few, many = played
+    assert few.batch_size == (K, 2)
+    for entry in ("probes", "validation_return", "done", "progress"):
+        assert torch.equal(few["next", entry], many["next", entry][:, 1::2])
+    for entry in ("reward", "proposed"):
+        pairs = many["next", entry].unflatten(1, (2, 2)).sum(2)
+        torch.testing.assert_close(few["next", entry], pairs)
+
+
+def test_a_held_actions_reward_adds_up_over_its_updates() -> None:
+    env = meta_env(task_difficulty, episode_length=4, updates_per_step=4)
+    env.fork(solvers(1).snapshot()[0], Streams(3))
+    action = torch.zeros(1, K, P, dtype=torch.int64)
+    reward = play(env, action)["next", "reward"].flatten()
+    assert ((reward > 0) & (reward <= 4)).all() and (reward > 1).any()
+
+
+def test_what_was_proposed_is_counted() -> None:
+    env, actions = meta_env(), some_actions()
+    env.fork(solvers(1).snapshot()[0], Streams(3))
+    counted = play(env, actions)["next", "proposed"]
+    for k in range(K):
+        for step in range(L):
+            expected = actions[step, k].bincount(minlength=SPACE.size)
+            assert torch.equal(counted[k, step], expected)
+
+
+def test_progress_runs_from_zero_to_one() -> None:
+    env = meta_env()
+    steps = play(env, some_actions())
+    expected = torch.arange(L + 1) / L
+    torch.testing.assert_close(steps["progress"][0, :, 0], expected[:-1])
+    torch.testing.assert_close(steps["next", "progress"][0, :, 0], expected[1:])
+
+
+def test_with_common_random_numbers_equal_actions_have_equal_consequences() -> None:
+    action = torch.randn(1, 1, SPACE.size).expand(L, K, -1)
+    spread = []
+    for common in (True, False):
+        env = meta_env(proposals=mixture(), common_random_numbers=common)
+        env.fork(solvers(1).snapshot()[0], Streams(3))
+        returns = play(env, action)["next", "validation_return"]
+        spread.append(returns.std(0).max())
+    assert spread[0] == 0 < spread[1]
+
+
+def test_refuses_lengths_and_solvers_that_make_no_sense() -> None:
+    for length, held in ((0, 1), (5, 2), (4, 0)):
+        with pytest.raises(ValueError, match=rf"multiple of updates_per_step; got {length} and"):
+            meta_env(episode_length=length, updates_per_step=held)
+    with pytest.raises(ValueError, match="at least 0; got 6, -1"):
+        meta_env(probe_levels=-1)
     ppo = solvers(1)
     ppo.agent.copies = None
     with pytest.raises(ValueError, match="must be a population"):
-        SolverTrainingEnv(
-            ppo, generate=generate, target=target, evaluate=evaluate, probe=probe,
-            reward=performance_gain, choices=4,
-        )  # fmt: skip
+        SolverTrainingEnv(ppo, view=view(), proposals=mixture(), reward=performance_gain)

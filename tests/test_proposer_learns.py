@@ -1,73 +1,97 @@
-"""The unchanged Proposer, collector and loss on a meta-environment whose best answer is known."""
+"""The unchanged Proposer, collector and loss on a Solver whose best curriculum is known."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
+import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
-from proposer_rl.models import ProposerNetwork, proposer_actor_critic
+from proposer_rl.advantages import CopiesBaseline
+from proposer_rl.curricula import total_gain
+from proposer_rl.models import (
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    normal,
+    proposer_actor_critic,
+)
 from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.proposals import Mixture, ProblemChoices
 from proposer_rl.streams import Streams
+from tests.skill_ladder import best_constant, best_sequence, even, ladder_env
 
-K, P, N, L = 16, 4, 4, 5
-
-
-class WorthOfChoices(EnvBase):
-    """Pays the mean worth of the P choices; which choice is worth most is seen in the probes.
-
-    ``shuffled`` pays every copy what another one earned.
-    """
-
-    def __init__(self, shuffled: bool = False) -> None:
-        super().__init__(batch_size=[K])
-        self.shuffled = shuffled
-        self.observation_spec = Composite(probes=Unbounded((K, 1, N, 4, 4)), shape=[K])
-        self.action_spec = Categorical(N, shape=(K, P), dtype=torch.int64)
-        self.reward_spec = Unbounded((K, 1))
-        flag = Categorical(2, shape=(K, 1), dtype=torch.bool)
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=[K])
-        self.best = torch.arange(K) % N  # copy k's best choice is k mod N
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
-        self.steps = 0
-        return self._observe(False)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.steps += 1
-        worth = (tensordict["action"] == self.best[:, None]).float().mean(-1, keepdim=True)
-        paid = worth.roll(1, 0) if self.shuffled else worth
-        return self._observe(self.steps == L).set("reward", paid)
-
-    def _observe(self, done: bool) -> TensorDict:
-        shown = torch.nn.functional.one_hot(self.best, N).float()[:, None, :, None, None]
-        flag = torch.full((K, 1), done)
-        probes = shown.expand(K, 1, N, 4, 4)
-        return TensorDict({"probes": probes, "done": flag, "terminated": flag.clone()}, [K])
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random."""
+SKILLS, UPDATES, COPIES, PROBLEMS = 3, 6, 16, 16
 
 
-def final_worth(seed: int, shuffled: bool = False) -> float:
-    """Mean worth of the choices after training; chance is 1 / N, the best is 1."""
-    with Streams(seed).as_default("weights"):
-        network = ProposerNetwork(N, P, N, context=32, hidden=32, channels=(8,))
-    settings = PPOSettings(horizon=L, updates=1, epochs=8, gamma=1.0, learning_rate=3e-3)
-    ppo = PPO(WorthOfChoices(shuffled), proposer_actor_critic(network), settings)
-    for cycle in range(80):
-        rollout = ppo.update([Streams(seed).generator(cycle, k) for k in range(K)]).rollout
-    chosen: Tensor = rollout["action"] == ppo.env.best[:, None, None]
-    return float(chosen.float().mean())
+def problem_choices(*, shuffled: bool = False) -> PPO:
+    """The paper's Proposer: every problem's choice is an action, a critic tells the advantage."""
+    env = ladder_env(
+        lambda generate: ProblemChoices(SKILLS, generate),
+        copies=COPIES,
+        problems=PROBLEMS,
+        shuffled=shuffled,
+        episode_length=UPDATES,
+    )
+    head = ProblemHead(33, PROBLEMS, SKILLS, hidden=32)
+    return _ppo(env, head, categorical, None)
 
 
-def test_the_proposer_finds_the_best_choice_for_the_solver_that_it_sees() -> None:
-    assert min(final_worth(seed) for seed in (0, 1)) > 0.9
+def mixtures(*, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False) -> PPO:
+    """Mixtures as actions; the other copies tell the advantage."""
+    choices = SKILLS + idle
+    env = ladder_env(
+        lambda generate: Mixture(torch.eye(choices), generate),
+        copies=COPIES,
+        problems=PROBLEMS,
+        shuffled=shuffled,
+        episode_length=UPDATES,
+        updates_per_step=updates_per_step,
+    )
+    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, CopiesBaseline(1.0))
 
 
-def test_it_does_not_when_the_rewards_are_shuffled_between_copies() -> None:
-    assert final_worth(0, shuffled=True) < 0.4
+def _ppo(env, head, distribution, advantage) -> PPO:
+    network = ProposerNetwork(head, SKILLS, numbers=1, context=32, hidden=32, channels=(8,))
+    agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
+    settings = PPOSettings(horizon=env.steps, epochs=8, gamma=1.0, learning_rate=3e-3)
+    return PPO(env, agent, settings, advantage)
+
+
+def learnt_gain(make: Callable[..., PPO], seed: int, cycles: int = 60, **options) -> float:
+    """Mean total gain of the last ten cycles, each from a beginner."""
+    streams = Streams(seed)
+    with streams.as_default("weights"):
+        proposer = make(**options)
+    beginner, gains = proposer.env.solvers.snapshot()[0], []
+    for cycle in range(cycles):
+        proposer.env.fork(beginner, streams.within(cycle))
+        generators = [streams.generator(cycle, "proposals", k) for k in range(COPIES)]
+        gains.append(total_gain(proposer.update(generators).rollout).mean())
+    return float(torch.stack(gains[-10:]).mean())
+
+
+def test_the_even_mixture_is_far_from_the_best() -> None:
+    assert even(SKILLS, UPDATES, SKILLS) < 0.2 * best_sequence(SKILLS, UPDATES)
+    assert even(SKILLS, UPDATES, 2 * SKILLS) < 0.2 * best_constant(SKILLS, UPDATES, PROBLEMS)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("make", [problem_choices, mixtures])
+def test_it_finds_the_best_curriculum(make: Callable[..., PPO], seed: int) -> None:
+    assert learnt_gain(make, seed) > 0.9 * best_sequence(SKILLS, UPDATES)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_it_finds_the_best_mixture_where_one_action_holds_for_an_episode(seed: int) -> None:
+    best = best_constant(SKILLS, UPDATES, PROBLEMS)
+    held = {"idle": SKILLS, "updates_per_step": UPDATES}
+    assert learnt_gain(mixtures, seed, cycles=160, **held) > 0.9 * best
+
+
+@pytest.mark.parametrize("make", [problem_choices, mixtures])
+def test_it_does_not_when_the_rewards_are_shuffled_between_copies(
+    make: Callable[..., PPO],
+) -> None:
+    assert learnt_gain(make, 0, shuffled=True) < 0.4 * best_sequence(SKILLS, UPDATES)

@@ -77,7 +77,7 @@ class _Parts:
     def __init__(self, task: MazeTask, env: SolverTrainingEnv) -> None:
         self.task = task
         self.solvers = env.solvers
-        self.validation, self.probes = env.validation, env.probes
+        self.validation, self.probes = env.view.validation, env.view.probes
         self.action_spec = env.action_spec
         self.generators = [
             Streams(copy, "bench").generator(device=task.device)

@@ -9,16 +9,16 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Advance, Curriculum, Improvement
+from proposer_rl.curricula.base import Advance, Improvement
+from proposer_rl.curricula.frozen_proposer import FrozenProposer
 from proposer_rl.meta_env import SolverTrainingEnv
-from proposer_rl.models import draw
 from proposer_rl.ppo import PPO, Update
 from proposer_rl.streams import Streams
 
 ADVANCES = ("train", "best", "random")
 
 
-class ProposerCurriculum(Curriculum):
+class ProposerCurriculum(FrozenProposer):
     """Proposals of an agent that is trained on what they do to copies of the Solver.
 
     Before each cycle K copies of the Solver go through one episode of the meta-environment; the
@@ -26,42 +26,54 @@ class ProposerCurriculum(Curriculum):
 
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta_env.SolverTrainingEnv` and
-            whose horizon is that environment's episode length.
+            whose horizon is the number of steps of that environment's episodes.
+        own_action: what is proposed to the Solver itself; see :class:`FrozenProposer`.
         advance: ``"train"``: the Solver trains on new proposals; ``"best"`` or ``"random"``: it
             becomes the copy with the greatest total gain, or any, with its optimiser.
-        histogram: counts of an action's choices, for the record: int64 [*, P] to nested lists.
+        table: arranges counts of the choices, int64 [N], for the record.
 
     Raises:
-        ValueError: for an unknown ``advance``, or a horizon other than the episode.
+        ValueError: for an unknown ``advance`` or ``own_action``, or a horizon other than the
+            episode's.
     """
 
     def __init__(
         self,
         proposer: PPO,
         *,
+        own_action: str = "sample",
         advance: str = "train",
-        histogram: Callable[[Tensor], Tensor] | None = None,
+        table: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         env = proposer.env
         if not isinstance(env, SolverTrainingEnv):
             raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
         if advance not in ADVANCES:
             raise ValueError(f"advance must be one of {list(ADVANCES)}, got {advance!r}")
-        if proposer.settings.horizon != env.episode_length:
+        if proposer.settings.horizon != env.steps:
             raise ValueError(
                 f"the Proposer's horizon {proposer.settings.horizon} must be the "
-                f"meta-environment's episode length {env.episode_length}"
+                f"meta-environment's number of steps, {env.steps}"
             )
+        super().__init__(
+            proposer.agent,
+            env.view,
+            env.proposals,
+            episode_length=env.episode_length,
+            updates_per_step=env.updates_per_step,
+            own_action=own_action,
+        )
         self.proposer = proposer
         self.env = env
         self.advance = advance
-        self._histogram = histogram
+        self._table = table or (lambda counts: counts)
 
     def improve(self, solver: PPO, streams: Sequence[Streams]) -> Improvement:
         """Roll K copies of the Solver out and train the Proposer on their gains."""
         (stream,) = streams
         env = self.env
         env.fork(solver.snapshot()[0], stream)
+        self._updates = 0
         rollout = self.proposer.collect(
             [
                 stream.generator("proposals", copy, device=env.device)
@@ -75,33 +87,14 @@ class ProposerCurriculum(Curriculum):
         advance = self._advance(solver, gains, stream)
         return Improvement(self._metrics(rollout, gains, training), frames, advance)
 
-    @torch.no_grad()
-    def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
-        """Levels [1, P] of the Proposer's policy, given its probes of the Solver."""
-        (stream,) = streams
-        agent = self.proposer.agent
-        probes = self.env.see(solver.agent)  # [1, C, ...]
-        state = TensorDict({"probes": probes}, [1], device=probes.device)
-        distribution = agent.distribution(agent(state))
-        noise_shape = (1, *self.env.action_spec.shape[1:])
-        generator = stream.generator("proposals", device=self.env.device)
-        noise = torch.rand(noise_shape, generator=generator, device=self.env.device)
-        return self.env.generate(
-            draw(distribution, noise), [stream.generator("levels", device=self.env.device)]
-        )
-
     def state_dict(self) -> dict[str, Any]:
-        """The Proposer's weights and optimiser, and where the cycle's probe levels come from."""
-        return {
-            "proposer": self.proposer.snapshot().to_dict(),
-            "streams": self.env.streams.address,
-        }
+        """That of the cycle, with the Proposer's weights and optimiser."""
+        return {**super().state_dict(), "proposer": self.proposer.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the Proposer and the cycle's probe levels back."""
-        saved = TensorDict(state["proposer"], batch_size=[])
-        self.proposer.restore(saved)
-        self.env.draw_levels(Streams(*state["streams"]))
+        """Put the Proposer and the cycle back."""
+        super().load_state_dict(state)
+        self.proposer.restore(TensorDict(state["proposer"], batch_size=[]))
 
     def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
@@ -120,18 +113,17 @@ class ProposerCurriculum(Curriculum):
     def _metrics(
         self, rollout: TensorDictBase, gains: Tensor, training: TensorDict
     ) -> dict[str, Any]:
-        metrics: dict[str, Any] = {
+        proposed = rollout["next", "proposed"].sum((0, 1))
+        return {
             "total_gain": gains.tolist(),
             "total_reward": rollout["next", "reward"].sum((-2, -1)).tolist(),
             "return_before": float(rollout["validation_return"][0, 0]),
             **{key: float(value) for key, value in training.items()},
+            "histogram": self._table(proposed).tolist(),
         }
-        if self._histogram is not None:
-            metrics["histogram"] = self._histogram(rollout["action"]).tolist()
-        return metrics
 
 
 def total_gain(rollout: TensorDictBase) -> Tensor:
-    """Return on the validation levels after the episode minus before it, [K] from [K, L]."""
+    """Return on the validation levels after the episode minus before it, [K] from [K, T]."""
     after = rollout["next", "validation_return"][:, -1, 0]
     return after - rollout["validation_return"][:, 0, 0]

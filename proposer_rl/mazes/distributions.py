@@ -150,20 +150,18 @@ class SpecificationSpace(LevelDistribution):
         """(M, N)."""
         return len(self.obstacle_fractions), len(self.path_lengths)
 
-    def histogram(self, index: Tensor) -> Tensor:
-        """Counts how often each specification occurs.
+    @property
+    def coordinates(self) -> Tensor:
+        """Obstacle fraction and path length of each pair, each scaled to [-1, 1]: float [M * N, 2].
 
-        Args:
-            index: int64 of any shape, in 0 ... size - 1.
-
-        Returns:
-            int64 ``[M, N]``.
-
-        Raises:
-            ValueError: If a number is out of range.
+        Of an axis with a single value the coordinate is 0.
         """
-        self._check(index)
-        return index.flatten().bincount(minlength=self.size).unflatten(0, self.shape)
+        axes = []
+        for values in (self.obstacle_fractions, self.path_lengths):
+            axis = torch.tensor(values, dtype=torch.float32)
+            middle, reach = (axis.max() + axis.min()) / 2, (axis.max() - axis.min()) / 2
+            axes.append((axis - middle) / reach.clamp(min=torch.finfo(axis.dtype).tiny))
+        return torch.cartesian_prod(*axes)
 
 
 Entry = TypeVar("Entry", float, int)

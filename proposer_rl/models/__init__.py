@@ -5,16 +5,25 @@ from proposer_rl.models.actor_critic import (
     categorical,
     draw,
     joint_categorical,
+    normal,
     uniform_noise,
 )
 from proposer_rl.models.population import Population
-from proposer_rl.models.proposer import ProposerNetwork, fourier_encoding, proposer_actor_critic
+from proposer_rl.models.proposer import (
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    fourier_encoding,
+    proposer_actor_critic,
+)
 from proposer_rl.models.solver import cell_logits, map_actor_critic, read_maps
 from proposer_rl.models.unet import UNet, orthogonal_
 
 __all__ = [
     "ActorCritic",
+    "MixtureHead",
     "Population",
+    "ProblemHead",
     "ProposerNetwork",
     "UNet",
     "categorical",
@@ -23,6 +32,7 @@ __all__ = [
     "fourier_encoding",
     "joint_categorical",
     "map_actor_critic",
+    "normal",
     "orthogonal_",
     "proposer_actor_critic",
     "read_maps",

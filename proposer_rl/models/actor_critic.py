@@ -13,7 +13,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torch import Tensor, nn
-from torch.distributions import Categorical, Distribution, Independent
+from torch.distributions import Categorical, Distribution, Independent, Normal
 
 
 class ActorCritic(TensorDictModuleBase):
@@ -129,6 +129,12 @@ def categorical(logits: Tensor) -> Distribution:
     return Categorical(logits=logits, validate_args=False)
 
 
+def normal(logits: Tensor) -> Distribution:
+    """D normal numbers as one event, from their locations and log-scales [*B, D, 2]."""
+    location, log_scale = logits.unbind(-1)
+    return Independent(Normal(location, log_scale.exp(), validate_args=False), 1)
+
+
 def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
     """Sample by inverting the cumulative distribution function at ``uniform``.
 
@@ -146,7 +152,9 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
         threshold = uniform.unsqueeze(-1) * cumulative[..., -1:]
         index = (cumulative <= threshold).sum(-1)
         return index.clamp_(max=cumulative.shape[-1] - 1)
-    return distribution.icdf(uniform)
+    # Zero is among the uniform numbers, but its quantile may be infinite: the middle of the
+    # interval that it stands for is taken instead.
+    return distribution.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))
 
 
 def uniform_noise(

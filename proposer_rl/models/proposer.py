@@ -1,47 +1,45 @@
-"""The Proposer: from the Solver's answers on probe levels to a distribution for every problem."""
+"""The Proposer: from what it sees of the Solver to a distribution over what to train it on."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
-from proposer_rl.models.actor_critic import ActorCritic, categorical, joint_categorical
+from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.models.unet import orthogonal_
-
-RATIOS = {"joint": joint_categorical, "per_problem": categorical}
 
 
 class ProposerNetwork(nn.Module):
-    """Probes in, one categorical per problem and a value out (the paper's Proposer, section 4).
+    """Observations in, parameters of the action's distribution and a value out.
 
-    A convolutional encoder reads each probe; the mean over the probes is the context g. The logits
-    of problem p come from an MLP, shared by all problems, of g and a Fourier encoding of p: given
-    g, the problems are independent. The value is an MLP of g.
+    A convolutional encoder reads each probe; the mean over the probes, joined by whatever else is
+    observed, is the context g (the paper's Proposer, section 4). ``head`` makes the policy of g,
+    an MLP the value.
 
     Args:
+        head: from contexts [*B, width] to the parameters of the action's distribution; see
+            :class:`ProblemHead` and :class:`MixtureHead`.
         probe_channels: channels of a probe, its planes and the Solver's logit map.
-        problems: number of problems P.
-        choices: number of categories N of each problem.
-        context: width of g.
-        hidden: width of the MLPs.
+        numbers: how many numbers are observed beside the probes.
+        context: width of the encoder's output; the context's is ``context + numbers``.
+        hidden: width of the value's MLP.
         channels: channels of the encoder's convolutions; each but the first halves the resolution.
-        bands: frequencies of the problem index's Fourier encoding.
     """
 
     def __init__(
         self,
+        head: nn.Module,
         probe_channels: int,
-        problems: int,
-        choices: int,
         *,
+        numbers: int = 0,
         context: int = 128,
         hidden: int = 128,
         channels: Sequence[int] = (32, 64),
-        bands: int = 16,
     ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
@@ -52,31 +50,91 @@ class ProposerNetwork(nn.Module):
         self.encoder = nn.Sequential(
             *layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels[-1], context)
         )
-        self.context_layer = nn.Linear(context, hidden)
+        self.value = nn.Sequential(
+            nn.Linear(context + numbers, hidden), nn.Tanh(), nn.Linear(hidden, 1)
+        )
+        self.context = context
+        orthogonal_(self)
+        orthogonal_(self.value[-1], 1.0)
+        self.head = head
+
+    def forward(self, probes: Tensor, *numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Map an observation to the distribution's parameters [*B, ...] and values [*B, 1].
+
+        Args:
+            probes: float [*B, C, channels, H, W].
+            numbers: of what else is observed, each [*B, 1].
+        """
+        context = torch.cat([self._encode(probes), *numbers], -1)
+        return self.head(context), self.value(context)
+
+    def _encode(self, probes: Tensor) -> Tensor:
+        leading = probes.shape[:-4]
+        if probes.shape[-4] == 0:  # C = 0: a Proposer that does not see the Solver's answers
+            return probes.new_zeros(*leading, self.context)
+        features = self.encoder(probes.flatten(0, -4))
+        return torch.relu(features.reshape(*leading, -1, self.context).mean(-2))
+
+
+class ProblemHead(nn.Module):
+    """One categorical per problem (the paper's Proposer, section 4).
+
+    The logits of problem p come from an MLP, shared by all problems, of the context and a Fourier
+    encoding of p: given the context, the problems are independent.
+
+    Args:
+        width: of the context.
+        problems: number of problems P.
+        choices: number of categories N of each problem.
+        hidden: width of the MLP.
+        bands: frequencies of the problem index's Fourier encoding.
+    """
+
+    def __init__(
+        self, width: int, problems: int, choices: int, *, hidden: int = 128, bands: int = 16
+    ) -> None:
+        super().__init__()
+        self.context_layer = nn.Linear(width, hidden)
         self.index_layer = nn.Linear(2 * bands, hidden, bias=False)
         self.logits = nn.Linear(hidden, choices)
-        self.value = nn.Sequential(nn.Linear(context, hidden), nn.Tanh(), nn.Linear(hidden, 1))
-        self.context = context
         # Not saved: a function of P and the number of bands.
         self.register_buffer("index", fourier_encoding(problems, bands), persistent=False)
         orthogonal_(self)
         # A nearly uniform first policy: no category is preferred before anything is known.
         orthogonal_(self.logits, 0.01)
-        orthogonal_(self.value[-1], 1.0)
 
-    def forward(self, probes: Tensor) -> tuple[Tensor, Tensor]:
-        """Map probes [*B, C, channels, H, W] to logits [*B, P, N] and values [*B, 1]."""
-        context = self._context(probes)  # [*B, context]
+    def forward(self, context: Tensor) -> Tensor:
+        """Logits [*B, P, N] of contexts [*B, width]."""
         # The first layer is linear in [g, enc(p)], so g's part is computed once for all problems.
         hidden = self.context_layer(context).unsqueeze(-2) + self.index_layer(self.index)
-        return self.logits(torch.tanh(hidden)), self.value(context)
+        return self.logits(torch.tanh(hidden))
 
-    def _context(self, probes: Tensor) -> Tensor:
-        leading = probes.shape[:-4]
-        if probes.shape[-4] == 0:  # C = 0: a Proposer that does not see the Solver
-            return probes.new_zeros(*leading, self.context)
-        features = self.encoder(probes.flatten(0, -4))
-        return torch.relu(features.reshape(*leading, -1, self.context).mean(-2))
+
+class MixtureHead(nn.Module):
+    """A normal distribution over mixtures: location by an MLP of the context, scale learnt.
+
+    Args:
+        width: of the context.
+        directions: number D of an action's numbers.
+        hidden: width of the MLP.
+        spread: standard deviation of the first policy, whose location is nearly zero.
+    """
+
+    def __init__(
+        self, width: int, directions: int, *, hidden: int = 128, spread: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.location = nn.Sequential(
+            nn.Linear(width, hidden), nn.Tanh(), nn.Linear(hidden, directions)
+        )
+        self.log_scale = nn.Parameter(torch.full((directions,), math.log(spread)))
+        orthogonal_(self)
+        orthogonal_(self.location[-1], 0.01)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Location and log-scale [*B, D, 2] of contexts [*B, width]; see :func:`normal`."""
+        location = self.location(context)
+        return torch.stack([location, self.log_scale.expand_as(location)], -1)
 
 
 def fourier_encoding(problems: int, bands: int) -> Tensor:
@@ -94,20 +152,18 @@ def fourier_encoding(problems: int, bands: int) -> Tensor:
 
 
 def proposer_actor_critic(
-    network: nn.Module, ratio: str = "per_problem", *, probes_key: str = "probes"
+    network: nn.Module,
+    distribution: Callable[..., Distribution],
+    observed: Sequence[str] = ("probes",),
 ) -> ActorCritic:
-    """Actor-critic of a network that maps probes to logits [*B, P, N] and a value [*B, 1].
+    """Actor-critic of a network that maps what it observes to parameters and a value [*B, 1].
 
     Args:
         network: such as :class:`ProposerNetwork`.
-        ratio: what PPO's probability ratio is taken over: ``"joint"``, one for the P draws
-            together, or ``"per_problem"``, one for each draw with the same advantage.
-        probes_key: entry of the probes.
-
-    Raises:
-        ValueError: for an unknown ratio.
+        distribution: the action's, from ``logits=`` parameters. For a :class:`ProblemHead`,
+            ``categorical`` gives PPO one ratio for each problem's draw, ``joint_categorical`` one
+            for all of them; for a :class:`MixtureHead`, ``normal``.
+        observed: entries that the network is called with, in order.
     """
-    if ratio not in RATIOS:
-        raise ValueError(f"ratio must be one of {sorted(RATIOS)}, got {ratio!r}")
-    head = TensorDictModule(network, [probes_key], ["logits", "state_value"])
-    return ActorCritic(head, distribution_class=RATIOS[ratio])
+    head = TensorDictModule(network, list(observed), ["logits", "state_value"])
+    return ActorCritic(head, distribution_class=distribution)

@@ -59,21 +59,22 @@ def test_sampling_is_uniform_over_the_space() -> None:
     levels = SPACE.sample((60, 100), seeded())
     row = levels.walls.sum((-1, -2)) // 9
     index = row * 2 + (shortest_path_length(levels) == 5)
-    counts = SPACE.histogram(index)
-    assert counts.shape == (3, 2) and counts.sum() == 6000
-    assert chisquare(counts.flatten().tolist()).pvalue > 1e-3
+    counts = index.flatten().bincount(minlength=6)
+    assert counts.sum() == 6000
+    assert chisquare(counts.tolist()).pvalue > 1e-3
     assert (levels == SPACE.sample((60, 100), seeded())).all()
 
 
-def test_histogram_counts() -> None:
-    index = torch.tensor([[0, 5, 5], [3, 5, 0]])
-    assert SPACE.histogram(index).tolist() == [[2, 0], [0, 1], [0, 3]]
+def test_coordinates_run_from_minus_one_to_one_along_each_axis() -> None:
+    assert SPACE.coordinates.tolist() == [[-1, -1], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 1]]
+    single = SpecificationSpace([0.25], [2, 5], height=6, width=6)
+    assert single.coordinates.tolist() == [[0, -1], [0, 1]]
 
 
 @pytest.mark.parametrize("number", [-1, 6])
 def test_numbers_out_of_range_are_refused(number: int) -> None:
     index = torch.tensor([0, number])
-    for call in (SPACE.decode, SPACE.generate, SPACE.histogram):
+    for call in (SPACE.decode, SPACE.generate):
         with pytest.raises(ValueError, match="0 to 5"):
             call(index)
 

@@ -2,14 +2,27 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scipy import stats
 from tensordict import TensorDict
 
-from proposer_rl.models import ProposerNetwork, fourier_encoding, proposer_actor_critic
+from proposer_rl.models import (
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    draw,
+    fourier_encoding,
+    joint_categorical,
+    normal,
+    proposer_actor_critic,
+)
 
 
 def network(**options) -> ProposerNetwork:
     torch.manual_seed(0)
-    return ProposerNetwork(7, problems=6, choices=5, context=16, hidden=16, **options)
+    numbers = options.get("numbers", 0)
+    head = ProblemHead(16 + numbers, problems=6, choices=5, hidden=16)
+    return ProposerNetwork(head, 7, context=16, hidden=16, **options)
 
 
 def test_shapes() -> None:
@@ -47,14 +60,40 @@ def test_problem_encodings_are_distinct(problems: int) -> None:
 def test_ratios_differ_in_what_is_one_event() -> None:
     probes = TensorDict({"probes": torch.rand(2, 4, 7, 10, 10)}, [2])
     events = {}
-    for ratio in ("joint", "per_problem"):
+    for ratio in (joint_categorical, categorical):
         agent = proposer_actor_critic(network(), ratio)
         distribution = agent.distribution(agent(probes.clone()))
         events[ratio] = distribution.log_prob(torch.ones(2, 6, dtype=torch.int64))
-    assert events["joint"].shape == (2,) and events["per_problem"].shape == (2, 6)
-    torch.testing.assert_close(events["joint"], events["per_problem"].sum(-1))
+    assert events[joint_categorical].shape == (2,) and events[categorical].shape == (2, 6)
+    torch.testing.assert_close(events[joint_categorical], events[categorical].sum(-1))
 
 
-def test_refuses_an_unknown_ratio() -> None:
-    with pytest.raises(ValueError, match=r"one of \['joint', 'per_problem'\], got 'each'"):
-        proposer_actor_critic(network(), "each")
+def test_numbers_beside_the_probes_reach_policy_and_value() -> None:
+    agent = proposer_actor_critic(network(numbers=2), categorical, ["probes", "gain", "time"])
+    seen = TensorDict({"probes": torch.rand(1, 4, 7, 10, 10)}, [1]).expand(2).clone()
+    seen["gain"], seen["time"] = torch.tensor([[0.0], [1.0]]), torch.zeros(2, 1)
+    out = agent(seen)
+    for entry in ("logits", "state_value"):
+        assert not torch.allclose(out[entry][0], out[entry][1])
+
+
+def test_the_first_mixture_policy_is_centred_on_the_even_mixture() -> None:
+    torch.manual_seed(0)
+    head = MixtureHead(16, directions=3, hidden=32, spread=1.5)
+    distribution = normal(head(torch.randn(100, 16)))
+    assert distribution.mean.abs().max() < 0.1
+    torch.testing.assert_close(distribution.stddev, torch.full((100, 3), 1.5))
+
+
+def test_normal_is_that_of_scipy_and_drawn_by_its_quantiles() -> None:
+    parameters = torch.tensor([[0.5, 0.3], [-2.0, -1.0]])  # location, log-scale
+    distribution, point = normal(parameters), torch.tensor([0.1, -1.7])
+    reference = stats.norm(parameters[:, 0].numpy(), parameters[:, 1].exp().numpy())
+    torch.testing.assert_close(
+        float(distribution.log_prob(point)), float(reference.logpdf(point.numpy()).sum()),
+        rtol=1e-5, atol=1e-6,
+    )  # fmt: skip
+    uniform = torch.tensor([0.0, 0.9])
+    drawn = draw(distribution, uniform)
+    assert drawn.isfinite().all()
+    torch.testing.assert_close(float(drawn[1]), float(reference.ppf(0.9)[1]), rtol=1e-5, atol=1e-6)

@@ -1,0 +1,41 @@
+"""Advantages without a critic."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives.value.functional import reward2go
+
+
+class CopiesBaseline(TensorDictModuleBase):
+    """The return to come, minus what the other copies had to come at the same step.
+
+    Where all K episodes start from one state, the others' mean return is an unbiased estimate of
+    that state's value, and a far better one than a critic that has seen a few episodes
+    (Kool et al. 2019, "Buy 4 REINFORCE samples, get a baseline for free!", eq. 8). It takes the
+    place of :class:`torchrl.objectives.value.GAE`: the returns are the critic's targets.
+
+    Args:
+        gamma: discount.
+
+    Raises:
+        ValueError: when called on fewer than two copies.
+    """
+
+    def __init__(self, gamma: float) -> None:
+        super().__init__()
+        self.in_keys = [("next", "reward"), ("next", "done")]
+        self.out_keys = ["advantage", "value_target"]
+        self.gamma = gamma
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
+        copies = tensordict.batch_size[0]
+        if copies < 2:
+            raise ValueError("a baseline from the other copies needs at least 2 copies, got 1")
+        following = reward2go(tensordict["next", "reward"], tensordict["next", "done"], self.gamma)
+        others = (following.sum(0, keepdim=True) - following) / (copies - 1)
+        tensordict.set("advantage", following - others)
+        return tensordict.set("value_target", following)

@@ -1,0 +1,124 @@
+"""What an action of the Proposer means: which of N choices each of P problems is made of.
+
+A choice is a number, whatever it stands for; the task turns choices into levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data import Categorical, TensorSpec, Unbounded
+
+from proposer_rl.streams import Streams
+
+# From choices, int64 [K, P], to levels [K, P]; copy k draws from the k-th generator.
+Generate = Callable[[Tensor, list[torch.Generator]], Any]
+
+
+class Proposals:
+    """The levels that actions of K copies stand for; a subclass defines the actions.
+
+    Args:
+        choices: number of choices N.
+        generate: makes levels of choices.
+
+    Raises:
+        ValueError: for fewer than one choice.
+    """
+
+    def __init__(self, choices: int, generate: Generate) -> None:
+        if choices < 1:
+            raise ValueError(f"choices must be at least 1, got {choices}")
+        self.choices = choices
+        self._generate = generate
+
+    def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
+        """The specification of actions, batch [K]."""
+        raise NotImplementedError
+
+    def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """Choices int64 [K, P]; what chance decides, copy k draws from the k-th generator."""
+        raise NotImplementedError
+
+    def levels(
+        self, action: Tensor, problems: int, streams: Sequence[Streams]
+    ) -> tuple[Any, Tensor]:
+        """Levels [K, P] of actions [K, ...], and their choices int64 [K, P].
+
+        Args:
+            action: of K copies.
+            problems: number P of levels.
+            streams: one for each copy, from which its choices and levels are drawn.
+        """
+        draws, levels = (
+            [stream.generator(purpose, device=action.device) for stream in streams]
+            for purpose in ("choices", "levels")
+        )
+        choices = self.draw(action, problems, draws)
+        return self._generate(choices, levels), choices
+
+
+class ProblemChoices(Proposals):
+    """An action names the choice of every problem: int64 [K, P] (the paper's Proposer, section 4).
+
+    The P draws are independent, so that all batches of one policy look alike: the composition of
+    a batch varies by about 1 / sqrt(P) only.
+    """
+
+    def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
+        """Categorical, int64 [K, P]."""
+        return Categorical(self.choices, (copies, problems), dtype=torch.int64, device=device)
+
+    def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """The action itself: nothing is left to chance."""
+        return action
+
+
+class Mixture(Proposals):
+    """An action is a mixture of choices from which the whole batch is drawn.
+
+    Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]: the zero action
+    is the even mixture. Batches of one policy really differ then, and what the Solver gained can be
+    credited to the mixture that it trained on. The draws are systematic: each choice occurs as
+    often as its share of P problems says, rounded up or down, in random order.
+
+    Args:
+        directions: what each of D numbers adds to the log-shares of N choices, float [D, N]. The
+            identity (D = N) makes every mixture possible; fewer directions are learnt faster.
+        generate: makes levels of choices.
+
+    Raises:
+        ValueError: if ``directions`` is no matrix, or not finite.
+    """
+
+    def __init__(self, directions: Tensor, generate: Generate) -> None:
+        if directions.ndim != 2 or min(directions.shape) < 1 or not directions.isfinite().all():
+            raise ValueError(
+                f"directions must be a finite matrix [D, N], got shape {list(directions.shape)}"
+            )
+        super().__init__(directions.shape[1], generate)
+        self.directions = directions
+
+    def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
+        """Unbounded, float [K, D]."""
+        return Unbounded((copies, self.directions.shape[0]), device=device)
+
+    def shares(self, action: Tensor) -> Tensor:
+        """The mixture of actions [*B, D]: shares that add up to one, [*B, N]."""
+        return (action @ self.directions.to(action.device)).softmax(-1)
+
+    def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """Systematic draws from the mixture of actions [K, D]."""
+        cumulative = self.shares(action).double().cumsum(-1)
+        device = action.device
+        offset = torch.stack([torch.rand(1, generator=g, device=device) for g in generators])
+        order = torch.stack(
+            [torch.rand(problems, generator=g, device=device).argsort() for g in generators]
+        )
+        steps = torch.arange(problems, device=device, dtype=torch.double)
+        marks = (steps + offset) / problems * cumulative[:, -1:]  # [K, P], one in each P-th
+        choices = torch.searchsorted(cumulative, marks, right=True)
+        return choices.clamp_(max=self.choices - 1).gather(1, order)
