@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -119,6 +120,34 @@ def read_config(config: DictConfig) -> RunConfig:
         return RunConfig.model_validate(values)
     except ValidationError as error:
         raise ConfigError(_first_line(error)) from error
+
+
+def saved_config(folder: Path) -> RunConfig:
+    """The settings of the run in a folder; what may differ between its calls is left to choice.
+
+    Raises:
+        ConfigError: if the folder is no run's, or was written by another version.
+    """
+    file = folder / "config.json"
+    free: dict[str, Any] = {
+        "device": "auto",
+        "threads": 1,
+        "cores": None,
+        "progress": False,
+        "logger": {"type": "csv"},
+    }
+    try:
+        values = json.loads(file.read_text())
+        values["schedule"]["updates"] = 1
+        return RunConfig.model_validate({**values, **free})
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: is no run's folder: it has no readable config.json"
+        ) from error
+    except ValidationError as error:
+        raise ConfigError(f"{file}: {_first_line(error)}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{file}: does not hold the settings of a run") from error
 
 
 def check_order(overrides: Sequence[str]) -> None:

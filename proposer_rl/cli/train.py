@@ -82,21 +82,8 @@ def build(config: RunConfig, path: Path) -> Experiment:
     Raises:
         ConfigError: if settings that are each valid do not make an experiment.
     """
-    device = _device(config.device)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     try:
-        task = MazeTask(
-            maze=config.maze,
-            distributions=config.distributions,
-            target=config.target,
-            space=config.space,
-            solver=config.solver,
-            evaluation=config.evaluation,
-            device=device,
-            precision=config.precision,
-            cores=config.cores,
-        )
+        task = make_task(config)
         curriculum = _curriculum(config, task)
     except ValueError as error:
         raise ConfigError(str(error)) from error
@@ -113,6 +100,28 @@ def build(config: RunConfig, path: Path) -> Experiment:
         records=task.records,
         log=make_log(config.logger, path, f"{config.method}_seed_{config.seed}"),
         progress=config.progress,
+    )
+
+
+def make_task(config: RunConfig) -> MazeTask:
+    """The task of a run, on its device and with its number of threads.
+
+    Raises:
+        ConfigError: if the device cannot be used.
+        ValueError: if settings that are each valid do not make a task.
+    """
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    return MazeTask(
+        maze=config.maze,
+        distributions=config.distributions,
+        target=config.target,
+        space=config.space,
+        solver=config.solver,
+        evaluation=config.evaluation,
+        device=_device(config.device),
+        precision=config.precision,
+        cores=config.cores,
     )
 
 
