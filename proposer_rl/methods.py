@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt, Len
+from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Distribution
 
 from proposer_rl.advantages import CopiesBaseline
+from proposer_rl.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.curricula import (
     Curriculum,
+    FrozenProposer,
     ProposerCurriculum,
     SamplingCurriculum,
     ScheduleCurriculum,
+    load_agent,
 )
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import (
@@ -144,6 +149,50 @@ def proposer(parts: Parts, reward: Reward) -> Curriculum:
         advance=chosen.advance,
         table=lambda counts: counts.unflatten(0, task.space.shape),
     )
+
+
+def frozen_proposer(parts: Parts, checkpoint: str | None) -> Curriculum:
+    """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
+
+    Args:
+        parts: the task, and the settings of the Proposer's network and actions, which must be those
+            of that run.
+        checkpoint: a checkpoint of that run, or its folder for the newest.
+
+    Raises:
+        ValueError: if nothing is named, or it holds no such Proposer.
+        CheckpointError: if it cannot be read.
+    """
+    if not checkpoint:
+        raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
+    task, chosen = parts.task, parts.proposer
+    action = ACTIONS[chosen.proposals](task, chosen)
+    agent = _agent(task, chosen, action)
+    learnt = _curriculum_state(Path(checkpoint))
+    try:
+        load_agent(agent, TensorDict(learnt["proposer"]))
+    except (KeyError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
+        ) from error
+    return FrozenProposer(
+        agent,
+        _view(task, chosen),
+        action.proposals,
+        episode_length=chosen.lookahead,
+        updates_per_step=chosen.updates_per_step,
+        own_action=chosen.own_action,
+    )
+
+
+def _curriculum_state(path: Path) -> State:
+    """The curriculum's part of a checkpoint, or of a run's newest one."""
+    if path.is_dir():
+        latest = load_latest(path / "checkpoints")
+        if latest is None:
+            raise CheckpointError(f"checkpoint={path}: the folder holds no checkpoints")
+        return latest[1]["curriculum"]
+    return load_checkpoint(path)[1]["curriculum"]
 
 
 class _Action(NamedTuple):

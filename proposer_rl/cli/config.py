@@ -51,6 +51,7 @@ class RunConfig(BaseModel):
     scale: str
     ablation: str
     curriculum: dict[str, Any]
+    checkpoint: str | None
     seed: Annotated[int, Field(ge=0)]
     device: str
     precision: Literal["fp32", "bf16"]
