@@ -67,18 +67,20 @@ class ProposerSettings:
 
     rollouts: Annotated[int, Ge(1)] = 16
     lookahead: Annotated[int, Ge(1)] = 50
-    updates_per_step: Annotated[int, Ge(1)] = 1
-    validation_levels: Annotated[int, Ge(1)] = 75
+    updates_per_step: Annotated[int, Ge(1)] = 50
+    validation_levels: Annotated[int, Ge(1)] = 512
     probe_levels: Annotated[int, Ge(0)] = 16
-    observes: list[Literal["validation_return", "progress"]] = field(default_factory=list)
+    observes: list[Literal["validation_return", "progress"]] = field(
+        default_factory=lambda: ["validation_return", "progress"]
+    )
     common_random_numbers: bool = False
-    proposals: Literal["problems", "mixture"] = "problems"
+    proposals: Literal["problems", "mixture"] = "mixture"
     ratio: Literal["joint", "per_problem"] = "per_problem"
     directions: Literal["linear", "quadratic", "all"] = "linear"
-    spread: Annotated[float, Gt(0)] = 1.0
-    own_action: Literal["sample", "mode"] = "sample"
+    spread: Annotated[float, Gt(0)] = 1.5
+    own_action: Literal["sample", "mode"] = "mode"
     advance: Literal["train", "best", "random"] = "train"
-    advantage: Literal["gae", "copies"] = "gae"
+    advantage: Literal["gae", "copies"] = "copies"
     context: Annotated[int, Ge(1)] = 128
     hidden: Annotated[int, Ge(1)] = 128
     channels: Annotated[list[Annotated[int, Ge(1)]], Len(1)]

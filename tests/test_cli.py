@@ -79,7 +79,11 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 @pytest.mark.parametrize("method", methods())
 def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsys) -> None:
-    assert train(f"+method={method}", *SMOKE, "hydra.run.dir=run") == 0
+    arguments = [f"+method={method}", *SMOKE]
+    if method == "frozen_proposer":
+        assert train("+method=perf_gain", *SMOKE, "seed=1", "hydra.run.dir=learnt") == 0
+        arguments.append("checkpoint=learnt")
+    assert train(*arguments, "hydra.run.dir=run") == 0
     folder = Path("run")
     metrics = read_csv(folder / "metrics.csv")
     assert [row["updates"] for row in metrics] == [0, 2, 4, 6]
@@ -108,7 +112,7 @@ def test_every_ablation_composes_and_is_built(ablation: str, tmp_path: Path) -> 
     config = composed("+method=perf_gain", *SMOKE, f"+ablation={ablation}")
     assert config.ablation == ablation
     plain = composed("+method=perf_gain", *SMOKE)
-    if ablation not in ("lookahead_50", "probes_16", "ratio_per_problem"):
+    if ablation not in ("advance_train", "lookahead_50", "probes_16", "ratio_per_problem"):
         changed = config.model_dump(exclude={"ablation"}) != plain.model_dump(exclude={"ablation"})
         assert changed
     build(config, tmp_path / "run")

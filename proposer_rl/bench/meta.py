@@ -34,7 +34,7 @@ def meta_step(options: Options) -> Result:
     rows, tables = [], []
     for name, scale in scales.items():
         task = scale.task(options)
-        env = _proposer(task, scale).env
+        env = _proposer(task, _acting_at_every_update(scale)).env
         parts = _Parts(task, env)
         with threads(scale.threads):
             seconds = interleave(
@@ -78,11 +78,9 @@ class _Parts:
         self.task = task
         self.solvers = env.solvers
         self.validation, self.probes = env.view.validation, env.view.probes
-        self.action_spec = env.action_spec
-        self.generators = [
-            Streams(copy, "bench").generator(device=task.device)
-            for copy in range(env.batch_size[0])
-        ]
+        self.env = env
+        self.streams = [Streams(copy, "bench") for copy in range(env.batch_size[0])]
+        self.generators = [stream.generator(device=task.device) for stream in self.streams]
         self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
 
     def __call__(self) -> None:
@@ -91,7 +89,8 @@ class _Parts:
             self.seconds[part] += timings[part]
 
     def generation(self) -> None:
-        self.levels = self.task.generate(self.action_spec.rand(), self.generators)
+        action, problems = self.env.action_spec.rand(), self.task.solver.problems
+        self.levels, _ = self.env.proposals.levels(action, problems, self.streams)
 
     def update(self) -> None:
         self.solvers.env.set_levels(self.levels)
@@ -127,7 +126,7 @@ def memory(options: Options) -> Result:
     task = scale.task(options)
     before = peak_memory()
     short = replace(scale, proposer=replace(scale.proposer, lookahead=steps))
-    curriculum = _proposer(task, short)
+    curriculum = _proposer(task, _acting_at_every_update(short))
     # The Solver itself, its levels and measurements are in memory beside its copies.
     solver = task.solvers([Streams(0, "solver")])
     curriculum.env.fork(solver.snapshot()[0], Streams(1))
@@ -163,6 +162,11 @@ def peak_memory() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # macOS counts bytes, every other system kibibytes.
     return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _acting_at_every_update(scale: Scale) -> Scale:
+    """The same with one update for each action: the shortest steps, and the most of them."""
+    return replace(scale, proposer=replace(scale.proposer, updates_per_step=1))
 
 
 def _proposer(task: MazeTask, scale: Scale) -> ProposerCurriculum:

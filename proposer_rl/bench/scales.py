@@ -89,20 +89,20 @@ PAPER = Scale(
     ),
 )
 
-_QUICK_PPO = PPOSettings(horizon=20, learning_rate=1e-3)
+_QUICK_PPO = PPOSettings(horizon=15, learning_rate=1e-3)
 QUICK = Scale(
-    maze=MazeSettings(height=8, width=8, max_steps=20),
+    maze=MazeSettings(height=6, width=6, max_steps=15),
     distributions={
-        "id": DistributionSettings(specifications=[(0.4, 10)]),
-        "ood": DistributionSettings(specifications=[(0.5, 12)], mechanism="path_first"),
+        "id": DistributionSettings(specifications=[(0.4, 8)]),
+        "ood": DistributionSettings(specifications=[(0.5, 10)], mechanism="path_first"),
     },
-    space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4], path_lengths=[2, 4, 6, 8, 10]),
-    solver=SolverSettings(channels=NARROW, problems=64, ppo=_QUICK_PPO),
+    space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4], path_lengths=[2, 4, 6, 8]),
+    solver=SolverSettings(channels=[16, 32], problems=32, ppo=_QUICK_PPO),
     proposer=replace(
         PAPER.proposer,
-        rollouts=6,
+        rollouts=8,
         lookahead=20,
-        validation_levels=256,
+        updates_per_step=20,
         context=64,
         hidden=64,
         channels=[16, 32],
@@ -123,6 +123,7 @@ TINY = Scale(
     proposer=ProposerSettings(
         rollouts=2,
         lookahead=3,
+        updates_per_step=3,
         validation_levels=4,
         probe_levels=2,
         context=8,

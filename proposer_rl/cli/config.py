@@ -86,6 +86,16 @@ class RunConfig(BaseModel):
                 f"schedule.cycle_length={schedule.cycle_length} must equal proposer.lookahead="
                 f"{proposer.lookahead} where proposer.advance={proposer.advance}"
             )
+        if proposer.lookahead % proposer.updates_per_step:
+            raise ValueError(
+                f"proposer.updates_per_step={proposer.updates_per_step} must divide "
+                f"proposer.lookahead={proposer.lookahead}"
+            )
+        if proposer.advantage == "copies" and proposer.rollouts < 2:
+            raise ValueError(
+                f"proposer.rollouts={proposer.rollouts} must be at least 2 where "
+                "proposer.advantage=copies"
+            )
         if proposer.ppo.horizon != proposer.lookahead:
             raise ValueError(
                 f"proposer.ppo.horizon={proposer.ppo.horizon} must equal proposer.lookahead="
@@ -178,4 +188,6 @@ def _first_line(error: ValidationError) -> str:
         return message
     if details["type"] == "extra_forbidden":
         return f"{key}: there is no such key"
+    if details["type"] == "missing":
+        return f"{key}: missing"
     return f"{key}={details['input']!r}: {message[0].lower()}{message[1:]}"

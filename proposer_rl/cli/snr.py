@@ -39,7 +39,7 @@ def main() -> None:
     try:
         rows = measure(arguments)
     except (ConfigError, CheckpointError, ValueError) as error:
-        _refuse(str(error))
+        refuse(str(error))
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     _print(rows)
@@ -62,7 +62,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         raise ConfigError(
             f"--explorations: must be among {', '.join(EXPLORATIONS)}, got {unknown[0]!r}"
         )
-    found = [(folder, file) for folder in arguments.folders for file in _checkpoints(folder)]
+    found = [(folder, file) for folder in arguments.folders for file in checkpoints(folder)]
     work = [(folder, file, name) for folder, file in found for name in arguments.explorations]
     rows = []
     for folder, file, name in tqdm(work, desc="explorations", disable=not sys.stderr.isatty()):
@@ -186,17 +186,29 @@ EXPLORATIONS = {"even": _even, "problems": _problems, "mixture": _mixture, "unev
 
 
 def _print(rows: list[dict[str, Any]]) -> None:
-    table = Table(
-        caption="signal, noise: standard deviations of the total gain. ratio: of variances."
-    )
-    for column in rows[0]:
-        table.add_column(column, justify="left" if isinstance(rows[0][column], str) else "right")
-    for row in rows:
-        table.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()))
-    Console().print(table)
+    for run in dict.fromkeys(row["run"] for row in rows):
+        own = [row for row in rows if row["run"] == run]
+        table = Table(
+            "updates", "exploration", "levels", "mean gain", "noise", "signal", "ratio", "95 %",
+            title=f"{run}: total gain over {own[0]['lookahead']} updates",
+            caption="noise, signal: standard deviations within and between proposals; "
+            "ratio: of their squares, with its confidence interval",
+        )  # fmt: skip
+        for row in own:
+            table.add_row(
+                str(row["updates"]), row["exploration"], str(row["levels"]),
+                *(f"{row[key]:.4f}" for key in ("mean", "noise", "signal")),
+                f"{row['ratio']:.2f}", f"{row['low']:.2f} - {row['high']:.2f}",
+            )  # fmt: skip
+        Console().print(table)
 
 
-def _checkpoints(folder: Path) -> list[Path]:
+def checkpoints(folder: Path) -> list[Path]:
+    """All checkpoints of a run, oldest first.
+
+    Raises:
+        ConfigError: if there are none.
+    """
     files = sorted((folder / "checkpoints").glob("step_*.pt"))
     if not files:
         raise ConfigError(f"{folder}: holds no checkpoints; give the folders of runs")
@@ -237,7 +249,8 @@ def _positive(text: str) -> int:
     return number
 
 
-def _refuse(message: str) -> NoReturn:
+def refuse(message: str) -> NoReturn:
+    """Say in one line what is wrong with the input, and exit."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(BAD_INPUT)
 
