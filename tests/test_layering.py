@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
+    {"capture"},
     {"mazes", "models", "run_folder", "checkpoint", "settings", "streams"},
     {"ppo", "evaluation", "rewards", "report"},
     {"meta_env"},
@@ -96,7 +97,7 @@ def objection(module: str, other: str) -> str:
         return ", but must work without mazes"
     if RANK[other] > RANK[module]:
         return ", which is in a higher layer"
-    if RANK[other] == RANK[module] == 0 and (module, other) not in NEIGHBOURS:
+    if RANK[other] == RANK[module] == 1 and (module, other) not in NEIGHBOURS:
         return ", its neighbour in the lowest layer"
     return ""
 
