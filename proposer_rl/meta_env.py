@@ -130,11 +130,12 @@ class SolverTrainingEnv(EnvBase):
             self.solvers.restore(self._origin)
             self._return = self._origin_return
             self._episode += 1
-        levels = self.generate(tensordict["action"], self._generators("levels"))
+        # Levels come from the host, in whatever time the device needs for its last update.
+        levels = self.generate(tensordict["action"], self._generators("levels", "cpu"))
         self.solvers.env.set_levels(levels)
         # A collector steps its environment without gradients; this one learns inside.
         with torch.enable_grad():
-            update = self.solvers.update(self._generators("actions"))
+            update = self.solvers.update(self._generators("actions", self.device))
         self.last_training = (levels, update)
         self._steps_done += 1
         before, self._return = self._return, self._validation_return()
@@ -176,12 +177,12 @@ class SolverTrainingEnv(EnvBase):
         return self._probe(solver, self.probes)
 
     def _draw(self, count: int, purpose: str) -> Any:
-        return self._target(count, self.streams.generator(purpose, device=self.device))
+        return self._target(count, self.streams.generator(purpose))
 
-    def _generators(self, purpose: str) -> list[torch.Generator]:
+    def _generators(self, purpose: str, device: torch.device | str) -> list[torch.Generator]:
         step = self._steps_done
         return [
-            self.streams.generator(purpose, self._episode, step, copy, device=self.device)
+            self.streams.generator(purpose, self._episode, step, copy, device=device)
             for copy in range(self._copies)
         ]
 

@@ -76,8 +76,7 @@ def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
     curve = [task.measure(solvers.agent)["mix_success"]]
     for update in range(updates):
         levels = [
-            task.sample_target(shape[1], s.generator("levels", update, device=task.device))
-            for s in streams
+            task.sample_target(shape[1], s.generator("levels", update)) for s in streams
         ]
         stacked: object = torch.stack(levels)  # type: ignore[arg-type]
         solvers.env.set_levels(stacked)

@@ -79,10 +79,10 @@ class _Parts:
         self.solvers = env.solvers
         self.validation, self.probes = env.validation, env.probes
         self.action_spec = env.action_spec
-        self.generators = [
-            Streams(copy, "bench").generator(device=task.device)
-            for copy in range(env.batch_size[0])
-        ]
+        self.level_generators, self.generators = (
+            [Streams(k, "bench").generator(device=place) for k in range(env.batch_size[0])]
+            for place in ("cpu", task.device)
+        )
         self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
 
     def __call__(self) -> None:
@@ -91,7 +91,7 @@ class _Parts:
             self.seconds[part] += timings[part]
 
     def generation(self) -> None:
-        self.levels = self.task.generate(self.action_spec.rand(), self.generators)
+        self.levels = self.task.generate(self.action_spec.rand(), self.level_generators)
 
     def update(self) -> None:
         self.solvers.env.set_levels(self.levels)

@@ -52,7 +52,8 @@ class RunConfig(BaseModel):
     curriculum: dict[str, Any]
     seed: Annotated[int, Field(ge=0)]
     device: str
-    precision: Literal["fp32", "bf16"]
+    precision: Literal["auto", "fp32", "bf16"]
+    graphs: bool
     threads: Annotated[int, Field(ge=1)] | None
     cores: Annotated[int, Field(ge=1)] | None
     progress: bool

@@ -30,7 +30,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.methods import Parts
 from proposer_rl.run_folder import RunFolder
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
+from proposer_rl.task import MazeTask, faster_precision
 
 INPUT_ERRORS = (ConfigError, CheckpointError)
 BAD_INPUT = 2
@@ -83,6 +83,12 @@ def build(config: RunConfig, path: Path) -> Experiment:
         ConfigError: if settings that are each valid do not make an experiment.
     """
     device = _device(config.device)
+    if device.type == "cuda":
+        # TF32: products of matrices and convolutions round their fp32 inputs to 10 bits.
+        torch.set_float32_matmul_precision("high")
+    if config.precision == "auto":
+        precision = faster_precision(config.solver.channels, device)
+        config = config.model_copy(update={"precision": precision})
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     try:
@@ -96,6 +102,7 @@ def build(config: RunConfig, path: Path) -> Experiment:
             device=device,
             precision=config.precision,
             cores=config.cores,
+            graphs=config.graphs,
         )
         curriculum = _curriculum(config, task)
     except ValueError as error:
@@ -192,7 +199,7 @@ def _device(name: str) -> torch.device:
 def _check_same_run(folder: RunFolder, config: RunConfig) -> None:
     """Refuse to go on with a run that was started with other settings."""
     # What may differ: where and how it is computed and shown, and a longer schedule.
-    free = {"device", "threads", "cores", "progress", "logger"}
+    free = {"device", "graphs", "threads", "cores", "progress", "logger"}
     now = config.model_dump(mode="json", exclude=free)
     now["schedule"].pop("updates")
     file = folder.path / "config.json"

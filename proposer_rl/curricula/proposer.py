@@ -86,9 +86,7 @@ class ProposerCurriculum(Curriculum):
         noise_shape = (1, *self.env.action_spec.shape[1:])
         generator = stream.generator("proposals", device=self.env.device)
         noise = torch.rand(noise_shape, generator=generator, device=self.env.device)
-        return self.env.generate(
-            draw(distribution, noise), [stream.generator("levels", device=self.env.device)]
-        )
+        return self.env.generate(draw(distribution, noise), [stream.generator("levels")])
 
     def state_dict(self) -> dict[str, Any]:
         """The Proposer's weights and optimiser, and where the cycle's probe levels come from."""
