@@ -398,4 +398,3 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
     return norm
-

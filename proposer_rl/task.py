@@ -207,9 +207,9 @@ class MazeTask:
                     head_gains=(self.solver.policy_gain, self.solver.value_gain),
                 )
 
-        network = Population(
-            make, copies, self.precision, self.cores, recorder=self.recorder
-        ).to(self.device)
+        network = Population(make, copies, self.precision, self.cores, recorder=self.recorder).to(
+            self.device
+        )
         agent = map_actor_critic(network, per_step=self.maze.observe_agent)
         # Placeholders of the right shape; every update sets its own levels.
         level = self._measured_on[next(iter(self._measured_on))][:1]

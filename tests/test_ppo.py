@@ -305,7 +305,7 @@ def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
 def test_replayed_updates_train_as_plain_ones(
     copies: int, observe_agent: bool, way: str | None
 ) -> None:
-    """Ten updates, the first ones plain, then recorded and replayed: the same numbers to the bit."""
+    """Ten updates, of which the first are plain and the others replays: equal to the bit."""
     tapes = Tapes()
     plain = learner(copies, observe_agent=observe_agent, way=way)
     replayed = learner(copies, observe_agent=observe_agent, way=way, recorder=tapes)

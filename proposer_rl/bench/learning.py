@@ -65,7 +65,10 @@ def learning_curves(options: Options) -> Result:
         at_most=True,
     )
     header = ["update", "fp32 success (min-max)", "bf16 success (min-max)", "difference"]
-    return Result([row], [Table("Learning curves, the paper's network, quick mazes, an easy mix", header, lines)])
+    return Result(
+        [row],
+        [Table("Learning curves, the paper's network, quick mazes, an easy mix", header, lines)],
+    )
 
 
 def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
@@ -75,9 +78,7 @@ def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
     shape = torch.Size([seeds, task.solver.problems])
     curve = [task.measure(solvers.agent)["mix_success"]]
     for update in range(updates):
-        levels = [
-            task.sample_target(shape[1], s.generator("levels", update)) for s in streams
-        ]
+        levels = [task.sample_target(shape[1], s.generator("levels", update)) for s in streams]
         stacked: object = torch.stack(levels)  # type: ignore[arg-type]
         solvers.env.set_levels(stacked)
         solvers.update([s.generator("actions", update, device=task.device) for s in streams])

@@ -58,7 +58,7 @@ class Scale:
             return options.precision
         return faster_precision(self.solver.channels, torch.device(options.device))
 
-    def task(self, options: Options, precision: str | None = None) -> MazeTask:
+    def task(self, options: Options, precision: str | None = None, graphs: bool = True) -> MazeTask:
         """The maze task of these settings."""
         return MazeTask(
             maze=self.maze,
@@ -70,6 +70,7 @@ class Scale:
             evaluation=EvaluationSettings(distributions=["id"], levels=8),
             device=options.device,
             precision=precision or self.precision(options),
+            graphs=graphs,
         )
 
 

@@ -83,14 +83,15 @@ def generate_levels(
     if isinstance(generator, Sequence) and not _MECHANISMS[mechanism].pools:
         levels: Any = torch.stack(
             [
-                generate_levels(f, n, height, width, mechanism, g, g.device)  # type: ignore[misc]
+                generate_levels(f, n, height, width, mechanism, g, g.device)
                 for f, n, g in zip(fraction, length, generator, strict=True)
             ]
         )
         return upload(levels, target)
     group, groups = _groups(fraction.shape, generator)
-    flat = (entry.flatten() for entry in (fraction, length, group))
-    task = _Task(*flat, groups, height, width, mechanism)
+    task = _Task(
+        fraction.flatten(), length.flatten(), group.flatten(), groups, height, width, mechanism
+    )
     return upload(task.solve(generator, _place(generator, target)).reshape(fraction.shape), target)
 
 

@@ -41,9 +41,7 @@ def draw_path_first(
     )
 
 
-def _carve(
-    path_length: Tensor, height: int, width: int, draws: Draws
-) -> tuple[Tensor, Tensor]:
+def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[Tensor, Tensor]:
     """Random paths of which no two cells touch unless they are consecutive.
 
     A path goes on to a uniform choice among the cells whose only carved neighbour is its end.

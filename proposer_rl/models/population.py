@@ -79,18 +79,20 @@ class Population(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
-        stacked = list(self.stacked)
         call = Call(self._template[0], self.names, self.precision)
-        outputs = self._chosen_way(call, stacked, inputs)(call, stacked, inputs)
+        outputs = self._chosen_way(inputs)(call, list(self.stacked), inputs)
         return outputs[0] if len(outputs) == 1 else outputs
 
-    def _chosen_way(
-        self, call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
-    ) -> Way:
+    def seconds_of_ways(self, *inputs: Tensor) -> dict[str, float]:
+        """Measure how long both passes over such inputs [K, ...] take, by each way."""
+        call = Call(self._template[0], self.names, self.precision)
+        return measure(WAYS, call, list(self.stacked), inputs, self._recorder)
+
+    def _chosen_way(self, inputs: Sequence[Tensor]) -> Way:
         if self.way is None and self.copies > 1:
-            if not stacked[0].is_cuda:
+            if not self.stacked[0].is_cuda:
                 return partial(apply_on_cores, cores=self.cores)
-            seconds = measure(WAYS, call, stacked, inputs, self._recorder)
+            seconds = self.seconds_of_ways(*inputs)
             self.way = min(seconds, key=seconds.__getitem__)
         return WAYS[self.way or "in turn"]
 

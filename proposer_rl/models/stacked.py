@@ -27,6 +27,7 @@ class Call(NamedTuple):
     precision: str
 
     def __call__(self, member: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Apply the network with one copy's parameters to its inputs."""
         parameters = dict(zip(self.names, member, strict=True))
         with _autocast(self.precision, member[0].device):
             outputs = functional_call(self.network, parameters, tuple(inputs))

@@ -298,9 +298,7 @@ def test_one_generator_for_each_index_draws_as_each_alone(mechanism: str, copies
 
     together = generate_levels(fractions, lengths, mechanism=mechanism, generator=generators())
     for k, generator in enumerate(generators()):
-        alone = generate_levels(
-            fractions[k], lengths[k], mechanism=mechanism, generator=generator
-        )
+        alone = generate_levels(fractions[k], lengths[k], mechanism=mechanism, generator=generator)
         assert (together[k] == alone).all()
 
 
