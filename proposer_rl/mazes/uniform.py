@@ -37,14 +37,29 @@ def draw_uniform(
     goals = cells_at_depth(free, start, path_length).flatten(0, 1)  # [H*W, C]
     kept = goals.any(0).nonzero().squeeze(1)  # [A]
     goals = goals.index_select(1, kept)
-    rank = draws.of(kept).rand(height * width)
-    goal = rank.masked_fill_(~goals, -1.0).argmax(0)
+    goal = _choose(goals, draws.of(kept).rand(1).squeeze(0))
     return kept, Level(
         walls=walls.index_select(1, kept).t().unflatten(1, (height, width)),
         start=cell_position(start[kept], width),
         goal=cell_position(goal, width),
         batch_size=kept.shape,
     )
+
+
+def _choose(goals: Tensor, uniform: Tensor) -> Tensor:
+    """Chooses a marked cell of each maze.
+
+    Args:
+        goals: bool ``[H*W, A]``, with a True in every column.
+        uniform: Numbers in [0, 1), ``[A]``; equal parts of them lead to each marked cell.
+
+    Returns:
+        int64 ``[A]``, numbers of cells.
+    """
+    marked = goals.cumsum(0, dtype=torch.int32)  # up to and including each cell
+    # Rounding may make the product the whole number of marks.
+    rank = (uniform * marked[-1]).int().minimum(marked[-1] - 1)
+    return (marked <= rank).sum(0)
 
 
 def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
