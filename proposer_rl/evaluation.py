@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.nn.functional import one_hot, pad
+from torch.nn.functional import pad
 
 from proposer_rl.mazes.distance import cells_first, padded_index
 from proposer_rl.mazes.dynamics import MOVES, successors
@@ -163,7 +163,8 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
 def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
     """Action probabilities, float32 ``[*B, 4, H, W]``."""
     if greedy:
-        return one_hot(cell_logits.argmax(-3), len(MOVES)).movedim(-1, -3).float()
+        best = cell_logits.argmax(-3, keepdim=True)
+        return torch.zeros(cell_logits.shape, device=best.device).scatter_(-3, best, 1.0)
     return cell_logits.float().softmax(-3)
 
 

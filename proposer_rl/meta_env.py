@@ -122,7 +122,7 @@ class SolverTrainingEnv(EnvBase):
             gained, chosen = self._train(tensordict["action"], measure=last)
             reward += gained
             choices.append(chosen)
-        proposed = _count(torch.cat(choices, -1), self.proposals.choices)
+        proposed = _count(torch.cat(choices, -1), self.proposals.choices).to(self.device)
         state = self._state(self._return, self.view.see(self.solvers.agent), proposed)
         return state.set("reward", reward.unsqueeze(-1))
 

@@ -146,7 +146,7 @@ def proposer(parts: Parts, reward: Reward) -> Curriculum:
     numbers = replace(chosen.ppo, horizon=env.steps)
     advantage = CopiesBaseline(numbers.gamma) if chosen.advantage == "copies" else None
     return ProposerCurriculum(
-        PPO(env, agent, numbers, advantage),
+        PPO(env, agent, numbers, advantage=advantage),
         own_action=chosen.own_action,
         advance=chosen.advance,
         table=lambda counts: counts.unflatten(0, task.space.shape),

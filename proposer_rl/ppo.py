@@ -2,7 +2,9 @@
 
 TorchRL's ``Collector``, ``GAE`` and ``ClipPPOLoss`` do the work. What is added here: the level's
 context is computed once per rollout and once per epoch, K copies train in one leading dimension as
-if each were alone, and everything that training changes can be taken out and put back.
+if each were alone, everything that training changes can be taken out and put back, and on a GPU a
+rollout and the training on it are one CUDA graph each. To that end nothing in them looks at a
+number on the device.
 """
 
 from __future__ import annotations
@@ -15,11 +17,13 @@ from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution, Independent
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from proposer_rl.capture import Captured, Recorder
 from proposer_rl.models import ActorCritic, draw, uniform_noise
 from proposer_rl.settings import settings
 
@@ -70,6 +74,8 @@ class PPO:
         agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
             independent copies, which decides over what losses, advantages and norms are taken.
         settings: PPO's numbers.
+        recorder: records rollouts and training, which a GPU then replays; None to run them as they
+            are. A recorded environment starts an episode from the same memory every time.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
             TorchRL's :class:`GAE` with the settings' numbers.
 
@@ -82,6 +88,8 @@ class PPO:
         env: EnvBase,
         agent: ActorCritic,
         settings: PPOSettings,
+        recorder: Recorder | None = None,
+        *,
         advantage: Callable[[TensorDictBase], TensorDictBase] | None = None,
     ) -> None:
         if agent.copies is not None and env.batch_size[:1] != (agent.copies,):
@@ -92,9 +100,10 @@ class PPO:
         self.env = env
         self.agent = agent
         self.settings = settings
+        self._level = _LevelAside(*agent.level_keys)
         self._policy = _RolloutPolicy(agent)
         self._collector = Collector(
-            _without(env, agent.level_keys),
+            _WithoutLevel(env, self._level),
             self._policy,
             frames_per_batch=env.batch_size.numel() * settings.horizon,
             total_frames=-1,
@@ -102,12 +111,14 @@ class PPO:
             use_buffers=False,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
+            no_cuda_sync=True,
         )
+        # TorchRL's vectorised form splits the batch where episodes end, which it has to look up.
         self._advantage = advantage or GAE(
-            gamma=settings.gamma, lmbda=settings.lmbda, value_network=None
+            gamma=settings.gamma, lmbda=settings.lmbda, value_network=None, vectorized=False
         )
         actor, critic = agent.readout()
-        self._loss = ClipPPOLoss(
+        self._loss = _ClipPPOLoss(
             actor,
             critic,
             clip_epsilon=settings.clip_epsilon,
@@ -125,10 +136,18 @@ class PPO:
             action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
         )
         self._parameters = list(agent.parameters())
+        device = self._parameters[0].device
+        self._loss.to(device)
         self._adam = torch.optim.Adam(
-            self._parameters, lr=settings.learning_rate, eps=settings.adam_eps, fused=True
+            self._parameters,
+            lr=settings.learning_rate,
+            eps=settings.adam_eps,
+            fused=True,
+            capturable=device.type == "cuda",
         )
         self._start_adam()
+        self._act = Captured(self._roll_out, recorder)
+        self._train = Captured(self._train_on, recorder)
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it.
@@ -150,14 +169,11 @@ class PPO:
             A complete TorchRL rollout [*B, T]: observations (those of the level expanded along
             time, which takes no memory), actions, log-probabilities, values and ``next``.
         """
-        with torch.no_grad():
-            level = self.env.reset().select(*self.agent.level_keys)
-            context = self.agent.encode(level)
-            shape = self.env.full_action_spec[self.agent.action_key].shape
-            noise = uniform_noise(shape, self.settings.horizon, generators, level.device)
-            self._policy.begin(context, noise)
-            rollout = self._collector.rollout()
-            self._set_next_values(rollout, context)
+        shape = self.env.full_action_spec[self.agent.action_key].shape
+        device = self._parameters[0].device
+        noise = uniform_noise(shape, self.settings.horizon, generators, device)
+        acted = self._act(TensorDict({"noise": noise}))
+        rollout, level = acted["rollout"], acted["level"]
         for key, entry in level.items(include_nested=True, leaves_only=True):
             along_time = entry.unsqueeze(level.ndim)
             rollout.set(key, along_time.expand(*rollout.shape, *entry.shape[level.ndim :]))
@@ -173,21 +189,19 @@ class PPO:
             ``loss_critic`` (the mean over copies of their weighted losses), ``entropy``,
             ``kl_approx``, ``clip_fraction``, ``explained_variance`` and ``grad_norm``.
         """
-        level = rollout.select(*self.agent.level_keys)[..., 0]
-        steps = []
-        for update in range(self.settings.updates):
-            if update:
-                self._set_values(rollout, level)
-            self._advantage(rollout)
-            batch = rollout.select(
-                *self.agent.step_keys,
-                self.agent.action_key,
-                self.agent.log_prob_key,
-                "advantage",
-                "value_target",
-            )
-            steps += [self._gradient_step(batch, level) for _ in range(self.settings.epochs)]
-        return torch.stack(steps).mean(0)
+        agent = self.agent
+        steps = rollout.select(
+            *agent.step_keys,
+            agent.action_key,
+            agent.log_prob_key,
+            agent.value_key,
+            *(("next", key) for key in [*agent.step_keys, agent.value_key]),
+            *(("next", key) for key in ["reward", "done", "terminated"]),
+        )
+        level = rollout.select(*agent.level_keys)[..., 0]
+        trained = self._train(TensorDict({"steps": steps, "level": level}))
+        rollout.update(trained["steps"])
+        return trained["metrics"]
 
     def snapshot(self) -> TensorDict:
         """A copy of weights and Adam's state, batch [K] with copies and [] without.
@@ -220,19 +234,22 @@ class PPO:
                 f"the snapshot must have batch size {list(self._batch)}, "
                 f"got {list(snapshot.batch_size)}"
             )
-        names = [name for name, _ in self.agent.named_parameters()]
-        if sorted(names) != sorted(snapshot.keys()):
+        parameters = dict(self.agent.named_parameters())
+        if parameters.keys() != set(snapshot.keys()):
             raise ValueError("the snapshot belongs to another network: its parameters differ")
-        for name, parameter in self.agent.named_parameters():
-            entry = snapshot[name]
-            step = entry["step"].flatten()
-            if entry["value"].shape != parameter.shape or not bool((step == step[0]).all()):
-                raise ValueError(f"the snapshot's {name} does not fit: another shape or Adam step")
-            state = self._adam.state[parameter]
+        for name, parameter in parameters.items():
+            if snapshot[name, "value"].shape != parameter.shape:
+                raise ValueError(f"the snapshot's {name} does not fit: another shape")
+        steps = torch.stack([snapshot[name, "step"].flatten() for name in parameters])
+        # The one question here that waits for the device.
+        if not bool((steps == steps[:, :1]).all()):
+            raise ValueError("the snapshot's copies have made different numbers of Adam steps")
+        for name, parameter in parameters.items():
+            entry, state = snapshot[name], self._adam.state[parameter]
             parameter.data.copy_(entry["value"])
             state["exp_avg"].copy_(entry["exp_avg"])
             state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
-            state["step"].copy_(step[0])
+            state["step"].copy_(entry["step"].flatten()[0])
 
     @property
     def _batch(self) -> torch.Size:
@@ -246,6 +263,29 @@ class PPO:
                 "exp_avg": torch.zeros_like(parameter),
                 "exp_avg_sq": torch.zeros_like(parameter),
             }
+
+    @torch.no_grad()
+    def _roll_out(self, inputs: TensorDictBase) -> TensorDict:
+        self._policy.begin(inputs["noise"], self._level)
+        rollout = self._collector.rollout()
+        self._set_next_values(rollout, self._policy.context)
+        return TensorDict({"rollout": rollout, "level": self._level.entries})
+
+    def _train_on(self, inputs: TensorDictBase) -> TensorDict:
+        rollout, level = inputs["steps"].copy(), inputs["level"]
+        metrics = []
+        for update in range(self.settings.updates):
+            if update:
+                self._set_values(rollout, level)
+            self._advantage(rollout)
+            metrics += [self._gradient_step(rollout, level) for _ in range(self.settings.epochs)]
+        value = self.agent.value_key
+        return TensorDict(
+            {
+                "steps": rollout.select(value, ("next", value), "advantage", "value_target"),
+                "metrics": torch.stack(metrics).mean(0),
+            }
+        )
 
     @torch.no_grad()
     def _set_values(self, rollout: TensorDictBase, level: TensorDictBase) -> None:
@@ -285,8 +325,19 @@ class PPO:
         return (1 - residual / total.clamp_min(1e-12)).mean()
 
 
+class _ClipPPOLoss(ClipPPOLoss):
+    """TorchRL's, without looking whether an entropy is finite: for discrete actions it is."""
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        if isinstance(dist, Categorical | Independent):
+            return dist.entropy().unsqueeze(-1)
+        return super()._get_entropy(dist, adv_shape)
+
+
 class _RolloutPolicy(TensorDictModuleBase):
     """What the collector calls: reads the steps off the context and draws actions from noise."""
+
+    context: TensorDictBase
 
     def __init__(self, agent: ActorCritic) -> None:
         super().__init__()
@@ -295,18 +346,41 @@ class _RolloutPolicy(TensorDictModuleBase):
         self.in_keys = agent.step_keys
         self.out_keys = [agent.action_key, agent.log_prob_key, agent.value_key]
 
-    def begin(self, context: TensorDictBase, noise: Tensor) -> None:
-        self._context = context
-        self._noise = iter(noise)
+    def begin(self, noise: Tensor, level: _LevelAside) -> None:
+        """Expect a rollout [T] with this noise, of the level that the next reset puts aside."""
+        self._steps = enumerate(noise)
+        self._level = (level,)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        (agent,) = self._agent
-        step = agent.decode(tensordict.select(*agent.step_keys), self._context)
+        (agent,), (level,) = self._agent, self._level
+        index, noise = next(self._steps)
+        if index == 0:
+            self.context = agent.encode(level.entries)
+        step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
-        action = draw(distribution, next(self._noise))
+        action = draw(distribution, noise)
         tensordict.set(agent.action_key, action)
         tensordict.set(agent.log_prob_key, distribution.log_prob(action))
         return tensordict.set(agent.value_key, step.get(agent.value_key))
+
+
+class _LevelAside(ExcludeTransform):
+    """Puts entries aside that the collector would copy at every step, at each whole reset."""
+
+    entries: TensorDictBase
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.entries = tensordict_reset.select(*self.excluded_keys)
+        return super()._reset(tensordict, tensordict_reset)
+
+
+class _WithoutLevel(TransformedEnv):
+    """An environment without those entries, whose own way of resetting what is done is kept."""
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.base_env.maybe_reset(tensordict).exclude(*self.transform.excluded_keys)
 
 
 def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
@@ -329,8 +403,3 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
     return norm
-
-
-def _without(env: EnvBase, keys: list[str]) -> EnvBase:
-    """The environment without entries that the collector would copy at every step."""
-    return TransformedEnv(env, ExcludeTransform(*keys)) if keys else env

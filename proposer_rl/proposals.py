@@ -48,16 +48,18 @@ class Proposals:
     ) -> tuple[Any, Tensor]:
         """Levels [K, P] of actions [K, ...], and their choices int64 [K, P].
 
+        Both are drawn on the host, where level generators work; the device meanwhile finishes what
+        it has to do.
+
         Args:
             action: of K copies.
             problems: number P of levels.
             streams: one for each copy, from which its choices and levels are drawn.
         """
         draws, levels = (
-            [stream.generator(purpose, device=action.device) for stream in streams]
-            for purpose in ("choices", "levels")
+            [stream.generator(purpose) for stream in streams] for purpose in ("choices", "levels")
         )
-        choices = self.draw(action, problems, draws)
+        choices = self.draw(action.cpu(), problems, draws)
         return self._generate(choices, levels), choices
 
 
@@ -100,7 +102,7 @@ class Mixture(Proposals):
                 f"directions must be a finite matrix [D, N], got shape {list(directions.shape)}"
             )
         super().__init__(directions.shape[1], generate)
-        self.directions = directions
+        self.directions = directions.cpu()
 
     def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
         """Unbounded, float [K, D]."""
@@ -108,17 +110,14 @@ class Mixture(Proposals):
 
     def shares(self, action: Tensor) -> Tensor:
         """The mixture of actions [*B, D]: shares that add up to one, [*B, N]."""
-        return (action @ self.directions.to(action.device)).softmax(-1)
+        return (action @ self.directions).softmax(-1)
 
     def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
         """Systematic draws from the mixture of actions [K, D]."""
         cumulative = self.shares(action).double().cumsum(-1)
-        device = action.device
-        offset = torch.stack([torch.rand(1, generator=g, device=device) for g in generators])
-        order = torch.stack(
-            [torch.rand(problems, generator=g, device=device).argsort() for g in generators]
-        )
-        steps = torch.arange(problems, device=device, dtype=torch.double)
+        offset = torch.stack([torch.rand(1, generator=g) for g in generators])
+        order = torch.stack([torch.rand(problems, generator=g).argsort() for g in generators])
+        steps = torch.arange(problems, dtype=torch.double)
         marks = (steps + offset) / problems * cumulative[:, -1:]  # [K, P], one in each P-th
         choices = torch.searchsorted(cumulative, marks, right=True)
         return choices.clamp_(max=self.choices - 1).gather(1, order)

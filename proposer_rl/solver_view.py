@@ -109,4 +109,4 @@ class SolverView:
         return self.observation(self.validation_return(solver, *place), self.see(solver), progress)
 
     def _draw(self, count: int, purpose: str) -> Levels:
-        return self._target(count, self.streams.generator(purpose, device=self.device))
+        return self._target(count, self.streams.generator(purpose))

@@ -10,6 +10,7 @@ from annotated_types import Ge, Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from proposer_rl.capture import Captured, recorder
 from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator
 from proposer_rl.mazes import (
     Level,
@@ -108,6 +109,19 @@ class EvaluationSettings:
     episodes: Annotated[int, Ge(1)] = 1
 
 
+def faster_precision(channels: Sequence[int], device: torch.device) -> str:
+    """``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
+
+    That is a wide network on a CPU with matrix instructions for it; see docs/benchmark.md.
+
+    Args:
+        channels: of the Solver's network.
+        device: that it runs on.
+    """
+    in_hardware = device.type == "cpu" and torch.cpu._is_amx_tile_supported()
+    return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
+
+
 class MazeTask:
     """Solvers, levels and measurements of one maze configuration.
 
@@ -121,6 +135,7 @@ class MazeTask:
         device: where everything lives.
         precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
         cores: Solvers of a population computed at once on a CPU; None for all cores.
+        graphs: whether a GPU records rollouts, training and evaluations as CUDA graphs.
 
     Raises:
         ValueError: if a name is no distribution's, or levels cannot be made as specified.
@@ -138,6 +153,7 @@ class MazeTask:
         device: torch.device | str = "cpu",
         precision: str = "fp32",
         cores: int | None = None,
+        graphs: bool = True,
     ) -> None:
         for name in (target, *evaluation.distributions):
             if name not in distributions:
@@ -147,6 +163,7 @@ class MazeTask:
         self.device = torch.device(device)
         self.precision = precision
         self.cores = cores
+        self.recorder = recorder(self.device, graphs)
         grid = (maze.height, maze.width)
         self.distributions = {
             name: LevelDistribution(d.specifications, d.mechanism, *grid)
@@ -164,6 +181,9 @@ class MazeTask:
             if evaluation.reward == "exact"
             else RolloutEvaluator(*rules, episodes=evaluation.episodes)
         )
+        self._rate = Captured(self._rated, self.recorder)
+        self._measure = Captured(self._measured, self.recorder)
+        self._see = Captured(self._seen, self.recorder)
         self._measured_on = {
             name: self.distributions[name].sample(
                 evaluation.levels,
@@ -188,7 +208,9 @@ class MazeTask:
                     head_gains=(self.solver.policy_gain, self.solver.value_gain),
                 )
 
-        network = Population(make, copies, self.precision, self.cores).to(self.device)
+        network = Population(make, copies, self.precision, self.cores, recorder=self.recorder).to(
+            self.device
+        )
         agent = map_actor_critic(network, per_step=self.maze.observe_agent)
         # Placeholders of the right shape; every update sets its own levels.
         level = self._measured_on[next(iter(self._measured_on))][:1]
@@ -198,16 +220,11 @@ class MazeTask:
             step_penalty=self.maze.step_penalty,
             observe_agent=self.maze.observe_agent,
         )
-        return PPO(env, agent, self.solver.ppo)
+        return PPO(env, agent, self.solver.ppo, self.recorder)
 
     def generate(self, choices: Tensor, generators: list[torch.Generator]) -> Level:
-        """Levels [K, P] of the Proposer's choices, int64 [K, P]."""
-        levels: list[Any] = [
-            self.space.generate(choice, generator)
-            for choice, generator in zip(choices, generators, strict=True)
-        ]
-        stacked: Any = torch.stack(levels)
-        return stacked
+        """Levels [K, P] of the Proposer's choices, int64 [K, P]; copy k's from generator k."""
+        return self.space.generate(choices, generators, self.device)
 
     def directions(self, kind: str) -> Tensor:
         """What the numbers of a mixture add to the log-shares of the space, float [D, M * N].
@@ -218,30 +235,31 @@ class MazeTask:
                 ``"all"``: every specification by itself (D = M * N).
         """
         if kind == "all":
-            return torch.eye(self.space.size, device=self.device)
-        x, y = self.space.coordinates.to(self.device).unbind(-1)
+            return torch.eye(self.space.size)
+        x, y = self.space.coordinates.unbind(-1)
         linear = [x, y]
         quadratic = [*linear, x.square(), y.square(), x * y]
         return torch.stack({"linear": linear, "quadratic": quadratic}[kind])
 
     def sample_target(self, count: int, generator: torch.Generator) -> Level:
         """Levels [count] of the target distribution."""
-        return self.target.sample(count, generator)
+        return self.target.sample(count, generator, self.device)
 
     def sample_space(self, count: int, generator: torch.Generator) -> Level:
         """Levels [count], evenly from the Proposer's space."""
-        return self.space.sample(count, generator)
+        return self.space.sample(count, generator, self.device)
 
     def evaluate(
         self, solver: ActorCritic, levels: Level, generator: torch.Generator
     ) -> TensorDictBase:
         """Return and success of K Solvers on levels [E], [K, E], as the reward counts them."""
-        return self._reward_evaluator(*_with_logits(solver, levels), generator)
+        if isinstance(self._reward_evaluator, RolloutEvaluator):
+            return self._reward_evaluator(*_with_logits(solver, levels), generator)
+        return self._rate(levels.to_tensordict(), solver)
 
     def probe(self, solver: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
-        copies, logits = _with_logits(solver, levels)
-        return torch.cat([planes(copies), logits], -3)
+        return self._see(levels.to_tensordict(), solver)["probes"]
 
     probe_channels = PLANES + ACTIONS
     """Channels of a probe."""
@@ -254,10 +272,23 @@ class MazeTask:
         """
         results: dict[str, Tensor] = {}
         for name, levels in self._measured_on.items():
-            copies, logits = _with_logits(solver, levels)
-            for policy, evaluator in (("", self._sampled), ("greedy_", self._greedy)):
-                for key, value in evaluator(copies, logits).items():
-                    results[f"{name}_{policy}{key}"] = value.mean(1)
+            for key, value in self._measure(levels.to_tensordict(), solver).items():
+                results[f"{name}_{key}"] = value
+        return TensorDict(results, [solver.copies])
+
+    def _rated(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
+        return self._sampled(*_with_logits(solver, Level.from_tensordict(levels)))
+
+    def _seen(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
+        copies, logits = _with_logits(solver, Level.from_tensordict(levels))
+        return TensorDict({"probes": torch.cat([planes(copies), logits], -3)})
+
+    def _measured(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
+        copies, logits = _with_logits(solver, Level.from_tensordict(levels))
+        results: dict[str, Tensor] = {}
+        for policy, evaluator in (("", self._sampled), ("greedy_", self._greedy)):
+            for key, value in evaluator(copies, logits).items():
+                results[f"{policy}{key}"] = value.mean(1)
         return TensorDict(results, [solver.copies])
 
     def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:

@@ -121,6 +121,8 @@ def test_long_benchmarks_run_on_request() -> None:
     assert "memory" in selected([], full=True)
     assert not {"memory", "learning"} & set(selected([], full=False))
     assert selected(["learning"], full=False) == ["learning"]
+    assert "gpu" in selected([], full=False, cuda=True)
+    assert "gpu" not in selected([], full=True)
 
 
 @pytest.mark.parametrize(("name", "scale"), [("paper", PAPER), ("quick", QUICK), ("smoke", TINY)])

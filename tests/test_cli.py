@@ -218,7 +218,10 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
         (["+method=target", "maze.height=2"], "halve a 2x10 maze to nothing"),
         (["+method=target", "solver.channels=[12]"], "must be multiples of solver.groups=8"),
         (["+method=target", "device=abacus"], "device='abacus': must be auto, cpu or a usable"),
-        (["+method=target", "precision=fp8"], "precision='fp8': input should be 'fp32' or 'bf16'"),
+        (
+            ["+method=target", "precision=fp8"],
+            "precision='fp8': input should be 'auto', 'fp32' or 'bf16'",
+        ),
         (["+method=hand_made", "curriculum.until=[3, 2]"], "2 stages need 1 ascending positive"),
         (["+method=hand_made", "curriculum.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
         (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer() got an unexpected"),

@@ -44,7 +44,7 @@ def proposer(
     head = MixtureHead(8, SPACE.size, hidden=8) if mix else ProblemHead(8, P, SPACE.size, hidden=8)
     settings = PPOSettings(horizon=env.steps, gamma=1.0, epochs=2)
     agent = proposer_actor_critic(network(head), normal if mix else categorical)
-    ppo = PPO(env, agent, settings, CopiesBaseline(1.0) if mix else None)
+    ppo = PPO(env, agent, settings, advantage=CopiesBaseline(1.0) if mix else None)
     return ProposerCurriculum(ppo, advance=advance, own_action=own_action)
 
 

@@ -14,10 +14,11 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
+    {"capture"},
     {"mazes", "models", "run_folder", "checkpoint", "settings", "streams"},
     {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
     {"meta_env"},
-    {"curricula"},
+    {"curricula", "snr"},
     {"experiment"},
     {"task"},
     {"methods"},
@@ -30,7 +31,7 @@ RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 NEIGHBOURS = {("checkpoint", "run_folder")}
 
 # These work with any environment and any level: they are reused where there are no mazes.
-KNOW_NO_MAZES = {"ppo", "advantages", "proposals", "solver_view", "meta_env", "experiment"}
+KNOW_NO_MAZES = {"ppo", "advantages", "proposals", "solver_view", "meta_env", "snr", "experiment"}
 
 # Everything but the command line takes plain arguments.
 CONFIGURATION = {"hydra", "omegaconf", "pydantic"}
@@ -96,7 +97,7 @@ def objection(module: str, other: str) -> str:
         return ", but must work without mazes"
     if RANK[other] > RANK[module]:
         return ", which is in a higher layer"
-    if RANK[other] == RANK[module] == 0 and (module, other) not in NEIGHBOURS:
+    if RANK[other] == RANK[module] == 1 and (module, other) not in NEIGHBOURS:
         return ", its neighbour in the lowest layer"
     return ""
 

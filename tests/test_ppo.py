@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch.distributions import Categorical
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.objectives import ClipPPOLoss
 
+from proposer_rl.capture import Recorder
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.models import Population, UNet, map_actor_critic
 from proposer_rl.ppo import PPO, PPOSettings, clip_gradients_
+from tests.graphs import NoHostReads, Tapes
 
 P, T = 6, 12
 SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
@@ -24,15 +29,34 @@ def levels(copies: int, seed: int = 0) -> Level:
     return generate_levels(torch.full((copies, P), 0.2), 2, 5, 5, generator=generator)
 
 
-def learner(copies: int = 1, settings: PPOSettings = SETTINGS, observe_agent: bool = False) -> PPO:
+def learner(
+    copies: int = 1,
+    settings: PPOSettings = SETTINGS,
+    observe_agent: bool = False,
+    *,
+    per_step: bool | None = None,
+    way: str | None = None,
+    recorder: Recorder | None = None,
+) -> PPO:
     torch.manual_seed(3)
 
     def make() -> UNet:
         return UNet(in_channels=4 if observe_agent else 3, channels=(8, 16), groups=4)
 
-    agent = map_actor_critic(Population(make, copies), per_step=observe_agent)
+    per_step = observe_agent if per_step is None else per_step
+    agent = map_actor_critic(Population(make, copies, way=way), per_step=per_step)
     env = MazeEnv(levels(copies), max_steps=5, observe_agent=observe_agent)
-    return PPO(env, agent, settings)
+    return PPO(env, agent, settings, recorder)
+
+
+def train(ppo: PPO, updates: int) -> list[TensorDict]:
+    """Updates on new levels each; their rollouts and metrics."""
+    copies, history = ppo.env.batch_size[0], []
+    for update in range(updates):
+        ppo.env.set_levels(levels(copies, seed=update))
+        rollout, metrics = ppo.update(generators(*(10 * update + k for k in range(copies))))
+        history.append(TensorDict({"rollout": rollout, "metrics": metrics}))
+    return history
 
 
 def generators(*seeds: int) -> list[torch.Generator]:
@@ -227,8 +251,12 @@ def test_restore_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="another network"):
         ppo.restore(other.exclude(name))
     other[name]["step"] += torch.tensor([0.0, 1.0])
-    with pytest.raises(ValueError, match="another shape or Adam step"):
+    with pytest.raises(ValueError, match="different numbers of Adam steps"):
         ppo.restore(other)
+    narrow = ppo.snapshot()
+    narrow[name]["value"] = narrow[name]["value"][:, :1]
+    with pytest.raises(ValueError, match=f"{name} does not fit: another shape"):
+        ppo.restore(narrow)
 
 
 def test_refuses_an_environment_of_another_size() -> None:
@@ -249,3 +277,90 @@ def test_more_updates_on_one_batch_recompute_the_advantages() -> None:
     torch.testing.assert_close(
         second["advantage"], hand_gae(second, 0.99, 0.95), rtol=1e-4, atol=1e-5
     )
+
+
+def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
+    """Ten updates: the same actions throughout, and the same weights up to rounding."""
+    by_level, by_step = learner(2), learner(2, per_step=True)
+    assert by_level.agent.encoder is not None and by_step.agent.encoder is None
+    start = [parameter.detach().clone() for parameter in by_level.agent.parameters()]
+    for one, other in zip(train(by_level, 10), train(by_step, 10), strict=True):
+        assert torch.equal(one["rollout", "action"], other["rollout", "action"])
+        for key, value in one["metrics"].items():
+            torch.testing.assert_close(value, other["metrics", key], rtol=1e-3, atol=1e-4)
+    ends = (by_level.agent.parameters(), by_step.agent.parameters())
+    for one, other in zip(*ends, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+    moved = max(
+        float((end.detach() - begin).abs().max())
+        for end, begin in zip(by_level.agent.parameters(), start, strict=True)
+    )
+    assert moved > 5e-3
+
+
+@pytest.mark.parametrize(
+    ("copies", "observe_agent", "way"),
+    [(1, False, None), (1, True, None), (2, False, "batched"), (2, False, "4 streams")],
+)
+def test_replayed_updates_train_as_plain_ones(
+    copies: int, observe_agent: bool, way: str | None
+) -> None:
+    """Ten updates, of which the first are plain and the others replays: equal to the bit."""
+    tapes = Tapes()
+    plain = learner(copies, observe_agent=observe_agent, way=way)
+    replayed = learner(copies, observe_agent=observe_agent, way=way, recorder=tapes)
+    for one, other in zip(train(plain, 10), train(replayed, 10), strict=True):
+        assert (one == other).all()
+    assert (plain.snapshot() == replayed.snapshot()).all()
+    assert tapes.recorded == 2  # a rollout and the training on it
+
+
+def test_replays_follow_a_restored_snapshot_and_leave_older_rollouts_alone() -> None:
+    ppo = learner(way="in turn", recorder=Tapes())
+    *_, old = train(ppo, 4)
+    kept, snapshot = old.clone(), ppo.snapshot()
+    first = train(ppo, 2)
+    ppo.restore(snapshot)
+    assert all((a == b).all() for a, b in zip(first, train(ppo, 2), strict=True))
+    assert (old == kept).all()
+
+
+@pytest.mark.parametrize("way", ["batched", "4 streams"])
+@pytest.mark.parametrize("observe_agent", [False, True])
+def test_an_update_never_waits_for_the_device(observe_agent: bool, way: str) -> None:
+    ppo = learner(2, observe_agent=observe_agent, way=way)
+    train(ppo, 1)  # constants are made
+    with NoHostReads():
+        ppo.env.set_levels(levels_on_hand := ppo.env.levels.clone())
+        ppo.update(generators(0, 1))
+    assert (ppo.env.levels == levels_on_hand).all()
+
+
+class Crossings(TorchDispatchMode):
+    """Counts copies between devices, and tensors of Python's numbers."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name in ("_to_copy", "copy_"):
+            devices = {a.device for a in (*args, result) if isinstance(a, Tensor)}
+            self.count += len(devices) > 1
+        self.count += name == "lift_fresh"
+        return result
+
+
+def test_everything_in_an_update_stays_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the device ``meta``, which has shapes but no numbers and refuses to mix with another."""
+    # TorchRL compares bounds when it makes a spec; autocast does not know the device.
+    monkeypatch.setattr(torch, "allclose", lambda *_, **__: True)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
+    agent = map_actor_critic(Population(lambda: UNet(channels=(8, 16), groups=4), 1).to("meta"))
+    ppo = PPO(MazeEnv(levels(1).to("meta"), max_steps=5), agent, SETTINGS)
+    ppo.update()  # constants are made, and moved there
+    with Crossings() as crossings:
+        rollout, metrics = ppo.update()
+    assert crossings.count == 0
+    leaves = [*rollout.values(True, True), *metrics.values()]
+    assert {leaf.device.type for leaf in leaves} == {"meta"}

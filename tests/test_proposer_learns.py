@@ -56,7 +56,7 @@ def _ppo(env, head, distribution, advantage) -> PPO:
     network = ProposerNetwork(head, SKILLS, numbers=1, context=32, hidden=32, channels=(8,))
     agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
     settings = PPOSettings(horizon=env.steps, epochs=8, gamma=1.0, learning_rate=3e-3)
-    return PPO(env, agent, settings, advantage)
+    return PPO(env, agent, settings, advantage=advantage)
 
 
 def learnt_gain(make: Callable[..., PPO], seed: int, cycles: int = 60, **options) -> float:

@@ -59,7 +59,7 @@ def run(names: list[str], options: Options, threads: int | None, output: Path) -
     Returns:
         The exit code.
     """
-    chosen = selected(names, options.size == "full")
+    chosen = selected(names, options.size == "full", options.device.startswith("cuda"))
     content: dict[str, Any] = {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": machine(options.device),
@@ -136,7 +136,12 @@ def _positive(text: str) -> int:
 
 
 def _list() -> None:
-    remarks = {"default": "", "full": " [with --full or by name]", "request": " [by name]"}
+    remarks = {
+        "default": "",
+        "full": " [with --full or by name]",
+        "cuda": " [on a GPU]",
+        "request": " [by name]",
+    }
     for name, benchmark in BENCHMARKS.items():
         print(f"{name:<15} {benchmark.about}{remarks[benchmark.on]}")
 

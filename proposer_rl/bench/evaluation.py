@@ -18,7 +18,7 @@ def exact_evaluation(options: Options) -> Result:
     scale = TINY if options.tiny else PAPER
     task = scale.task(options)
     copies, count = scale.proposer.rollouts, scale.proposer.validation_levels
-    generator = Streams(0, "validation").generator(device=options.device)
+    generator = Streams(0, "validation").generator()
     validation = task.sample_target(count, generator)
     solver, population = Solvers(task), Solvers(task, copies, batches=1)
     agent = population.ppo.agent

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.bench.results import Options, Result, Row, Spread, Table
-from proposer_rl.bench.scales import QUICK, TINY
+from proposer_rl.bench.scales import PAPER, QUICK, TINY
 from proposer_rl.bench.timing import threads
 from proposer_rl.streams import Streams
 from proposer_rl.task import DistributionSettings, EvaluationSettings, MazeTask
@@ -16,11 +16,21 @@ from proposer_rl.task import DistributionSettings, EvaluationSettings, MazeTask
 # An easy mix, so that something is learnt in few updates.
 MIX = DistributionSettings(specifications=[(0.0, 2), (0.1, 3), (0.2, 4), (0.25, 5), (0.3, 6)])
 
+# The paper's network and step size, which is where bf16 pays, on mazes and batches of `quick`.
+WIDE = replace(
+    QUICK,
+    solver=replace(
+        PAPER.solver,
+        problems=QUICK.solver.problems,
+        ppo=replace(PAPER.solver.ppo, horizon=QUICK.solver.ppo.horizon),
+    ),
+)
+
 
 def learning_curves(options: Options) -> Result:
-    """Train narrow Solvers with both precisions on the same levels and random numbers."""
-    scale = TINY if options.tiny else QUICK
-    updates, every = (4, 2) if options.tiny else (240, 20)
+    """Train Solvers of the paper's width in both precisions: same levels, same random numbers."""
+    scale = TINY if options.tiny else WIDE
+    updates, every = (4, 2) if options.tiny else (100, 10)
     seeds = max(2, options.repeats)
     curves = {}
     for precision in ("fp32", "bf16"):
@@ -29,7 +39,7 @@ def learning_curves(options: Options) -> Result:
             distributions={"mix": MIX if not options.tiny else scale.distributions["id"]},
             target="mix",
             space=scale.space,
-            solver=replace(scale.solver),
+            solver=scale.solver,
             evaluation=EvaluationSettings(distributions=["mix"], levels=8 if options.tiny else 512),
             device=options.device,
             precision=precision,
@@ -55,7 +65,10 @@ def learning_curves(options: Options) -> Result:
         at_most=True,
     )
     header = ["update", "fp32 success (min-max)", "bf16 success (min-max)", "difference"]
-    return Result([row], [Table("Learning curves, quick values, an easy mix", header, lines)])
+    return Result(
+        [row],
+        [Table("Learning curves, the paper's network, quick mazes, an easy mix", header, lines)],
+    )
 
 
 def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
@@ -65,10 +78,7 @@ def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
     shape = torch.Size([seeds, task.solver.problems])
     curve = [task.measure(solvers.agent)["mix_success"]]
     for update in range(updates):
-        levels = [
-            task.sample_target(shape[1], s.generator("levels", update, device=task.device))
-            for s in streams
-        ]
+        levels = [task.sample_target(shape[1], s.generator("levels", update)) for s in streams]
         stacked: object = torch.stack(levels)  # type: ignore[arg-type]
         solvers.env.set_levels(stacked)
         solvers.update([s.generator("actions", update, device=task.device) for s in streams])

@@ -34,11 +34,11 @@ def meta_step(options: Options) -> Result:
     rows, tables = [], []
     for name, scale in scales.items():
         task = scale.task(options)
-        env = _proposer(task, _acting_at_every_update(scale)).env
-        parts = _Parts(task, env)
+        env = proposer_curriculum(task, _acting_at_every_update(scale)).env
+        parts = StepParts(task, env)
         with threads(scale.threads):
             seconds = interleave(
-                {"step": _Step(env), "parts": parts},
+                {"step": MetaStep(env), "parts": parts},
                 options.few if scale is PAPER else options.repeats,
                 options.device,
             )
@@ -58,7 +58,7 @@ def meta_step(options: Options) -> Result:
     return Result(rows, tables)
 
 
-class _Step:
+class MetaStep:
     """A step with random actions, as a collector makes it."""
 
     def __init__(self, env: SolverTrainingEnv) -> None:
@@ -67,11 +67,12 @@ class _Step:
 
     @torch.no_grad()
     def __call__(self) -> None:
+        """Step every Solver once."""
         action = self.env.action_spec.rand()
         _, self.state = self.env.step_and_maybe_reset(self.state.set("action", action))
 
 
-class _Parts:
+class StepParts:
     """What a step consists of, without the environment around it."""
 
     def __init__(self, task: MazeTask, env: SolverTrainingEnv) -> None:
@@ -84,24 +85,29 @@ class _Parts:
         self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
 
     def __call__(self) -> None:
+        """All parts, each timed."""
         for part in PARTS:
             timings = interleave({part: getattr(self, part)}, 1, str(self.task.device), warmup=0)
             self.seconds[part] += timings[part]
 
     def generation(self) -> None:
+        """Levels for random actions."""
         action, problems = self.env.action_spec.rand(), self.task.solver.problems
         self.levels, _ = self.env.proposals.levels(action, problems, self.streams)
 
     def update(self) -> None:
+        """One PPO update of each Solver on them."""
         self.solvers.env.set_levels(self.levels)
         self.solvers.update(self.generators)
 
     @torch.no_grad()
     def evaluation(self) -> None:
+        """Their return on the validation levels."""
         self.task.evaluate(self.solvers.agent, self.validation, self.generators[0])
 
     @torch.no_grad()
     def probing(self) -> None:
+        """What the Proposer sees of them."""
         self.task.probe(self.solvers.agent, self.probes)
 
     def table(self, title: str) -> Table:
@@ -126,7 +132,7 @@ def memory(options: Options) -> Result:
     task = scale.task(options)
     before = peak_memory()
     short = replace(scale, proposer=replace(scale.proposer, lookahead=steps))
-    curriculum = _proposer(task, _acting_at_every_update(short))
+    curriculum = proposer_curriculum(task, _acting_at_every_update(short))
     # The Solver itself, its levels and measurements are in memory beside its copies.
     solver = task.solvers([Streams(0, "solver")])
     curriculum.env.fork(solver.snapshot()[0], Streams(1))
@@ -169,6 +175,7 @@ def _acting_at_every_update(scale: Scale) -> Scale:
     return replace(scale, proposer=replace(scale.proposer, updates_per_step=1))
 
 
-def _proposer(task: MazeTask, scale: Scale) -> ProposerCurriculum:
+def proposer_curriculum(task: MazeTask, scale: Scale) -> ProposerCurriculum:
+    """The curriculum of the method `perf_gain`."""
     curriculum: Any = proposer(Parts(task, scale.proposer, seed=0), performance_gain)
     return curriculum

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from proposer_rl.bench.ceiling import against_convolutions
 from proposer_rl.bench.environment import environment_steps
 from proposer_rl.bench.evaluation import exact_evaluation
+from proposer_rl.bench.gpu import gpu_targets
 from proposer_rl.bench.learning import learning_curves
 from proposer_rl.bench.levels import generation, shortest_paths
 from proposer_rl.bench.meta import memory, meta_step
@@ -21,7 +22,8 @@ class Benchmark(NamedTuple):
     Attributes:
         about: one line for a list.
         run: the measurement.
-        on: ``"default"``, ``"full"`` (only with the full sizes) or ``"request"``.
+        on: ``"default"``, ``"full"`` (only with the full sizes), ``"cuda"`` (only on a GPU) or
+            ``"request"``.
     """
 
     about: str
@@ -42,12 +44,13 @@ BENCHMARKS = {
     "meta": Benchmark("a meta-environment step against its parts", meta_step),
     "population": Benchmark("K Solvers in one update against one after another", population),
     "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
+    "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
     "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
     "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),
 }
 
 
-def selected(names: list[str], full: bool) -> list[str]:
+def selected(names: list[str], full: bool, cuda: bool = False) -> list[str]:
     """The names given, or without any those that run by default."""
-    allowed = {"default", "full"} if full else {"default"}
+    allowed = {"default"} | ({"full"} if full else set()) | ({"cuda"} if cuda else set())
     return names or [name for name, benchmark in BENCHMARKS.items() if benchmark.on in allowed]

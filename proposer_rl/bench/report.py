@@ -89,6 +89,8 @@ def number(value: float, unit: Unit) -> str:
         return f"{100 * value:.1f} %"
     if unit == "/s":
         return f"{value:,.0f} /s"
+    if unit == "ms":
+        return f"{1e3 * value:.3g} ms"
     digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
     return f"{value:.{digits}f}{'x' if unit == 'x' else ' ' + unit}"
 

@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any, Literal
 
 Size = Literal["tiny", "normal", "full"]
-Unit = Literal["x", "%", "/s", "GiB"]
+Unit = Literal["x", "%", "/s", "GiB", "ms", "s"]
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class Row:
     Attributes:
         what: what was measured.
         against: what it was measured against, or a remark on an absolute number.
-        value: the measurement, in ``unit``; shares in % are fractions here.
-        unit: of the value and the target.
+        value: the measurement; shares are fractions here, times are seconds.
+        unit: for showing the value and the target; of times both are in seconds.
         target: what is to be reached; None for information only.
         at_most: whether the target is an upper bound.
         samples: the timings behind it, in seconds, by name and in the order of the rounds.

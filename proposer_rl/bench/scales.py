@@ -20,6 +20,7 @@ from proposer_rl.task import (
     MazeTask,
     SolverSettings,
     SpaceSettings,
+    faster_precision,
 )
 
 NARROW = [16, 32, 32]
@@ -52,13 +53,12 @@ class Scale:
         return replace(self, proposer=replace(self.proposer, rollouts=copies))
 
     def precision(self, options: Options) -> str:
-        """The precision asked for; with ``auto`` bf16 for a wide network where it is faster."""
+        """The precision asked for; with ``auto`` that of a run."""
         if options.precision != "auto":
             return options.precision
-        wide = self.solver.channels[0] >= 64
-        return "bf16" if wide and bf16_in_hardware(options.device) else "fp32"
+        return faster_precision(self.solver.channels, torch.device(options.device))
 
-    def task(self, options: Options, precision: str | None = None) -> MazeTask:
+    def task(self, options: Options, precision: str | None = None, graphs: bool = True) -> MazeTask:
         """The maze task of these settings."""
         return MazeTask(
             maze=self.maze,
@@ -70,6 +70,7 @@ class Scale:
             evaluation=EvaluationSettings(distributions=["id"], levels=8),
             device=options.device,
             precision=precision or self.precision(options),
+            graphs=graphs,
         )
 
 
@@ -170,6 +171,6 @@ class Solvers:
 
     def _draw(self, batch: int) -> Level:
         shape = torch.Size([self.copies, self.task.solver.problems])
-        generator = Streams(batch, "levels").generator(device=self.task.device)
+        generator = Streams(batch, "levels").generator()
         levels = self.task.sample_target(shape.numel(), generator)
         return levels.reshape(shape)

@@ -64,6 +64,8 @@ def main() -> None:
         torch.set_num_threads(int(threads))
     torch.manual_seed(0)
     chosen = Options(**json.loads(options))
+    if chosen.device.startswith("cuda"):
+        torch.set_float32_matmul_precision("high")  # TF32, as in a run
     start = time.perf_counter()
     result = BENCHMARKS[name].run(chosen)
     content = {

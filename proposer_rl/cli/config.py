@@ -54,7 +54,8 @@ class RunConfig(BaseModel):
     checkpoint: str | None
     seed: Annotated[int, Field(ge=0)]
     device: str
-    precision: Literal["fp32", "bf16"]
+    precision: Literal["auto", "fp32", "bf16"]
+    graphs: bool
     threads: Annotated[int, Field(ge=1)] | None
     cores: Annotated[int, Field(ge=1)] | None
     progress: bool
@@ -142,6 +143,7 @@ def saved_config(folder: Path) -> RunConfig:
     file = folder / "config.json"
     free: dict[str, Any] = {
         "device": "auto",
+        "graphs": True,
         "threads": 1,
         "cores": None,
         "progress": False,

@@ -30,7 +30,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.methods import Parts
 from proposer_rl.run_folder import RunFolder
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
+from proposer_rl.task import MazeTask, faster_precision
 
 INPUT_ERRORS = (ConfigError, CheckpointError)
 BAD_INPUT = 2
@@ -110,8 +110,13 @@ def make_task(config: RunConfig) -> MazeTask:
         ConfigError: if the device cannot be used.
         ValueError: if settings that are each valid do not make a task.
     """
+    device = _device(config.device)
+    if device.type == "cuda":
+        # TF32: products of matrices and convolutions round their fp32 inputs to 10 bits.
+        torch.set_float32_matmul_precision("high")
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    automatic = config.precision == "auto"
     return MazeTask(
         maze=config.maze,
         distributions=config.distributions,
@@ -119,9 +124,12 @@ def make_task(config: RunConfig) -> MazeTask:
         space=config.space,
         solver=config.solver,
         evaluation=config.evaluation,
-        device=_device(config.device),
-        precision=config.precision,
+        device=device,
+        precision=(
+            faster_precision(config.solver.channels, device) if automatic else config.precision
+        ),
         cores=config.cores,
+        graphs=config.graphs,
     )
 
 
@@ -201,7 +209,7 @@ def _device(name: str) -> torch.device:
 def _check_same_run(folder: RunFolder, config: RunConfig) -> None:
     """Refuse to go on with a run that was started with other settings."""
     # What may differ: where and how it is computed and shown, and a longer schedule.
-    free = {"device", "threads", "cores", "progress", "logger"}
+    free = {"device", "graphs", "threads", "cores", "progress", "logger"}
     now = config.model_dump(mode="json", exclude=free)
     now["schedule"].pop("updates")
     file = folder.path / "config.json"

@@ -26,8 +26,8 @@ class SamplingCurriculum(Curriculum):
 
     def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
         """Fresh levels [K, P] at every update."""
-        device, problems = solver.env.device, solver.env.batch_size[1:].numel()
-        draws = [self._sample(problems, s.generator("levels", device=device)) for s in streams]
+        problems = solver.env.batch_size[1:].numel()
+        draws = [self._sample(problems, s.generator("levels")) for s in streams]
         return torch.stack(draws)
 
 

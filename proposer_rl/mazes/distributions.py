@@ -11,6 +11,7 @@ from torch import Tensor
 
 from proposer_rl.mazes.generation import check_specifications, generate_levels
 from proposer_rl.mazes.levels import Level, LevelSpec
+from proposer_rl.mazes.randomness import Generators
 
 
 class LevelDistribution:
@@ -65,22 +66,31 @@ class LevelDistribution:
             torch.tensor(lengths, device=index.device)[index],
         )
 
-    def generate(self, index: Tensor, generator: torch.Generator | None = None) -> Level:
+    def generate(
+        self,
+        index: Tensor,
+        generator: Generators = None,
+        device: torch.device | str | None = None,
+    ) -> Level:
         """Draws one level for each number.
 
         Args:
             index: int64 ``[*B]``, in 0 ... size - 1.
-            generator: Source of randomness; None for the default one.
+            generator: Source of randomness; None for the default one, a sequence for one of each
+                index of the first dimension (see
+                :func:`~proposer_rl.mazes.generation.generate_levels`).
+            device: Where the levels are returned; None for that of the numbers.
 
         Returns:
-            Levels ``[*B]``, in the order of the numbers and on their device.
+            Levels ``[*B]``, in the order of the numbers.
 
         Raises:
             ValueError: If a number is out of range.
         """
         fraction, length = self.decode(index.cpu())
+        target = index.device if device is None else device
         return generate_levels(
-            fraction, length, self.height, self.width, self.mechanism, generator, index.device
+            fraction, length, self.height, self.width, self.mechanism, generator, target
         )
 
     def sample(
@@ -102,7 +112,7 @@ class LevelDistribution:
         target = _target_device(generator, device)
         place = target if generator is None else generator.device
         index = torch.randint(self.size, _shape(batch_shape), generator=generator, device=place)
-        return self.generate(index.to(target), generator)
+        return self.generate(index, generator, target)
 
     def _check(self, index: Tensor) -> None:
         if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):

@@ -56,15 +56,21 @@ class MazeEnv(EnvBase):
     ) -> None:
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
-        super().__init__(device=levels.walls.device, batch_size=levels.batch_size)
+        super().__init__(
+            device=levels.walls.device,
+            batch_size=levels.batch_size,
+            # A start is never a goal. Else TorchRL looks at every reset, and waits for the device.
+            allow_done_after_reset=True,
+        )
         self.max_steps = max_steps
         self.step_penalty = step_penalty
         self.observe_agent = observe_agent
         self._grid = levels.walls.shape[-2:]
         self._make_specs()
+        self._next_levels = levels.clone()
+        self._waiting = False  # whether a maze may still be playing an older level
         self._play(levels)
         self._agent = levels.start
-        self._next_levels: Level | None = None
 
     @property
     def levels(self) -> Level:
@@ -73,6 +79,9 @@ class MazeEnv(EnvBase):
 
     def set_levels(self, levels: Level) -> None:
         """Replaces the levels; each maze plays its new one from its own next reset on.
+
+        The new levels are copied to where the ones before them were, so that a recorded reset
+        (:mod:`proposer_rl.capture`) finds them.
 
         Args:
             levels: Levels of the environment's batch shape, grid and device.
@@ -87,14 +96,40 @@ class MazeEnv(EnvBase):
                 "levels must keep the environment's batch shape, grid and device "
                 f"{_describe(*own)}, got {_describe(*given)}"
             )
-        self._next_levels = levels
+        self._next_levels.update_(levels)
+        self._waiting = True
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Sends the agents of finished mazes back to their starts.
+
+        As TorchRL's, but without asking first whether there are any, which would wait for the
+        device.
+
+        Args:
+            tensordict: The root of the next step, with the ends of the last one.
+
+        Returns:
+            The same with the reset of every maze that was done.
+        """
+        if self._waiting:
+            return super().maybe_reset(tensordict)
+        done = tensordict.get("done")  # [*B, 1]
+        agent = self._levels.start.where(done, tensordict.get("agent"))
+        self._agent = agent
+        after = tensordict.copy()
+        after.set("agent", agent)
+        after.set("step_count", tensordict.get("step_count") * ~done)
+        for key in ("done", "terminated", "truncated"):
+            after.set(key, torch.zeros_like(done))
+        if self.observe_agent and "planes" in tensordict.keys():
+            after.set("planes", self._observe(agent)["planes"])
+        return after
 
     def to(self, device: torch.device | str | int) -> MazeEnv:
         """Moves the environment and its levels to a device."""
         super().to(device)
         self._agent = self._agent.to(self.device)
-        if self._next_levels is not None:
-            self._next_levels = self._next_levels.to(self.device)
+        self._next_levels = self._next_levels.to(self.device)
         self._play(self._levels.to(self.device))
         return self
 
@@ -170,8 +205,11 @@ class MazeEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(self.batch_size)
-        if self._next_levels is not None:
-            self._take_up(self._next_levels, mask)
+        if mask is None:
+            self._play(self._next_levels.clone())
+            self._waiting = False
+        elif self._waiting:
+            self._play(self._next_levels.where(mask, self._levels))
         start = self._levels.start
         self._agent = start if mask is None else start.where(mask.unsqueeze(-1), self._agent)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
@@ -187,14 +225,6 @@ class MazeEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
-
-    def _take_up(self, levels: Level, mask: Tensor | None) -> None:
-        """Lets the mazes that are reset (all of them if there is no mask) play their new levels."""
-        if mask is None or bool(mask.all()):
-            self._next_levels = None
-            self._play(levels)
-        else:
-            self._play(levels.where(mask, self._levels))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         (height, width), action = self._grid, tensordict.get("action")

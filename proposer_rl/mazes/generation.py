@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from proposer_rl.mazes.levels import Level, LevelSpec
 from proposer_rl.mazes.path_first import draw_path_first
+from proposer_rl.mazes.randomness import Draws, Generators
 from proposer_rl.mazes.uniform import draw_uniform
 
-_Draw = Callable[
-    [Tensor, Tensor, int, int, torch.Generator | None, torch.device], tuple[Tensor, Level]
-]
+_Draw = Callable[[Tensor, Tensor, int, int, Draws], tuple[Tensor, Level]]
 
 
 class _Mechanism(NamedTuple):
@@ -22,11 +21,12 @@ class _Mechanism(NamedTuple):
     limit: int  # candidates per level after which a specification counts as impossible
     chunk: int  # candidates drawn at once on a CPU, so that the working set stays in its cache
     device_chunk: int  # the same on an accelerator, where few large launches are faster
+    pools: bool  # whether a candidate's random numbers are as many whatever the others are
 
 
 _MECHANISMS = {
-    "uniform": _Mechanism(draw_uniform, 200_000, 8_192, 131_072),
-    "path_first": _Mechanism(draw_path_first, 100_000, 2_048, 32_768),
+    "uniform": _Mechanism(draw_uniform, 200_000, 8_192, 131_072, True),
+    "path_first": _Mechanism(draw_path_first, 100_000, 2_048, 32_768, False),
 }
 MECHANISMS = tuple(_MECHANISMS)
 
@@ -37,7 +37,7 @@ def generate_levels(
     height: int = 10,
     width: int = 10,
     mechanism: str = "uniform",
-    generator: torch.Generator | None = None,
+    generator: Generators = None,
     device: torch.device | str | None = None,
 ) -> Level:
     """Draws one level for each specification, exactly as specified.
@@ -60,7 +60,9 @@ def generate_levels(
         width: W, cells.
         mechanism: ``"uniform"`` or ``"path_first"``.
         generator: Source of randomness; None for the default one. The levels are drawn on its
-            device, so that they depend on it alone.
+            device, so that they depend on it alone. With a sequence of generators, one for each
+            index of the first dimension, levels ``[k]`` are those that generator k alone would
+            give, drawn together.
         device: Where the levels are returned; None for that of ``obstacle_fraction`` or
             ``path_length`` if either is a tensor, else that of the generator, else the CPU.
 
@@ -78,10 +80,26 @@ def generate_levels(
         raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
     if height < 1 or width < 1:
         raise ValueError(f"a grid has at least one row and one column, got {height}x{width}")
-    task = _Task(fraction.flatten(), length.flatten(), height, width, mechanism)
-    place = torch.device(target) if generator is None else generator.device
-    levels = task.solve(generator, place)
-    return levels.reshape(fraction.shape).to(target)
+    if isinstance(generator, Sequence) and not _MECHANISMS[mechanism].pools:
+        levels: Any = torch.stack(
+            [
+                generate_levels(f, n, height, width, mechanism, g, g.device)
+                for f, n, g in zip(fraction, length, generator, strict=True)
+            ]
+        )
+        return upload(levels, target)
+    group, groups = _groups(fraction.shape, generator)
+    task = _Task(
+        fraction.flatten(), length.flatten(), group.flatten(), groups, height, width, mechanism
+    )
+    return upload(task.solve(generator, _place(generator, target)).reshape(fraction.shape), target)
+
+
+def upload(levels: Level, device: torch.device) -> Level:
+    """Moves levels to a device; to a GPU without waiting for what it is doing."""
+    if device.type == "cuda" and levels.walls.device.type == "cpu":
+        return levels.pin_memory().to(device, non_blocking=True)
+    return levels.to(device)
 
 
 def check_specifications(
@@ -113,14 +131,21 @@ def check_specifications(
 
 
 class _Task:
-    """The problems of one call, pooled by distinct specification.
+    """The problems of one call, pooled by distinct specification and group.
 
     Specifications are in ascending order of path length, as the mechanisms require. All counts are
     kept on the CPU; only candidates live on the device.
     """
 
     def __init__(
-        self, fraction: Tensor, length: Tensor, height: int, width: int, mechanism: str
+        self,
+        fraction: Tensor,
+        length: Tensor,
+        group: Tensor,
+        groups: int,
+        height: int,
+        width: int,
+        mechanism: str,
     ) -> None:
         self.grid = (height, width)
         self.name = mechanism
@@ -128,8 +153,11 @@ class _Task:
         obstacles = (fraction * (height * width)).round()
         _check_range(fraction, length)
         base = height * width + 1
-        specs, spec_of = (length * base + obstacles.long()).unique(return_inverse=True)
-        self.length, self.obstacles = specs // base, specs % base  # [S], ascending in length
+        number = (length * base + obstacles.long()) * groups + group
+        specs, spec_of = number.unique(return_inverse=True)
+        specs, self.group = specs // groups, specs % groups  # [S]
+        self.length, self.obstacles = specs // base, specs % base  # ascending in length
+        self.by_group = self.group.argsort(stable=True)
         self.order = spec_of.argsort(stable=True)  # problems, grouped by specification
         self.wanted = spec_of.bincount(minlength=len(specs))  # [S]
         self.first = self.wanted.cumsum(0) - self.wanted  # of each group in ``order``
@@ -137,7 +165,7 @@ class _Task:
         for spec in range(len(specs)):
             self._check_necessary(spec)
 
-    def solve(self, generator: torch.Generator | None, device: torch.device) -> Level:
+    def solve(self, generator: Generators, device: torch.device) -> Level:
         """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
         count, (height, width) = self.order.shape[0], self.grid
         result = Level(
@@ -151,8 +179,9 @@ class _Task:
         while (filled < self.wanted).any():
             share = self._share(self.wanted - filled, drawn, accepted, device)
             spec_of = torch.arange(len(share)).repeat_interleave(share)  # [C]
+            draws = Draws(generator, self.group[spec_of], device)
             kept, level = self.mechanism.draw(
-                self.obstacles[spec_of], self.length[spec_of], height, width, generator, device
+                self.obstacles[spec_of], self.length[spec_of], height, width, draws
             )
             spec_of = spec_of[kept.cpu()]  # [A]
             found = spec_of.bincount(minlength=len(share))
@@ -179,8 +208,14 @@ class _Task:
         share = (1.1 * pending / rate).ceil().long() + 2 * (pending > 0)
         on_cpu = device.type == "cpu"
         chunk = self.mechanism.chunk if on_cpu else self.mechanism.device_chunk
-        before = share.cumsum(0) - share
-        return share.minimum((chunk - before).clamp(min=0))
+        return share.minimum((chunk - self._before(share)).clamp(min=0))
+
+    def _before(self, share: Tensor) -> Tensor:
+        """Candidates of the specifications before each one of its group."""
+        ordered, group = share[self.by_group], self.group[self.by_group]
+        before = ordered.cumsum(0) - ordered
+        first = torch.searchsorted(group, group)  # where the group begins
+        return torch.empty_like(share).scatter_(0, self.by_group, before - before[first])
 
     def _check_necessary(self, spec: int) -> None:
         """Refuses at once what no level can meet."""
@@ -251,10 +286,28 @@ def _broadcast(
     return fraction, length
 
 
+def _groups(shape: torch.Size, generator: Generators) -> tuple[Tensor, int]:
+    """The number of each problem's generator, int64 ``[*B]`` on the CPU, and how many there are."""
+    if not isinstance(generator, Sequence):
+        return torch.zeros(shape, dtype=torch.int64), 1
+    count = len(generator)
+    if shape[:1] != (count,):
+        raise ValueError(
+            f"{count} generators need as many indices in the first dimension, got {list(shape)}"
+        )
+    return torch.arange(count).view(-1, *[1] * (len(shape) - 1)).expand(shape), count
+
+
+def _place(generator: Generators, otherwise: torch.device) -> torch.device:
+    """The generators' device."""
+    first = generator[0] if isinstance(generator, Sequence) else generator
+    return otherwise if first is None else first.device
+
+
 def _target_device(
     obstacle_fraction: object,
     path_length: object,
-    generator: torch.Generator | None,
+    generator: Generators,
     device: torch.device | str | None,
 ) -> torch.device:
     if device is not None:
@@ -262,4 +315,4 @@ def _target_device(
     for argument in (obstacle_fraction, path_length):
         if isinstance(argument, Tensor):
             return argument.device
-    return torch.device("cpu") if generator is None else generator.device
+    return _place(generator, torch.device("cpu"))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from proposer_rl.mazes.distance import padded_index, schedule
 from proposer_rl.mazes.levels import Level, cell_position
+from proposer_rl.mazes.randomness import Draws
 
 _NEVER = 2**31 - 1  # rank of a cell that is not to be opened
 _CLOSED = 100  # added to a cell's count of carved neighbours: it can no longer be carved
@@ -17,18 +18,17 @@ def draw_path_first(
     path_length: Tensor,
     height: int,
     width: int,
-    generator: torch.Generator | None,
-    device: torch.device,
+    draws: Draws,
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those that meet their specification.
 
     Args and returns are those of :func:`proposer_rl.mazes.uniform.draw_uniform`. A candidate is
     lost if its path runs into a dead end, or if too few cells can be opened without a shortcut.
     """
-    path, carved = _carve(path_length.to(device), height, width, generator)  # [D+1, C], [C]
+    path, carved = _carve(path_length.to(draws.device), height, width, draws)  # [D+1, C], [C]
     kept = carved.nonzero().squeeze(1)  # [A]
     path = path.index_select(1, kept)
-    rank = _opening_order(path, height * width, generator)  # [H*W, A]
+    rank = _opening_order(path, height * width, draws.of(kept))  # [H*W, A]
     cells_free = height * width - obstacles[kept.cpu()]
     free, met = _open_cells(
         rank.unflatten(0, (height, width)), path[0], path[-1], path_length[kept.cpu()], cells_free
@@ -41,9 +41,7 @@ def draw_path_first(
     )
 
 
-def _carve(
-    path_length: Tensor, height: int, width: int, generator: torch.Generator | None
-) -> tuple[Tensor, Tensor]:
+def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[Tensor, Tensor]:
     """Random paths of which no two cells touch unless they are consecutive.
 
     A path goes on to a uniform choice among the cells whose only carved neighbour is its end.
@@ -52,7 +50,7 @@ def _carve(
         path_length: int64 ``[C]``, moves.
         height: H.
         width: W.
-        generator: Source of randomness.
+        draws: Random numbers of the candidates.
 
     Returns:
         path, int64 ``[D + 1, C]`` with D the longest length: numbers of the cells, the last one
@@ -66,7 +64,7 @@ def _carve(
     touched = touched.flatten(0, 1)  # [(H+2) * (W+2), C]
     ones = touched.new_ones(4, count)
 
-    start = torch.randint(height * width, (1, count), generator=generator, device=device)
+    start = draws.randint(height * width)
     cell = padded_index(start, width)  # [1, C]
     path = [cell]
     alive = torch.ones(1, count, dtype=torch.bool, device=device)
@@ -75,7 +73,7 @@ def _carve(
         neighbours = cell + moves  # [4, C]
         touched.scatter_add_(0, neighbours, ones)
         open_to = touched.gather(0, neighbours) == 1
-        rank = torch.rand(4, count, generator=generator, device=device)
+        rank = draws.rand(4)
         choice = rank.masked_fill_(~open_to, -1.0).argmax(0, keepdim=True)
         going = step < path_length
         alive &= open_to.any(0) | ~going
@@ -85,18 +83,18 @@ def _carve(
     return (padded // stride - 1) * width + padded % stride - 1, alive.squeeze(0)
 
 
-def _opening_order(path: Tensor, cells: int, generator: torch.Generator | None) -> Tensor:
+def _opening_order(path: Tensor, cells: int, draws: Draws) -> Tensor:
     """Ranks the cells of each maze in a random order of opening, the path's own cells first.
 
     Args:
         path: int64 ``[D + 1, N]``, numbers of the cells that are open already.
         cells: H * W.
-        generator: Source of randomness.
+        draws: Random numbers of the candidates.
 
     Returns:
         int32 ``[H*W, N]``, a permutation of 0 ... H*W - 1 in each column.
     """
-    key = torch.rand(cells, path.shape[1], generator=generator, device=path.device)
+    key = draws.rand(cells)
     order = key.scatter_(0, path, -1.0).argsort(0)
     ranks = torch.arange(cells, dtype=torch.int32, device=path.device)
     return torch.empty_like(order, dtype=torch.int32).scatter_(

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from proposer_rl.mazes.distance import cells_at_depth
 from proposer_rl.mazes.levels import Level, cell_position
+from proposer_rl.mazes.randomness import Draws
 
 
 def draw_uniform(
@@ -14,8 +15,7 @@ def draw_uniform(
     path_length: Tensor,
     height: int,
     width: int,
-    generator: torch.Generator | None,
-    device: torch.device,
+    draws: Draws,
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those in which the path length occurs.
 
@@ -27,19 +27,17 @@ def draw_uniform(
         path_length: int64 ``[C]`` on the CPU, ascending.
         height: H.
         width: W.
-        generator: Source of randomness, on ``device``.
-        device: Where the candidates are drawn.
+        draws: Random numbers of the candidates.
 
     Returns:
         Indices of the A candidates that were kept, int64 ``[A]`` ascending, and their levels.
     """
-    walls, start = _draw_walls_and_start(obstacles, height * width, generator, device)
+    walls, start = _draw_walls_and_start(obstacles, height * width, draws)
     free = ~walls.unflatten(0, (height, width))  # [H, W, C]
     goals = cells_at_depth(free, start, path_length).flatten(0, 1)  # [H*W, C]
     kept = goals.any(0).nonzero().squeeze(1)  # [A]
     goals = goals.index_select(1, kept)
-    rank = torch.rand(goals.shape, generator=generator, device=device)
-    goal = rank.masked_fill_(~goals, -1.0).argmax(0)
+    goal = _choose(goals, draws.of(kept).rand(1).squeeze(0))
     return kept, Level(
         walls=walls.index_select(1, kept).t().unflatten(1, (height, width)),
         start=cell_position(start[kept], width),
@@ -48,9 +46,23 @@ def draw_uniform(
     )
 
 
-def _draw_walls_and_start(
-    obstacles: Tensor, cells: int, generator: torch.Generator | None, device: torch.device
-) -> tuple[Tensor, Tensor]:
+def _choose(goals: Tensor, uniform: Tensor) -> Tensor:
+    """Chooses a marked cell of each maze.
+
+    Args:
+        goals: bool ``[H*W, A]``, with a True in every column.
+        uniform: Numbers in [0, 1), ``[A]``; equal parts of them lead to each marked cell.
+
+    Returns:
+        int64 ``[A]``, numbers of cells.
+    """
+    marked = goals.cumsum(0, dtype=torch.int32)  # up to and including each cell
+    # Rounding may make the product the whole number of marks.
+    rank = (uniform * marked[-1]).int().minimum(marked[-1] - 1)
+    return (marked <= rank).sum(0)
+
+
+def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
     """Uniform obstacles and a uniform free start.
 
     The obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
@@ -61,22 +73,21 @@ def _draw_walls_and_start(
     Args:
         obstacles: int64 ``[C]``, less than ``cells`` each.
         cells: H * W.
-        generator: Source of randomness.
-        device: Where to draw.
+        draws: Random numbers of the candidates.
 
     Returns:
         walls, bool ``[H*W, C]``, and start, int64 ``[C]``.
     """
-    count = obstacles.shape[0]
+    device, count = draws.device, obstacles.shape[0]
     needed = obstacles.to(device, torch.float32)
-    draw = torch.rand(cells - 1, count, generator=generator, device=device)
+    draw = draws.rand(cells - 1)
     # Strictly below the number of cells left, also after rounding: the last ones needed are taken.
     draw *= torch.arange(cells - 1, 0, -1, device=device).unsqueeze(1)
     walls = torch.zeros(cells, count, dtype=torch.bool, device=device)
     for wall, threshold in zip(walls, draw, strict=False):
         torch.lt(threshold, needed, out=wall)
         needed -= wall.float()
-    start = torch.randint(cells, (1, count), generator=generator, device=device)
+    start = draws.randint(cells)
     walls[-1:] = walls.gather(0, start)
     walls.scatter_(0, start, False)
     return walls, start.squeeze(0)

@@ -78,12 +78,16 @@ def cell_logits(solver: ActorCritic, planes: Tensor) -> Tensor:
         return solver.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
     planes_key, agent_key = solver.step_keys
     height, width = planes.shape[-2:]
+    number = torch.arange(height * width, device=planes.device)
+    positions = torch.stack([number // width, number % width], -1)  # [H * W, 2]
     cells = []
-    for row in range(height):
-        for column in range(width):
-            drawn = torch.zeros_like(planes[..., :1, :, :])
-            drawn[..., row, column] = 1.0
-            agent = torch.tensor([row, column], device=planes.device).expand(*batch, 2)
-            step = {planes_key: torch.cat([planes, drawn], -3), agent_key: agent}
-            cells.append(solver(TensorDict(step, batch))["logits"])
+    for cell, position in enumerate(positions):
+        row, column = divmod(cell, width)
+        drawn = torch.zeros_like(planes[..., :1, :, :])
+        drawn[..., row, column].fill_(1.0)
+        step = {
+            planes_key: torch.cat([planes, drawn], -3),
+            agent_key: position.expand(*batch, 2),
+        }
+        cells.append(solver(TensorDict(step, batch))["logits"])
     return torch.stack(cells, -1).unflatten(-1, (height, width))

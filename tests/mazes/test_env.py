@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from proposer_rl.mazes import Level, MazeEnv, planes, successors
@@ -258,3 +259,33 @@ def test_environment_moves_to_a_gpu() -> None:
     env.set_levels(levels.to("cuda"))
     check_env_specs(env, break_when_any_done="both")
     assert env.levels.walls.is_cuda and (env.levels.cpu() == levels).all()
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
+def test_finished_mazes_are_reset_as_torchrl_resets_them(observe_agent: bool) -> None:
+    levels = random_levels(30, 4, 4, 0.2, 3)
+    env = MazeEnv(levels, max_steps=5, observe_agent=observe_agent)
+    state, ended = env.reset(), 0
+    for _ in range(20):
+        state = env.step(state.set("action", torch.randint(4, (30,))))
+        root = env._step_mdp(state).exclude("action")  # the old one, of no meaning any more
+        ended += int(root["done"].sum())
+        expected = EnvBase.maybe_reset(env, root.clone())
+        state = env.maybe_reset(root)
+        assert sorted(state.keys()) == sorted(expected.keys())
+        assert (state == expected).all()
+        assert torch.equal(env._agent, state["agent"])
+    assert ended > 30
+
+
+def test_new_levels_are_written_where_a_recorded_reset_finds_them() -> None:
+    first, second = (random_levels(3, 4, 4, 0.2, seed) for seed in (0, 1))
+    env = MazeEnv(first)
+    memory = env._next_levels.walls.data_ptr()
+    before = env.levels.clone()
+    env.set_levels(second)
+    assert (env.levels == before).all()
+    second.walls.zero_()  # the environment's own are another copy
+    env.reset()
+    assert (env.levels == random_levels(3, 4, 4, 0.2, 1)).all()
+    assert env._next_levels.walls.data_ptr() == memory

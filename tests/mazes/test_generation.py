@@ -283,3 +283,25 @@ def test_opening_many_cells_at_once_equals_one_by_one() -> None:
                 skipped += 1
         assert torch.equal(fast[..., i], ~level.walls)
     assert skipped > 20
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+@pytest.mark.parametrize("copies", [1, 3])
+def test_one_generator_for_each_index_draws_as_each_alone(mechanism: str, copies: int) -> None:
+    # Rare and frequent ones, other ones for each copy, so that some copies need more rounds.
+    fractions = torch.tensor([[0.0, 0.4, 0.4, 0.2], [0.5, 0.5, 0.5, 0.1], [0.3, 0.3, 0.0, 0.0]])
+    lengths = torch.tensor([[2, 12, 12, 6], [16, 16, 14, 3], [1, 1, 2, 2]])
+    fractions, lengths = fractions[:copies].repeat(1, 5), lengths[:copies].repeat(1, 5)
+
+    def generators() -> list[torch.Generator]:
+        return [torch.Generator().manual_seed(seed) for seed in range(copies)]
+
+    together = generate_levels(fractions, lengths, mechanism=mechanism, generator=generators())
+    for k, generator in enumerate(generators()):
+        alone = generate_levels(fractions[k], lengths[k], mechanism=mechanism, generator=generator)
+        assert (together[k] == alone).all()
+
+
+def test_generators_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"2 generators need as many indices.*got \[3\]"):
+        generate_levels(torch.full((3,), 0.1), 2, generator=[torch.Generator()] * 2)

@@ -10,12 +10,14 @@ import torch
 from torch import nn
 
 from proposer_rl.models import Population, UNet
-from proposer_rl.models.population import (
-    _Call,
-    apply_batched,
+from proposer_rl.models.stacked import (
+    WAYS,
+    Call,
     apply_in_turn,
     apply_on_cores,
+    measure,
 )
+from tests.graphs import Tapes
 
 
 def small_unet() -> UNet:
@@ -48,25 +50,25 @@ def test_outputs_and_gradients_equal_those_of_networks_apart() -> None:
             torch.testing.assert_close(stacked.grad[k], parameter.grad, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("way", [apply_batched, partial(apply_on_cores, cores=4)])
+@pytest.mark.parametrize("way", [*WAYS.values(), partial(apply_on_cores, cores=4)])
 def test_every_way_equals_one_copy_after_the_other(way: Callable) -> None:
     population = together(5)
     planes = torch.rand(5, 4, 3, 7, 9, requires_grad=True)
-    call = _Call(population._template[0], population.names, "fp32")
+    call = Call(population._template[0], population.names, "fp32")
     results = {}
-    for apply in (apply_in_turn, way):
+    for name, apply in (("plain", apply_in_turn), ("way", way)):
         outputs = apply(call, list(population.stacked), (planes,))
         loss = sum(output.square().sum() for output in outputs)
         gradients = torch.autograd.grad(loss, [planes, *population.stacked])
         with torch.no_grad():
-            results[apply] = (*outputs, *gradients, *apply(call, population.stacked, (planes,)))
+            results[name] = (*outputs, *gradients, *apply(call, population.stacked, (planes,)))
     for one, other in zip(*results.values(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
 
 
 def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> None:
     population, planes = together(6), torch.rand(6, 4, 3, 6, 6)
-    call = _Call(population._template[0], population.names, "fp32")
+    call = Call(population._template[0], population.names, "fp32")
     runs = []
     for _ in range(3):
         outputs = apply_on_cores(call, list(population.stacked), (planes,), cores=4)
@@ -94,6 +96,18 @@ def test_the_number_of_cores_changes_no_bit() -> None:
         results.append(trained(cores))
     for other in results[1:]:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
+
+
+def test_every_way_is_measured_as_it_will_be_run_and_leaves_no_trace() -> None:
+    population, planes, tapes = together(2), torch.rand(2, 4, 3, 6, 6), Tapes()
+    before = [parameter.detach().clone() for parameter in population.stacked]
+    call = Call(population._template[0], population.names, "fp32")
+    with torch.no_grad():  # as in the rollout, where a population is called first
+        seconds = measure(WAYS, call, list(population.stacked), (planes,), tapes, repeats=1)
+    assert list(seconds) == list(WAYS) and min(seconds.values()) > 0
+    assert tapes.recorded == len(WAYS)
+    for parameter, old in zip(population.stacked, before, strict=True):
+        assert parameter.grad is None and torch.equal(parameter, old)
 
 
 def test_a_parameter_that_is_not_used_has_no_slope() -> None:
@@ -145,6 +159,7 @@ def test_a_network_with_one_output_gives_one_output() -> None:
     [
         ((small_unet, 0), "copies and cores must be at least 1, got 0 and"),
         ((small_unet, 1, "fp32", 0), "copies and cores must be at least 1, got 1 and 0"),
+        ((small_unet, 1, "fp32", 1, "magic"), "way must be one of .*, got 'magic'"),
         ((small_unet, 1, "fp8"), "precision must be 'fp32' or 'bf16', got 'fp8'"),
         ((lambda: nn.BatchNorm1d(3), 1), "must not have buffers"),
     ],

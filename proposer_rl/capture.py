@@ -1,0 +1,158 @@
+"""Functions of tensors whose kernels are recorded once, as a CUDA graph, and then replayed.
+
+Thousands of small kernels cost a GPU less time than it takes Python to ask for them one by one. A
+graph asks for all of them at once. It repeats kernels on the memory that they were recorded with
+and runs no Python, so a function that is to be recorded reads nothing back from the device, and
+what it reads and changes besides its inputs (weights, an optimiser's state) stays where it is.
+
+``tensordict.nn.CudaGraphModule`` does the same, but waits for the device before every replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+
+T = TypeVar("T")
+
+WARM_UPS = 2
+"""Calls before the recording, in which libraries choose kernels and constants are made."""
+
+
+class Recorder(Protocol):
+    """What :class:`Captured` needs of a device; the tests have one for the CPU."""
+
+    def warm_up(self, function: Callable[[], T]) -> T:
+        """Call a function as it is, in preparation for its recording."""
+
+    def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], object]]:
+        """Record what a function asks of the device, without doing any of it.
+
+        Returns:
+            The function's result, whose memory is filled by every call of what comes with it.
+        """
+
+
+class CudaGraphs:
+    """Records CUDA graphs.
+
+    Args:
+        device: the GPU.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+
+    def warm_up(self, function: Callable[[], T]) -> T:
+        """Call the function on a stream of its own, as CUDA asks of what is recorded later."""
+        with torch.cuda.device(self._device):
+            stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
+                result = function()
+            current.wait_stream(stream)
+        return result
+
+    def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], object]]:
+        """Record the function as a graph with memory of its own."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.device(self._device), torch.cuda.graph(graph):
+            result = function()
+        return result, graph.replay
+
+
+def recorder(device: torch.device, graphs: bool = True) -> Recorder | None:
+    """The recorder for a device; None where there is none, or where none is wanted."""
+    return CudaGraphs(device) if graphs and device.type == "cuda" else None
+
+
+class Captured:
+    """A function whose work is recorded, once for each shape of its inputs.
+
+    The first calls run the function as it is; without a recorder all of them do. Then it is
+    recorded, on inputs of its own; from there on a call copies its inputs there, replays, and
+    returns a copy of the outputs.
+
+    Args:
+        function: from a tensordict, and any further objects, to a tensordict. It keeps to what the
+            module says of recorded functions.
+        recorder: of the device that the tensors are on; None to record nothing.
+    """
+
+    def __init__(
+        self, function: Callable[..., TensorDictBase], recorder: Recorder | None = None
+    ) -> None:
+        self._function = function
+        self._recorder = recorder
+        self._recordings: dict[Any, _Recording] = {}
+
+    def __call__(self, inputs: TensorDictBase, *fixed: object) -> TensorDictBase:
+        """Apply the function.
+
+        Args:
+            inputs: tensors, other ones at every call.
+            fixed: further arguments; each combination of objects has recordings of its own.
+
+        Returns:
+            The function's outputs, which later calls leave alone.
+
+        Raises:
+            RuntimeError: if the function cannot be recorded.
+        """
+        if self._recorder is None:
+            return self._function(inputs, *fixed)
+        key = (*map(id, fixed), _shapes(inputs))
+        if key not in self._recordings:
+            self._recordings[key] = _Recording(self._function, fixed, self._recorder)
+        return self._recordings[key](inputs)
+
+
+class _Recording:
+    """The function on inputs of one shape; keeps the fixed arguments, whose ids name it, alive."""
+
+    _inputs: TensorDictBase
+    _outputs: TensorDictBase
+
+    def __init__(
+        self,
+        function: Callable[..., TensorDictBase],
+        fixed: tuple[object, ...],
+        recorder: Recorder,
+    ) -> None:
+        self._function = function
+        self._fixed = fixed
+        self._recorder = recorder
+        self._calls = 0
+        self._replay: Callable[[], object] | None = None
+
+    def __call__(self, inputs: TensorDictBase) -> TensorDictBase:
+        self._calls += 1
+        if self._calls <= WARM_UPS:
+            return self._recorder.warm_up(lambda: self._function(inputs, *self._fixed))
+        if self._replay is None:
+            self._inputs = inputs.clone()
+            self._outputs, self._replay = self._record()
+        else:
+            self._inputs.update_(inputs)
+        self._replay()
+        return self._outputs.clone()
+
+    def _record(self) -> tuple[TensorDictBase, Callable[[], object]]:
+        try:
+            return self._recorder.record(lambda: self._function(self._inputs, *self._fixed))
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"{self._function} cannot be recorded as a CUDA graph; graphs=false does without: "
+                f"{error}"
+            ) from error
+
+
+def _shapes(inputs: TensorDictBase) -> tuple[Any, ...]:
+    leaves = sorted(
+        (str(key), tuple(entry.shape), str(entry.dtype))
+        for key, entry in inputs.items(include_nested=True, leaves_only=True)
+    )
+    return (tuple(inputs.batch_size), *leaves)

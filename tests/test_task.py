@@ -1,0 +1,109 @@
+"""The maze task: its recorded measurements are the plain ones, and wait for no device."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.utils._python_dispatch import _disable_current_modes
+
+from proposer_rl.bench.results import Options
+from proposer_rl.bench.scales import TINY, Solvers
+from proposer_rl.methods import Parts, proposer
+from proposer_rl.models import Population
+from proposer_rl.rewards import performance_gain, task_difficulty
+from proposer_rl.streams import Streams
+from proposer_rl.task import MazeTask, faster_precision
+from tests.graphs import NoHostReads, Tapes
+
+OPTIONS = Options(size="tiny", precision="fp32")
+
+
+def task(observe_agent: bool = False) -> MazeTask:
+    return replace(TINY, maze=replace(TINY.maze, observe_agent=observe_agent)).task(OPTIONS)
+
+
+def one_thread(solvers: Solvers) -> Solvers:
+    """Copies in turn: operations in other threads are not seen by what watches this one."""
+    for module in solvers.ppo.agent.modules():
+        if isinstance(module, Population):
+            module.way = "in turn"
+    return solvers
+
+
+def test_recorded_measurements_follow_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    tapes = Tapes()
+    monkeypatch.setattr("proposer_rl.task.recorder", lambda *_: tapes)
+    recorded = task()
+    monkeypatch.undo()
+    plain = task()
+    several = [one_thread(Solvers(plain, copies)) for copies in (1, 2)]
+    levels = plain.sample_target(5, Streams(0).generator())
+    generator = torch.Generator()
+    with torch.no_grad():
+        for _ in range(5):
+            for solvers in several:
+                agent = solvers.ppo.agent
+                assert (recorded.measure(agent) == plain.measure(agent)).all()
+                rated = recorded.evaluate(agent, levels, generator)
+                assert (rated == plain.evaluate(agent, levels, generator)).all()
+                seen = recorded.probe(agent, levels)
+                assert torch.equal(seen, plain.probe(agent, levels))
+                with torch.enable_grad():
+                    solvers.update()
+    assert tapes.recorded == 3 * 2
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
+@pytest.mark.parametrize("reward", [performance_gain, task_difficulty])
+def test_a_meta_step_waits_for_the_device_only_to_hear_the_action(reward, observe_agent) -> None:
+    maze = task(observe_agent)
+    every_update = replace(TINY.proposer, updates_per_step=1)
+    env = proposer(Parts(maze, every_update, seed=0), reward).env
+    for module in env.solvers.agent.modules():
+        if isinstance(module, Population):
+            module.way = "4 streams"
+    levels = env.proposals.levels
+
+    def on_the_host(action, problems, streams):
+        with _disable_current_modes():
+            return levels(action, problems, streams)
+
+    env.proposals.levels = on_the_host
+    state = env.reset()
+    with torch.no_grad():
+        for step in range(2):
+            state = state.exclude("reward").set("action", env.action_spec.rand())
+            if step:  # the first one restores the Solvers, which asks for their Adam steps
+                with NoHostReads():
+                    env.step(state)
+                    maze.measure(env.solvers.agent)
+            state = env.step(state)["next"]
+
+
+def test_levels_of_copies_are_those_of_each_alone() -> None:
+    maze, choices = task(), torch.randint(TINY_CHOICES, (3, 6))
+    together = maze.generate(choices, [Streams(k).generator() for k in range(3)])
+    for k in range(3):
+        alone = maze.generate(choices[k : k + 1], [Streams(k).generator()])
+        assert (together[k] == alone[0]).all()
+
+
+TINY_CHOICES = len(TINY.space.obstacle_fractions) * len(TINY.space.path_lengths)
+
+
+@pytest.mark.parametrize(
+    ("amx", "device", "channels", "expected"),
+    [
+        (True, "cpu", [64, 128, 256], "bf16"),
+        (True, "cpu", [16, 32, 32], "fp32"),
+        (False, "cpu", [64, 128, 256], "fp32"),
+        (True, "cuda", [64, 128, 256], "fp32"),
+    ],
+)
+def test_bf16_is_chosen_where_it_was_measured(
+    monkeypatch: pytest.MonkeyPatch, amx, device, channels, expected
+) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    assert faster_precision(channels, torch.device(device)) == expected
