@@ -160,6 +160,26 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
     return cell_position(torch.cat(path, dim=-1), width)
 
 
+def worst_mean(values: Tensor, fraction: float) -> Tensor:
+    """Mean of the lowest values: the conditional value at risk of an even draw from them.
+
+    With n values and m = fraction · n it is exactly the mean of the m lowest, of which the last
+    counts in part where m is no whole number (Rockafellar & Uryasev, Journal of Banking & Finance
+    26, 2002).
+
+    Args:
+        values: float ``[*B, n]``.
+        fraction: of the values, above 0 and at most 1.
+
+    Returns:
+        float ``[*B]``.
+    """
+    count = fraction * values.shape[-1]
+    rank = torch.arange(values.shape[-1], device=values.device, dtype=values.dtype)
+    weight = (count - rank).clamp(0, 1)  # 1 for the whole ones, then the part, then 0
+    return (values.sort(-1).values * weight).sum(-1) / count
+
+
 def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
     """Action probabilities, float32 ``[*B, 4, H, W]``."""
     if greedy:

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from proposer_rl.capture import Captured, recorder
-from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator
+from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator, worst_mean
 from proposer_rl.mazes import (
     Level,
     LevelDistribution,
@@ -29,6 +29,7 @@ from proposer_rl.streams import Streams
 ACTIONS = 4
 PLANES = 3
 RECORDED_LEVELS = 8
+WORST = 0.1  # of the levels, in <name>_success_worst10
 
 Mechanism = Literal["uniform", "path_first"]
 Fraction = Annotated[float, Interval(ge=0, lt=1)]
@@ -268,7 +269,9 @@ class MazeTask:
         """Exact means over the fixed levels of each distribution measured on, each [K].
 
         Entries, by the distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
-        policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one.
+        policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one; and
+        ``<name>_success_worst10``, the sampled policy's success over the tenth of the levels on
+        which it is lowest.
         """
         results: dict[str, Tensor] = {}
         for name, levels in self._measured_on.items():
@@ -287,8 +290,11 @@ class MazeTask:
         copies, logits = _with_logits(solver, Level.from_tensordict(levels))
         results: dict[str, Tensor] = {}
         for policy, evaluator in (("", self._sampled), ("greedy_", self._greedy)):
-            for key, value in evaluator(copies, logits).items():
+            measured = evaluator(copies, logits)
+            for key, value in measured.items():
                 results[f"{policy}{key}"] = value.mean(1)
+            if not policy:
+                results["success_worst10"] = worst_mean(measured["success"], WORST)
         return TensorDict(results, [solver.copies])
 
     def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:

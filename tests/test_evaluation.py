@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom, norm
 from torch import Tensor
 
-from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator, policy_path
+from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator, policy_path, worst_mean
 from proposer_rl.mazes import Level, generate_levels
 from tests.mazes.oracles import moved, play, random_levels
 
@@ -187,3 +187,15 @@ def test_logits_of_an_expanded_batch_are_left_as_they_were() -> None:
 def test_no_episodes_are_refused() -> None:
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
         RolloutEvaluator(episodes=0)
+
+
+@given(
+    values=st.lists(st.floats(0, 1, width=32), min_size=1, max_size=12),
+    tenths=st.integers(1, 10),
+)
+def test_the_worst_mean_counts_the_last_value_in_part(values: list[float], tenths: int) -> None:
+    # Ten of every value make the part a whole number.
+    tenfold = sorted(values * 10)[: len(values) * tenths]
+    expected = sum(tenfold) / len(tenfold)
+    found = worst_mean(torch.tensor([values, values[::-1]]), tenths / 10)
+    assert found.tolist() == pytest.approx([expected] * 2, abs=1e-5)
