@@ -29,6 +29,7 @@ from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,
     categorical,
+    context_width,
     joint_categorical,
     normal,
     proposer_actor_critic,
@@ -53,6 +54,7 @@ class ProposerSettings:
         validation_levels: size E of the batch that the gain is measured on.
         probe_levels: number C of target levels through which the Solver is seen.
         observes: what is seen beside the probes.
+        number_bands: frequencies at which that is told to the network; 0: as it is.
         common_random_numbers: whether the copies differ by their actions alone.
         proposals: an action's meaning: the choice of every problem, or a mixture of choices.
         ratio: of ``problems``: PPO's ratio over the P draws together, or for each draw.
@@ -73,6 +75,7 @@ class ProposerSettings:
     observes: list[Literal["validation_return", "progress"]] = field(
         default_factory=lambda: ["validation_return", "progress"]
     )
+    number_bands: Annotated[int, Ge(0)] = 0
     common_random_numbers: bool = False
     proposals: Literal["problems", "mixture"] = "mixture"
     ratio: Literal["joint", "per_problem"] = "per_problem"
@@ -242,9 +245,10 @@ def _view(task: MazeTask, chosen: ProposerSettings) -> SolverView:
 def _agent(task: MazeTask, chosen: ProposerSettings, action: _Action) -> ActorCritic:
     numbers = len(chosen.observes)
     network = ProposerNetwork(
-        action.head(chosen.context + numbers),
+        action.head(context_width(chosen.context, numbers, chosen.number_bands)),
         task.probe_channels,
         numbers=numbers,
+        number_bands=chosen.number_bands,
         context=chosen.context,
         hidden=chosen.hidden,
         channels=chosen.channels,

@@ -116,6 +116,8 @@ class ProposerCurriculum(FrozenProposer):
         proposed = rollout["next", "proposed"].sum((0, 1))
         return {
             "total_gain": gains.tolist(),
+            "gain_sd": float(gains.std(correction=0)),
+            "gain_explained": explained_share(rollout["action"], gains),
             "total_reward": rollout["next", "reward"].sum((-2, -1)).tolist(),
             "return_before": float(rollout["validation_return"][0, 0]),
             **{key: float(value) for key, value in training.items()},
@@ -127,3 +129,31 @@ def total_gain(rollout: TensorDictBase) -> Tensor:
     """Return on the validation levels after the episode minus before it, [K] from [K, T]."""
     after = rollout["next", "validation_return"][:, -1, 0]
     return after - rollout["validation_return"][:, 0, 0]
+
+
+def explained_share(action: Tensor, gains: Tensor) -> float | None:
+    """Share of the variance of total gains that a linear function of the actions explains.
+
+    A hint, for nothing, of how much of the reward a Proposer can learn from: with adjustment for
+    the number of coefficients it is 0 on average where the actions do not matter, and at most 1.
+    ``proposer_rl.snr`` measures the same without supposing linearity.
+
+    Args:
+        action: [K, T, D]; the mean over the T steps counts.
+        gains: float [K].
+
+    Returns:
+        The adjusted coefficient of determination; None where actions are no numbers, or too many
+        for K copies to tell.
+    """
+    if not action.is_floating_point():
+        return None
+    copies, directions = action.shape[0], action.shape[-1]
+    spare = copies - 1 - directions
+    if spare < 1 or float(gains.var()) == 0:
+        return None
+    actions, gains = action.mean(1).cpu().double(), gains.cpu().double()
+    design = torch.cat([torch.ones(copies, 1, dtype=torch.double), actions], 1)
+    fitted = design @ torch.linalg.lstsq(design, gains[:, None]).solution
+    residual = (gains - fitted[:, 0]).square().sum() / spare
+    return float(1 - residual / gains.var())

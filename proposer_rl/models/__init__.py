@@ -13,6 +13,7 @@ from proposer_rl.models.proposer import (
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
+    context_width,
     fourier_encoding,
     proposer_actor_critic,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "UNet",
     "categorical",
     "cell_logits",
+    "context_width",
     "draw",
     "fourier_encoding",
     "joint_categorical",

@@ -25,8 +25,12 @@ class ProposerNetwork(nn.Module):
         head: from contexts [*B, width] to the parameters of the action's distribution; see
             :class:`ProblemHead` and :class:`MixtureHead`.
         probe_channels: channels of a probe, its planes and the Solver's logit map.
-        numbers: how many numbers are observed beside the probes.
-        context: width of the encoder's output; the context's is ``context + numbers``.
+        numbers: how many numbers, of about 0 to 1, are observed beside the probes.
+        number_bands: frequencies at which a number is told to the network by its sine and cosine,
+            from half a cycle over 0 to 1 upwards, each double the last; with 0 as it is. The more
+            of them, the less what is learnt at one value is taken for another.
+        context: width of the encoder's output; the context's is
+            :func:`context_width`.
         hidden: width of the value's MLP.
         channels: channels of the encoder's convolutions; each but the first halves the resolution.
     """
@@ -37,11 +41,13 @@ class ProposerNetwork(nn.Module):
         probe_channels: int,
         *,
         numbers: int = 0,
+        number_bands: int = 0,
         context: int = 128,
         hidden: int = 128,
         channels: Sequence[int] = (32, 64),
     ) -> None:
         super().__init__()
+        width = context_width(context, numbers, number_bands)
         layers: list[nn.Module] = []
         for i, (fan_in, fan_out) in enumerate(
             zip([probe_channels, *channels], channels, strict=False)
@@ -50,10 +56,9 @@ class ProposerNetwork(nn.Module):
         self.encoder = nn.Sequential(
             *layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels[-1], context)
         )
-        self.value = nn.Sequential(
-            nn.Linear(context + numbers, hidden), nn.Tanh(), nn.Linear(hidden, 1)
-        )
+        self.value = nn.Sequential(nn.Linear(width, hidden), nn.Tanh(), nn.Linear(hidden, 1))
         self.context = context
+        self.number_bands = number_bands
         orthogonal_(self)
         orthogonal_(self.value[-1], 1.0)
         self.head = head
@@ -65,8 +70,16 @@ class ProposerNetwork(nn.Module):
             probes: float [*B, C, channels, H, W].
             numbers: of what else is observed, each [*B, 1].
         """
-        context = torch.cat([self._encode(probes), *numbers], -1)
+        told = [self._tell(number) for number in numbers]
+        context = torch.cat([self._encode(probes), *told], -1)
         return self.head(context), self.value(context)
+
+    def _tell(self, number: Tensor) -> Tensor:
+        if self.number_bands == 0:
+            return number
+        cycles = 0.5 * 2.0 ** torch.arange(self.number_bands, device=number.device)
+        phase = 2 * math.pi * number * cycles
+        return torch.cat([phase.sin(), phase.cos()], -1)
 
     def _encode(self, probes: Tensor) -> Tensor:
         leading = probes.shape[:-4]
@@ -74,6 +87,11 @@ class ProposerNetwork(nn.Module):
             return probes.new_zeros(*leading, self.context)
         features = self.encoder(probes.flatten(0, -4))
         return torch.relu(features.reshape(*leading, -1, self.context).mean(-2))
+
+
+def context_width(context: int, numbers: int, number_bands: int = 0) -> int:
+    """Width of the context that a :class:`ProposerNetwork` of these sizes gives to its head."""
+    return context + numbers * max(1, 2 * number_bands)
 
 
 class ProblemHead(nn.Module):
