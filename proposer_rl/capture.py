@@ -64,6 +64,16 @@ class CudaGraphs:
         return result, graph.replay
 
 
+def use(device: torch.device) -> None:
+    """Make a GPU the current one, and let its fp32 products round their factors to TF32.
+
+    Without a GPU it does nothing.
+    """
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        torch.set_float32_matmul_precision("high")
+
+
 def recorder(device: torch.device, graphs: bool = True) -> Recorder | None:
     """The recorder for a device; None where there is none, or where none is wanted."""
     return CudaGraphs(device) if graphs and device.type == "cuda" else None

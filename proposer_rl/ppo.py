@@ -394,11 +394,12 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     Returns:
         The norms before clipping, [K] or [].
     """
+    if copies is None or copies == 1:  # a few kernels for all parameters together
+        norm = nn.utils.clip_grad_norm_(parameters, max_norm)
+        return norm if copies is None else norm.unsqueeze(0)
     gradients = [p.grad for p in parameters if p.grad is not None]
-    if copies is None:
-        return nn.utils.clip_grad_norm_(parameters, max_norm)
-    squares = torch.stack([g.flatten(1).square().sum(1) for g in gradients])
-    norm = squares.sum(0).sqrt()  # [K]
+    norms = [torch.linalg.vector_norm(g.flatten(1), dim=1) for g in gradients]
+    norm = torch.linalg.vector_norm(torch.stack(norms), dim=0)  # [K]
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))

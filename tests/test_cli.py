@@ -182,6 +182,15 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> Non
     assert tables(Path("run")) == before
 
 
+def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkeypatch) -> None:
+    command = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
+    assert train(*command) == 0
+    assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
+    monkeypatch.setattr("proposer_rl.cli.train.faster_precision", lambda *_: "bf16")
+    assert train(*command) == 2
+    assert "error: precision: the run in" in capsys.readouterr().err
+
+
 def test_multirun_goes_over_methods_and_seeds(train) -> None:
     assert train("-m", "+method=target,domain_randomization", "seed=0,1", *SMOKE) == 0
     summaries = [json.loads(file.read_text()) for file in Path().glob("multirun/*/*/summary.json")]

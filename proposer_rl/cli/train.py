@@ -21,6 +21,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
+from proposer_rl.capture import use
 from proposer_rl.checkpoint import CheckpointError
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.loggers import make_log
@@ -87,6 +88,8 @@ def build(config: RunConfig, path: Path) -> Experiment:
         curriculum = _curriculum(config, task)
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    # What `auto` has become, so that a run does not go on in another precision elsewhere.
+    config = config.model_copy(update={"precision": task.precision})
     folder = RunFolder(path)
     _check_same_run(folder, config)
     return Experiment(
@@ -111,9 +114,7 @@ def make_task(config: RunConfig) -> MazeTask:
         ValueError: if settings that are each valid do not make a task.
     """
     device = _device(config.device)
-    if device.type == "cuda":
-        # TF32: products of matrices and convolutions round their fp32 inputs to 10 bits.
-        torch.set_float32_matmul_precision("high")
+    use(device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     automatic = config.precision == "auto"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
@@ -40,9 +40,24 @@ def apply_in_turn(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """One copy after the other: the plain way, and the reference for the others."""
-    # unbind, not indexing: its backward is one stack, not K additions into full-sized zeros.
-    members = zip(*(parameter.unbind() for parameter in stacked), strict=True)
-    outputs = [call(member, [x[k] for x in inputs]) for k, member in enumerate(members)]
+    outputs = [call(member, [x[k] for x in inputs]) for k, member in enumerate(_members(stacked))]
+    return _stack(outputs)
+
+
+def _members(stacked: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+    """The parameters of each copy.
+
+    By unbinding, whose backward pass is one stack; indexing would add into full-sized zeros, K
+    times. A view is enough for a single copy, and costs nothing in either pass.
+    """
+    alone = len(stacked[0]) == 1
+    return zip(*((p.squeeze(0),) if alone else p.unbind() for p in stacked), strict=True)
+
+
+def _stack(outputs: Sequence[tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+    """The copies' outputs, stacked one by one."""
+    if len(outputs) == 1:
+        return tuple(output.unsqueeze(0) for output in outputs[0])
     return tuple(torch.stack(slices) for slices in zip(*outputs, strict=True))
 
 
@@ -71,14 +86,13 @@ def apply_on_streams(
     current, side = module.current_stream(), _streams(device, streams)
     for stream in side:
         stream.wait_stream(current)
-    members = zip(*(parameter.unbind() for parameter in stacked), strict=True)
     outputs = []
-    for k, member in enumerate(members):
+    for k, member in enumerate(_members(stacked)):
         with module.stream(side[k % streams]):
             outputs.append(call(member, [x[k] for x in inputs]))
     for stream in side:
         current.wait_stream(stream)
-    return tuple(torch.stack(slices) for slices in zip(*outputs, strict=True))
+    return _stack(outputs)
 
 
 @cache
