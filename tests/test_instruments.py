@@ -1,0 +1,106 @@
+"""``bin/snr`` and ``bin/look`` as users call them, on runs of a few updates."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from proposer_rl.cli import look, snr, train
+
+SMOKE = ["+scale=smoke", "progress=false", "schedule.keep_checkpoints=100"]
+
+
+def call(command, *arguments: str) -> int:
+    before, sys.argv = sys.argv, ["command", *arguments]
+    try:
+        GlobalHydra.instance().clear()
+        command.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = before
+    return 0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "learnt"
+    assert call(train, "+method=perf_gain", *SMOKE, f"hydra.run.dir={folder}") == 0
+    return folder
+
+
+def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "snr.json"
+    sizes = ["--proposals", "2", "--copies", "2", "--levels", "2", "4", "--output", str(output)]
+    assert call(snr, str(run), *sizes) == 0
+    rows = json.loads(output.read_text())
+    stages = sorted({row["updates"] for row in rows})
+    assert stages == [0, 2, 3, 4, 6]
+    assert len(rows) == len(stages) * len(snr.EXPLORATIONS) * 2
+    for row in rows:
+        assert row["noise"] >= 0 and row["signal"] >= 0 and row["low"] <= row["high"]
+    said = capsys.readouterr().out
+    assert "learnt: total gain over 3 updates" in said and "uneven" in said
+    assert call(snr, str(run), *sizes) == 0
+    assert json.loads(output.read_text()) == rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: holds no checkpoints"),
+        (["{run}", "--explorations", "all"], "--explorations: must be among even, problems"),
+        (["{run}", "--output", "no/where/snr.json"], "--output: there is no folder no/where"),
+        (["{run}", "--copies", "1", "--explorations", "even"], "at least 2 proposals and 2 copies"),
+        (["{run}", "--levels", "0"], "must be at least 1, got 0"),
+    ],
+)
+def test_snr_refuses_in_one_line(run: Path, arguments: list[str], message: str, capsys) -> None:
+    assert call(snr, *(argument.format(run=run) for argument in arguments)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_look_shows_every_stage_and_what_changes(run: Path, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "look.json"
+    assert call(look, str(run), str(run), "--output", str(output)) == 0
+    rows = json.loads(output.read_text())
+    asis = [row for row in rows if row["seen"] == "as it is"]
+    assert [row["updates"] for row in asis] == [0, 2, 3, 4, 6]
+    for row in rows:
+        assert sum(map(sum, row["shares"])) == pytest.approx(1)
+        assert 0 <= row["distance"] <= 1
+        assert 2 <= row["path_length"] <= 4 and 0 <= row["obstacle_fraction"] <= 0.2
+    assert all(row["distance"] == 0 for row in asis)
+    # The first stage cannot be shown its own probes, nor the last its own.
+    assert [row["seen"] for row in rows if row["updates"] == 0] == [
+        "as it is", "probes of the last", "validation_return of the last",
+    ]  # fmt: skip
+    assert "as it is" in capsys.readouterr().out
+
+
+def test_look_refuses_a_run_without_a_proposer(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "target"
+    assert call(train, "+method=target", *SMOKE, f"hydra.run.dir={folder}") == 0
+    capsys.readouterr()
+    assert call(look, str(folder), str(folder)) == 2
+    assert "holds no Proposer" in capsys.readouterr().err
+
+
+def test_folders_of_something_else_are_refused(tmp_path: Path, run: Path, capsys) -> None:
+    for content, message in (("{", "does not hold"), ("{}", "does not hold"), ("[1]", "does not")):
+        (tmp_path / "config.json").write_text(content)
+        assert call(look, str(tmp_path), str(run)) == 2
+        assert message in capsys.readouterr().err
+    settings = json.loads((run / "config.json").read_text())
+    for change, message in (({"seed": -1}, "seed=-1"), ({"surprise": 1}, "surprise: there is no")):
+        (tmp_path / "config.json").write_text(json.dumps({**settings, **change}))
+        assert call(look, str(tmp_path), str(run)) == 2
+        assert message in capsys.readouterr().err
+    del settings["maze"]
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    assert call(look, str(tmp_path), str(run)) == 2
+    assert "maze: missing" in capsys.readouterr().err
