@@ -17,6 +17,7 @@ from proposer_rl.bench.profiling import profile
 from proposer_rl.bench.results import Options, Result, Row, Spread, Table
 from proposer_rl.bench.scales import PAPER, TINY, Solvers, bf16_in_hardware
 from proposer_rl.bench.timing import Timings, interleave
+from proposer_rl.capture import WARM_UPS
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -110,7 +111,7 @@ def against_convolutions(options: Options) -> Result:
         forward, both = layer.passes(layout, dtype, options.device)
         candidates[_name(i, "forward", layout, dtype)] = forward
         candidates[_name(i, "training", layout, dtype)] = both
-    seconds = interleave(candidates, options.repeats, options.device, warmup=2)
+    seconds = interleave(candidates, options.repeats, options.device, warmup=WARM_UPS + 1)
     rows, tables = [], []
     for dtype in dtypes:
         # An update in the faster precision has to stand against the best of both.

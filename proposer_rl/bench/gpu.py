@@ -13,7 +13,6 @@ from proposer_rl.bench.meta import MetaStep, StepParts, proposer_curriculum
 from proposer_rl.bench.results import Options, Result, Row, Spread, Table
 from proposer_rl.bench.scales import PAPER, TINY, Scale, Solvers, bf16_in_hardware
 from proposer_rl.bench.timing import interleave, synchronise, time_once
-from proposer_rl.capture import WARM_UPS
 from proposer_rl.curricula import Curriculum, SamplingCurriculum
 from proposer_rl.experiment import Experiment, Schedule
 from proposer_rl.models import Population
@@ -49,7 +48,7 @@ def _update(scale: Scale, options: Options, precision: str) -> Result:
         f"{precision}, not replayed": Solvers(scale.task(options, precision, graphs=False)),
     }
     candidates: dict[str, Callable[[], object]] = {n: s.update for n, s in solvers.items()}
-    seconds = interleave(candidates, options.repeats, options.device, warmup=WARM_UPS + 1)
+    seconds = interleave(candidates, options.repeats, options.device)
     rows = [
         _row(f"a Solver update, {name}", "K = 1", times, 8e-3 if i == 0 else None, options)
         for i, (name, times) in enumerate(seconds.items())
@@ -67,12 +66,8 @@ def _meta_step(scale: Scale, options: Options, precision: str) -> Result:
     task = scale.task(options, precision)
     env = proposer_curriculum(task, scale).env
     parts = StepParts(task, env)
-    seconds = interleave(
-        {"step": MetaStep(env), "parts": parts},
-        options.repeats,
-        options.device,
-        warmup=WARM_UPS + 1,
-    )
+    steps: dict[str, Callable[[], object]] = {"step": MetaStep(env), "parts": parts}
+    seconds = interleave(steps, options.repeats, options.device)
     size = f"K = {scale.proposer.rollouts}, {precision}"
     row = _row("a meta-environment step", size, seconds["step"], 50e-3, options)
     ways = _ways(task, scale.proposer.rollouts, options)

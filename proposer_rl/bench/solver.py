@@ -140,7 +140,8 @@ def overhead(options: Options) -> Result:
     scale = TINY if options.tiny else PAPER
     rows = []
     for precision in _precisions(options):
-        solvers = Solvers(scale.task(options, precision))
+        # Both called as they are: on a GPU the network alone would not be replayed.
+        solvers = Solvers(scale.task(options, precision, graphs=False))
         agent = solvers.ppo.agent
         level = solvers.ppo.env.reset().select(*agent.level_keys)
         with torch.no_grad():

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 
 from proposer_rl.bench.results import Spread
+from proposer_rl.capture import WARM_UPS
 
 Timings = dict[str, list[float]]
 
@@ -17,7 +18,7 @@ def interleave(
     candidates: Mapping[str, Callable[[], object]],
     repeats: int,
     device: str = "cpu",
-    warmup: int = 1,
+    warmup: int | None = None,
 ) -> Timings:
     """Time every candidate once per round, in turn.
 
@@ -25,11 +26,14 @@ def interleave(
         candidates: what to call, by name.
         repeats: rounds that count.
         device: whose queue is waited for before and after each call.
-        warmup: rounds before them that do not count.
+        warmup: rounds before them that do not count; None for one, or on a GPU for as many as it
+            takes until everything has been recorded.
 
     Returns:
         Seconds of each candidate, one number per round.
     """
+    if warmup is None:
+        warmup = 1 if torch.device(device).type == "cpu" else WARM_UPS + 1
     seconds: Timings = {name: [] for name in candidates}
     for turn in range(warmup + repeats):
         for name, candidate in candidates.items():
