@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
     {"capture"},
-    {"mazes", "models", "run_folder", "checkpoint", "settings", "streams"},
+    {"mazes", "models", "run_folder", "checkpoint", "settings", "streams", "machine"},
     {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
     {"meta_env"},
     {"curricula", "snr"},

@@ -6,12 +6,12 @@ import os
 import platform
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from proposer_rl.bench.results import Result, Row, Spread, Unit
+from proposer_rl.machine import processor
 
 HEADER = ["what", "against", "measured", "from – to", "target", "reached"]
 PACKAGES = ("proposer_rl", "torch", "torchrl", "tensordict", "gymnasium", "networkx", "scipy")
@@ -21,7 +21,7 @@ def machine(device: str) -> dict[str, Any]:
     """What the numbers depend on besides the code."""
     found: dict[str, Any] = {
         "device": device,
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "avx512_bf16": torch.cpu._is_avx512_bf16_supported(),
@@ -93,12 +93,3 @@ def number(value: float, unit: Unit) -> str:
         return f"{1e3 * value:.3g} ms"
     digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
     return f"{value:.{digits}f}{'x' if unit == 'x' else ' ' + unit}"
-
-
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        for line in information.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

@@ -16,11 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 QUARTER = 0.25
+MANY = 1000  # runs in a group
+CERTAIN = 20.0  # standard deviations between two means
 
 Values = Sequence[float] | NDArray[np.float64]
 
@@ -161,7 +163,7 @@ def pseudo_values(group: Sequence[Waiting], horizon: float) -> NDArray[np.float6
 def seeds_needed(one: Values, other: Values, power: float = 0.8) -> int | None:
     """Seeds per group with which a difference as large as the one seen would be found.
 
-    Found means: by the two-sided t test at 5 %, with the given power; from the noncentral t
+    Found means: by the two-sided t test at 5 %, with the given power; from the noncentral F
     distribution (Cohen, Statistical Power Analysis, 1988, chapter 2).
 
     Returns:
@@ -174,23 +176,22 @@ def seeds_needed(one: Values, other: Values, power: float = 0.8) -> int | None:
     difference = abs(float(a.mean() - b.mean()))
     if difference == 0:
         return None
-    if spread == 0 or difference / spread > 20:
-        return 2
-    effect = difference / spread
-    if _power(2, effect) >= power:
-        return 2
-    upper = 2.0
-    while _power(upper, effect) < power:
-        upper *= 2
-    return math.ceil(optimize.brentq(lambda n: _power(n, effect) - power, 2, upper))
+    effect = difference / spread if spread else math.inf
+    quantiles = stats.norm.ppf([(1 + CONFIDENCE) / 2, power])
+    normal = 2 * (float(quantiles.sum()) / effect) ** 2
+    if normal > MANY:
+        return math.ceil(normal)  # t and normal distributions are alike there
+    counts = range(2, math.ceil(normal) + 4)
+    return next(count for count in counts if _power(count, effect) >= power)
 
 
-def _power(count: float, effect: float) -> float:
-    """Power of the two-sided t test with ``count`` runs in each group."""
-    freedom, shift = 2 * count - 2, effect * math.sqrt(count / 2)
-    critical = stats.t.ppf((1 + CONFIDENCE) / 2, freedom)
-    both = stats.nct.sf(critical, freedom, shift) + stats.nct.cdf(-critical, freedom, shift)
-    return float(both)
+def _power(count: int, effect: float) -> float:
+    """Power of the two-sided t test with ``count`` runs in each group: of F, which is t squared."""
+    if effect > CERTAIN:
+        return 1.0
+    freedom = 2 * count - 2
+    critical = stats.f.ppf(CONFIDENCE, 1, freedom)
+    return float(stats.ncf.sf(critical, 1, freedom, count / 2 * effect**2))
 
 
 def _censored(group: Sequence[Waiting], horizon: float) -> stats.CensoredData:

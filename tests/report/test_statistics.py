@@ -168,6 +168,16 @@ def test_seeds_needed_are_those_of_cohens_tables() -> None:
     assert seeds_needed([1.0, 1.0], [2.0, 2.0]) == 2
 
 
+@given(st.floats(-8, 3))
+def test_seeds_needed_are_found_for_every_effect(exponent: float) -> None:
+    effect = 10**exponent
+    spread = np.array([-1.0, 1.0]) / math.sqrt(2)
+    count = seeds_needed(spread + effect, spread)
+    # The normal distribution's answer is a lower bound, and close to it for many.
+    normal = 2 * (sum(stats.norm.ppf([0.975, 0.8])) / effect) ** 2
+    assert count is not None and max(2, normal * 0.999) <= count <= 1.001 * normal + 4
+
+
 def test_seeds_needed_have_the_power_in_a_simulation() -> None:
     rng = np.random.default_rng(0)
     one, other = [0.0, 1.0, 2.0], [1.0, 2.5, 4.0]

@@ -1,0 +1,75 @@
+"""``bin/report`` and ``proposer-report``: tables, figures and a page from folders of runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from proposer_rl.report.build import OutputError, write_report
+from proposer_rl.report.runs import UnreadableRun
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+EPILOG = """\
+examples:
+  bin/report outputs                       every run below outputs/, to report/
+  bin/report sweeps/quick -o results/quick
+  bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
+
+The output folder gets report.html (one self-contained page), report.md (the same in short),
+figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
+Runs that were measured on different levels come in sections of their own. Unfinished runs count as
+far as they got, and the report says so."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point: exit code 0, 2 for bad input, 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        page = write_report(
+            options.folder, options.output, options.threshold, progress=not options.quiet
+        )
+    except (UnreadableRun, OutputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    print(f"Report: {page}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bin/report",
+        description="Write tables, figures and a page from the folders of runs.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"
+    )
+    parser.add_argument(
+        "--threshold",
+        type=_share,
+        help="of sample efficiency, above 0 and at most 1 (default: the runs' own, 0.8)",
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+    return parser
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"must be above 0 and at most 1, got {text!r}")
+    return value
+
+
+if __name__ == "__main__":
+    main()

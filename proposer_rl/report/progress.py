@@ -1,0 +1,93 @@
+"""How far runs are, read from their folders without disturbing them."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from proposer_rl.report.runs import LONGEST_NAME, Run, UnreadableRun, read_run
+
+FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
+DEEPEST = 4
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of one run's folder.
+
+    Attributes:
+        folder: of the run.
+        runs: its seeds; empty if it has not measured anything yet, or failed before.
+        failure: why it failed, in one line; empty if it did not.
+        age: seconds since something was written.
+    """
+
+    folder: Path
+    runs: tuple[Run, ...]
+    failure: str
+    age: float
+
+    @property
+    def state(self) -> str:
+        """In a word: failed, finished, unfinished (running or interrupted) or starting."""
+        if self.failure:
+            return "failed"
+        if not self.runs:
+            return "starting"
+        return "finished" if all(run.finished for run in self.runs) else "unfinished"
+
+
+def read_progress(folder: Path) -> Progress:
+    """The state of a run's folder, whatever of it is there yet."""
+    failure = _failure(folder)
+    try:
+        runs = tuple(read_run(folder))
+    except UnreadableRun as error:
+        runs = ()
+        if not failure and (folder / "metrics.csv").is_file():
+            failure = str(error).removeprefix(f"{folder}: ")
+    return Progress(folder, runs, failure, _age(folder))
+
+
+def find_progress(folder: Path) -> list[Progress]:
+    """The states of all runs in a folder, or of the folder itself.
+
+    Raises:
+        UnreadableRun: if there is no such folder, or no run in it.
+    """
+    if not folder.is_dir():
+        raise UnreadableRun(f"{folder}: there is no such folder")
+    found = [read_progress(path) for path in _folders(folder)]
+    if not found:
+        raise UnreadableRun(f"{folder}: no run in it, finished or begun")
+    return found
+
+
+def _folders(folder: Path) -> Iterable[Path]:
+    for root, names, files in os.walk(folder):
+        path = Path(root)
+        names.sort()
+        begun = {"config.json", FAILURE} & set(files)
+        if begun or len(path.relative_to(folder).parts) >= DEEPEST:
+            names.clear()
+        if begun:
+            yield path
+
+
+def _failure(folder: Path) -> str:
+    path = folder / FAILURE
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**20:
+        return ""
+    try:
+        return " ".join(str(json.loads(path.read_text())["message"]).split())[: 4 * LONGEST_NAME]
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"{FAILURE} cannot be read"
+
+
+def _age(folder: Path) -> float:
+    times = [entry.stat().st_mtime for entry in os.scandir(folder) if entry.is_file()]
+    return max(time.time() - max(times), 0.0) if times else 0.0

@@ -1,0 +1,247 @@
+"""Runs that can be compared, in groups that differ in nothing but the seed."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from proposer_rl.report.runs import Run, UnreadableRun, read_run
+from proposer_rl.report.statistics import Waiting, common_horizon
+
+LONGEST_LABEL = 40  # characters of the settings in a label
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of one method with the same settings and different seeds.
+
+    Attributes:
+        label: what it is called in this report.
+        runs: in the order of their seeds.
+        setting: in which it differs from groups of the same method; empty if there are none.
+    """
+
+    label: str
+    runs: tuple[Run, ...]
+    setting: str = ""
+
+    @property
+    def seeds(self) -> list[int]:
+        """The runs' seeds."""
+        return [run.seed for run in self.runs]
+
+    @property
+    def proposes(self) -> bool:
+        """Whether a Proposer was trained."""
+        return any(run.cycles for run in self.runs)
+
+    def waiting(self, measurement: str, threshold: float) -> list[Waiting]:
+        """Updates of each run until a measurement reached a threshold."""
+        return [run.waiting(measurement, threshold) for run in self.runs]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Groups that were measured on the same levels of the same mazes.
+
+    Attributes:
+        title: the scale and the mazes.
+        groups: what is compared, by label.
+        threshold: of the headline measurement.
+    """
+
+    title: str
+    groups: tuple[Group, ...]
+    threshold: float
+
+    @property
+    def runs(self) -> list[Run]:
+        """The runs of all groups."""
+        return [run for group in self.groups for run in group.runs]
+
+    @property
+    def example(self) -> Run:
+        """A run, for what all have in common."""
+        return self.groups[0].runs[0]
+
+    @property
+    def headline(self) -> str:
+        """The measurement that runs are summed up by."""
+        return self.example.headline
+
+    @property
+    def measured(self) -> list[str]:
+        """Names of the distributions that were measured on."""
+        return list(self.example.config["evaluation"]["distributions"])
+
+    @property
+    def horizon(self) -> int:
+        """The length at which runs are compared: that of most finished runs."""
+        lengths = Counter(run.updates for run in self.runs if run.finished)
+        if not lengths:
+            return max(run.updates for run in self.runs)
+        return max(lengths, key=lambda length: (lengths[length], length))
+
+    @property
+    def compared(self) -> list[Group]:
+        """Groups of which some run is as long as the horizon."""
+        longest = {group.label: max(run.updates for run in group.runs) for group in self.groups}
+        return [group for group in self.groups if longest[group.label] >= self.horizon]
+
+    def restricted_to(self, threshold: float) -> float:
+        """The horizon of restricted means to a threshold of the headline measurement."""
+        waiting = [group.waiting(self.headline, threshold) for group in self.compared]
+        return min(common_horizon(waiting), self.horizon)
+
+    def group(self, label: str) -> Group | None:
+        """The group of that label, if there is one."""
+        return next((group for group in self.groups if group.label == label), None)
+
+
+def read_studies(folders: Iterable[Path], threshold: float | None) -> tuple[list[Study], list[str]]:
+    """Read runs and sort them into studies.
+
+    Args:
+        folders: of runs.
+        threshold: in place of the runs' own.
+
+    Returns:
+        The studies, the largest first, and a line for each folder that was left out.
+
+    Raises:
+        UnreadableRun: if no run could be read.
+    """
+    runs: list[Run] = []
+    notes: list[str] = []
+    first = "no folders"
+    for folder in folders:
+        try:
+            runs += read_run(folder)
+        except UnreadableRun as error:
+            first = str(error) if not notes else first
+            notes.append(f"not read: {folder.name}: {str(error).removeprefix(f'{folder}: ')}")
+    if not runs:
+        raise UnreadableRun(first)
+    runs, doubles = _without_doubles(runs)
+    sorted_runs = defaultdict(list)
+    for run in runs:
+        sorted_runs[_key(_setting(run))].append(run)
+    studies = [
+        Study(_title(members[0]), _groups(members), threshold or _threshold(members[0]))
+        for members in sorted_runs.values()
+    ]
+    return sorted(studies, key=lambda study: -len(study.runs)), notes + doubles
+
+
+def _threshold(run: Run) -> float:
+    return float(run.config["schedule"]["threshold"])
+
+
+def _setting(run: Run) -> dict[str, Any]:
+    """All that must be equal for two runs to be measured alike."""
+    config = run.config
+    measured = config["evaluation"]["distributions"]
+    return {
+        "scale": config.get("scale"),
+        "maze": {key: value for key, value in config["maze"].items() if key != "observe_agent"},
+        "levels": {name: config["distributions"][name] for name in measured},
+        "measured": [config["evaluation"][key] for key in ("distributions", "levels", "seed")],
+        "target": config.get("target"),
+        "headline": [config["schedule"][key] for key in ("headline", "threshold")],
+    }
+
+
+def _variant(run: Run) -> dict[str, Any]:
+    """All that the outcome of a run depends on, but for the seed."""
+    ignored = {"seed", "seeds", "evaluation", "schedule", "hand_made_until", "precision"}
+    ignored |= set() if run.cycles else {"proposer"}  # it had none
+    kept = {key: value for key, value in run.config.items() if key not in ignored}
+    kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
+    kept["precision"] = run.config.get("precision", "fp32")
+    kept["reward"] = run.config["evaluation"].get("reward") if run.cycles else None
+    return kept
+
+
+def _key(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, sort_keys=True)
+
+
+def _title(run: Run) -> str:
+    maze, scale = run.config["maze"], str(run.config.get("scale", "unnamed"))
+    return f"{scale.capitalize()} scale, {maze['height']}×{maze['width']} mazes"
+
+
+def _without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Of runs with the same settings and seed the longest: a seed must not count twice."""
+    best: dict[str, Run] = {}
+    notes = []
+    for run in runs:
+        key = _key({**_setting(run), **_variant(run), "seed": run.seed})
+        kept = best.setdefault(key, run)
+        if kept is run:
+            continue
+        if run.updates > kept.updates:
+            best[key], kept, run = run, run, kept
+        notes.append(
+            f"left out: {run.folder.name}: the same settings and seed as {kept.folder.name}"
+        )
+    return list(best.values()), notes
+
+
+def _groups(runs: Sequence[Run]) -> tuple[Group, ...]:
+    variants: dict[str, list[Run]] = defaultdict(list)
+    for run in runs:
+        variants[_key(_variant(run))].append(run)
+    named: dict[str, list[list[Run]]] = defaultdict(list)
+    for members in variants.values():
+        named[_plain_label(members[0])].append(sorted(members, key=lambda run: run.seed))
+    groups = [
+        Group(label, tuple(members), setting)
+        for plain, alike in named.items()
+        for (label, setting), members in zip(_labels(plain, alike), alike, strict=True)
+    ]
+    return tuple(sorted(groups, key=lambda group: group.label))
+
+
+def _plain_label(run: Run) -> str:
+    return run.method if run.ablation == "none" else f"{run.method}, {run.ablation}"
+
+
+def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:
+    """Labels of variants of one name, each with the settings in which it differs from the others.
+
+    Where these are few they are the label, else the variants are numbered.
+    """
+    if len(alike) == 1:
+        return [(plain, "")]
+    leaves = [dict(_leaves(_variant(members[0]))) for members in alike]
+    keys = sorted({key for leaf in leaves for key in leaf})
+    differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
+    names = _short_names(differing)
+    settings = [
+        ", ".join(f"{names[key]}={leaf.get(key, 'absent')}" for key in differing) for leaf in leaves
+    ]
+    order = sorted(range(len(alike)), key=settings.__getitem__)
+    short = max(map(len, settings)) <= LONGEST_LABEL
+    return [
+        (f"{plain} ({setting})" if short else f"{plain} #{order.index(i) + 1}", setting)
+        for i, setting in enumerate(settings)
+    ]
+
+
+def _short_names(keys: Sequence[str]) -> dict[str, str]:
+    """Dotted keys by their last part, where no other ends in the same."""
+    last = Counter(key.rpartition(".")[2] for key in keys)
+    return {key: part if last[part := key.rpartition(".")[2]] == 1 else key for key in keys}
+
+
+def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, f"{prefix}.{key}" if prefix else str(key))
+    else:
+        yield prefix, json.dumps(value)

@@ -1,0 +1,157 @@
+"""How figures look: one colour for a method everywhere, and files that are the same every time."""
+
+from __future__ import annotations
+
+import base64
+import io
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
+
+# Okabe and Ito's colours, which stay distinct under the common forms of colour blindness.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+METHODS = {
+    "perf_gain": VERMILLION,
+    "task_difficulty": BLUE,
+    "target": BLACK,
+    "domain_randomization": GREEN,
+    "hand_made": ORANGE,
+}
+# For every other method or variant, by its name: Paul Tol's muted scheme, without near doubles.
+FURTHER = ("#332288", "#882255", "#44AA99", "#AA4499", "#999933", "#88CCEE", "#CC6677")
+DASHES = ("-", "--", "-.", ":")
+PANEL = (4.6, 3.3)  # inches
+
+SETTINGS: Any = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.8,
+    "svg.hashsalt": "proposer_rl",
+    "savefig.dpi": 130,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+
+class Look(NamedTuple):
+    """Colour and line of a method."""
+
+    colour: str
+    dash: str
+
+
+class Panel(NamedTuple):
+    """A part of a figure that can stand alone.
+
+    Attributes:
+        name: of the part.
+        description: what is to be seen, for those who cannot see it.
+        draw: draws it.
+        size: width and height in inches.
+    """
+
+    name: str
+    description: str
+    draw: Callable[[FigureBase], None]
+    size: tuple[float, float] = PANEL
+
+
+class Drawing(NamedTuple):
+    """A figure of the report.
+
+    Attributes:
+        name: of its files.
+        title: above it.
+        caption: below it.
+        panels: its parts, at least one.
+        columns: how many of them stand side by side in the file of all.
+        labels: of the methods in its legend; empty where none is needed.
+    """
+
+    name: str
+    title: str
+    caption: str
+    panels: Sequence[Panel]
+    columns: int = 2
+    labels: Sequence[str] = ()
+
+
+def look(label: str) -> Look:
+    """The look of a method or variant, a function of its label alone."""
+    if label in METHODS:
+        return Look(METHODS[label], "-")
+    number = zlib.crc32(label.encode())
+    colour = FURTHER[number % len(FURTHER)]
+    return Look(colour, DASHES[number // len(FURTHER) % len(DASHES)])
+
+
+def style(label: str) -> dict[str, Any]:
+    """Arguments of a line of that method."""
+    colour, dash = look(label)
+    return {"color": colour, "linestyle": dash}
+
+
+def axes_of(figure: FigureBase) -> Axes:
+    """The one pair of axes of a panel."""
+    axes: Axes = figure.subplots()
+    return axes
+
+
+def save(drawing: Drawing) -> dict[str, bytes]:
+    """A figure with all of its panels and its legend.
+
+    Returns:
+        The contents of files, by suffix: ``svg`` and ``png``.
+    """
+    columns = min(drawing.columns, len(drawing.panels))
+    rows = -(-len(drawing.panels) // columns)
+    width, height = drawing.panels[0].size
+    legend = 0.3 * -(-len(drawing.labels) // max(2 * columns, 1))
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
+        parts = figure.subfigures(rows, columns, squeeze=False).flat
+        for panel, part in zip(drawing.panels, parts, strict=False):
+            panel.draw(part)
+        if drawing.labels:
+            _draw_legend(figure, drawing.labels, 2 * columns)
+        return {suffix: _render(figure, suffix) for suffix in ("svg", "png")}
+
+
+def save_panel(panel: Panel) -> bytes:
+    """One panel alone, as SVG."""
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=panel.size, layout="constrained")
+        panel.draw(figure)
+        return _render(figure, "svg")
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """A file's content as an address that a page can hold."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _draw_legend(figure: Figure, labels: Sequence[str], columns: int) -> None:
+    handles = [Line2D([], [], label=label, **style(label)) for label in labels]
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+def _render(figure: Figure, suffix: str) -> bytes:
+    file = io.BytesIO()
+    # Without a date the same runs give the same file.
+    metadata = {"Date": None} if suffix == "svg" else {"Software": None}
+    figure.savefig(file, format=suffix, metadata=metadata)
+    return file.getvalue()

@@ -1,0 +1,166 @@
+"""The report as a whole: its page, its files, its command."""
+
+from __future__ import annotations
+
+import csv
+import html
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image, ImageSequence
+
+from proposer_rl.cli.report import main
+from proposer_rl.report import build
+from proposer_rl.report.build import write_report
+from proposer_rl.report.curves import cost_curves
+from tests.report.folders import cycle, write_run
+
+HOSTILE = "<script>alert(1)</script>&\"'"
+
+
+class Tags(HTMLParser):
+    """All tags with their attributes, and the text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    runs = tmp_path_factory.mktemp("runs")
+    for seed in range(2):
+        cycles = [cycle(i, [0.1, -0.1], [[1, 2, 3], [4, 5, 6 + i]], every=10) for i in range(3)]
+        write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600)
+        write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0)
+    write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up")
+    write_run(runs / "large", "target", maze={"height": 5, "width": 5})
+    return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
+
+
+def test_the_page_holds_all_that_it_shows(report: Path) -> None:
+    tags = Tags(report.read_text(encoding="utf-8"))
+    assert not tags.open
+    assert "script" not in {tag for tag, _ in tags.found}
+    images = [attributes for tag, attributes in tags.found if tag == "img"]
+    assert len(images) > 15
+    assert all(image["src"].startswith("data:image/") and image["alt"] for image in images)
+    links = [attributes["href"] for tag, attributes in tags.found if tag == "a"]
+    places = {attributes.get("id") for _, attributes in tags.found}
+    assert links and all(link.startswith("#") and link[1:] in places for link in links)
+    assert not [tag for tag, _ in tags.found if tag in ("link", "iframe", "object")]
+
+
+def test_what_a_run_calls_itself_is_only_text(report: Path) -> None:
+    page = report.read_text(encoding="utf-8")
+    escaped = html.escape(HOSTILE).replace("&#x27;", "&#39;").replace("&quot;", "&#34;")
+    assert HOSTILE not in page and escaped in page
+    text = (report.parent / "report.md").read_text(encoding="utf-8")
+    assert "<script>" not in re.sub(r"```bash\n.*?\n```\n", "", text, flags=re.DOTALL)
+    inside = {path.resolve() for path in report.parent.rglob("*") if path.is_file()}
+    assert all(report.parent.resolve() in path.parents for path in inside)
+    assert not list(report.parent.parent.glob("*up*"))
+
+
+def test_the_page_says_what_was_run_and_what_is_unfinished(report: Path) -> None:
+    text = Tags(report.read_text(encoding="utf-8")).text
+    assert "bin/train -m +method=perf_gain seed=0,1" in text
+    assert "target seed 1 (20 updates)" in text
+    assert "Tiny scale, 2×4 mazes" in text and "Tiny scale, 5×5 mazes" in text
+    assert "python 3.11" in text
+
+
+def test_there_are_figures_and_tables_for_other_tools(report: Path) -> None:
+    figures = {path.name for path in (report.parent / "figures").iterdir()}
+    names = ("learning_curves", "cost", "worst_levels", "difficulty", "gains", "proposals")
+    for name in (*names, "levels", "samples", "diagnostics"):
+        for suffix in ("svg", "png"):
+            assert f"tiny_scale_2_4_mazes_{name}.{suffix}" in figures
+    animation = report.parent / "figures" / "tiny_scale_2_4_mazes_proposals_perf_gain.gif"
+    with Image.open(animation) as image:
+        assert sum(1 for _ in ImageSequence.Iterator(image)) == 3
+    for name in ("methods", "comparisons", "runs", "findings", "metrics", "cycles"):
+        file = report.parent / "tables" / f"tiny_scale_2_4_mazes_{name}.csv"
+        rows = list(csv.DictReader(file.open(encoding="utf-8")))
+        assert rows and None not in rows[0]
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    write_run(tmp_path / "runs" / "a")
+    return tmp_path / "runs"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_the_same_runs_give_the_same_files(runs: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        main([str(runs), "-q", "-o", str(tmp_path / name)])
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_a_report_is_replaced_and_nothing_else(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [cost_curves])
+    output = tmp_path / "report"
+    main([str(runs), "-q", "-o", str(output)])
+    (output / "figures" / "old.png").write_bytes(b"of a former report")
+    (output / "notes.md").write_text("mine")
+    main([str(runs), "-q", "-o", str(output), "--threshold", "0.5"])
+    assert not (output / "figures" / "old.png").exists()
+    assert (output / "notes.md").read_text() == "mine"
+    assert "updates to 50%" in (output / "report.md").read_text()
+
+
+def test_a_foreign_folder_is_not_written_to(runs: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    before = contents(tmp_path)
+    assert refused(capsys, str(runs), "-o", str(tmp_path / "mine")).endswith("one of a report")
+    assert refused(capsys, str(runs), "-o", str(runs / "a" / "run.json")).endswith("the report")
+    assert contents(tmp_path) == before
+
+
+def test_wrong_folders_get_one_line(tmp_path: Path, capsys) -> None:
+    assert "there is no such folder" in refused(capsys, str(tmp_path / "missing"))
+    assert "no run in it" in refused(capsys, str(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_threshold_is_refused(runs: Path, capsys) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([str(runs), "--threshold", "80"])
+    assert end.value.code == 2
+    assert "must be above 0 and at most 1, got '80'" in capsys.readouterr().err
+
+
+def refused(capsys, *arguments: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main(["-q", *arguments])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    return line

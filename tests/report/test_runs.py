@@ -1,0 +1,135 @@
+"""What is read from folders, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from proposer_rl.report import runs
+from proposer_rl.report.runs import UnreadableRun, find_runs, read_run
+from proposer_rl.report.statistics import Waiting
+from tests.report.folders import cycle, write_run
+
+
+def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
+    cycles = [cycle(0, [0.1, -0.2], [[1, 2, 3], [4, 5, 6]])]
+    (run,) = read_run(
+        write_run(tmp_path / "a", "perf_gain", [3], [0.0, 0.5, 0.9], cycles=cycles, copies=600)
+    )
+    assert (run.method, run.seed, run.updates, run.planned) == ("perf_gain", 3, 20, 20)
+    assert run.finished and run.cycles == cycles
+    assert run.metrics["id_success"].tolist() == [0.0, 0.5, 0.9]
+    assert run.total_frames.tolist() == [0, 7000, 14000]
+    assert run.waiting("id_success", 0.5) == Waiting(10, True)
+    assert run.waiting("id_success", 0.95) == Waiting(20, False)
+    assert run.at("id_success", 10) == 0.5 and np.isnan(run.at("id_success", 11))
+    # Trapezoids of width 10: (0 + 0.5) / 2 and (0.5 + 0.9) / 2.
+    assert run.mean_until("id_success", 20) == pytest.approx((0.25 + 0.7) / 2)
+    assert np.isnan(run.mean_until("id_success", 30))
+
+
+def test_seeds_trained_together_share_the_time(tmp_path: Path) -> None:
+    found = read_run(write_run(tmp_path / "a", seeds=[4, 7]))
+    assert [run.seed for run in found] == [4, 7]
+    assert [run.shared_by for run in found] == [2, 2]
+    assert found[0].own_seconds.tolist() == [0, 1, 2]
+    assert found[0].metrics["updates"].tolist() == [0, 10, 20]
+
+
+def test_an_unfinished_run_counts_as_far_as_it_got(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", finished=False)
+    with open(folder / "metrics.csv", "ab") as file:
+        file.write(b"0,30,30")  # a row that is being written
+    (run,) = read_run(folder)
+    assert not run.finished and run.updates == 20
+
+
+def test_a_run_made_longer_is_unfinished_until_its_new_end(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a")
+    summary = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps({**summary, "updates": 10}))
+    assert not read_run(folder)[0].finished
+
+
+def test_runs_are_found_at_any_depth_once_and_not_through_links(tmp_path: Path) -> None:
+    one, two = write_run(tmp_path / "x" / "y" / "one"), write_run(tmp_path / "two")
+    elsewhere = write_run(tmp_path.parent / f"{tmp_path.name}_elsewhere" / "run")
+    os.symlink(elsewhere, tmp_path / "link")
+    assert find_runs([tmp_path, two]) == sorted([one.resolve(), two.resolve()])
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_wrong_folder_is_named(name: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UnreadableRun, match=name):
+        find_runs([tmp_path / name])
+
+
+def broken(folder: Path, name: str, change) -> None:
+    path = folder / name
+    path.write_text(change(path.read_text()))
+
+
+def set_key(*keys: str, value: object):
+    def change(text: str) -> str:
+        content = json.loads(text)
+        inner = content
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value
+        return json.dumps(content)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("config.json", lambda text: "[]", "not a JSON object"),
+        ("config.json", lambda text: "[" * 100_000, "recursion"),
+        ("config.json", lambda text: text[:-5], "delimiter"),
+        ("config.json", set_key("maze", "height", value=10**9), "cannot be drawn"),
+        ("config.json", set_key("maze", value={}), "'height' is missing"),
+        ("config.json", set_key("method", value="x" * 1000), "method is no name"),
+        ("config.json", set_key("method", value="a\nb"), "method is no name"),
+        ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),
+        ("metrics.csv", lambda text: text.replace("0.5", "nan"), "id_success is not always a"),
+        ("metrics.csv", lambda text: text.replace("0.5", "half"), "is not a number"),
+        ("metrics.csv", lambda text: text.replace("id_success", "x"), "no column 'id_success'"),
+        ("metrics.csv", lambda text: text.splitlines()[0] + "\n", "no rows yet"),
+        ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
+        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[1, 4]"), "leaves its level"),
+        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[-1, 3]"), "leaves its level"),
+        ("proposer.jsonl", lambda text: text.replace("0.1", '"x"'), "could not convert"),
+        ("proposer.jsonl", lambda text: text.replace("[[1], [1]]", "[1]"), "histogram is no table"),
+    ],
+)
+def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
+    name: str, change, message: str, tmp_path: Path
+) -> None:
+    folder = write_run(tmp_path / "run", cycles=[cycle(0, [0.1, 0.1], [[1], [1]])])
+    broken(folder, name, change)
+    with pytest.raises(UnreadableRun) as refused:
+        read_run(folder)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(f"{folder}: ")
+
+
+def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    secret = tmp_path / "secret.csv"
+    os.replace(folder / "metrics.csv", secret)
+    os.symlink(secret, folder / "metrics.csv")
+    with pytest.raises(UnreadableRun, match="not a plain file"):
+        read_run(folder)
+
+
+def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_run(tmp_path / "run")
+    monkeypatch.setattr(runs, "LARGEST_FILE", 100)
+    with pytest.raises(UnreadableRun, match="is larger than"):
+        read_run(folder)

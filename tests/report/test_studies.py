@@ -1,0 +1,104 @@
+"""What may be compared with what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.studies import Study, read_studies
+from tests.report.folders import config, cycle, write_run
+
+CYCLES = [cycle(0, [0.1, 0.2], [[1, 1, 1], [1, 1, 1]])]
+
+
+def read(folder: Path) -> tuple[list[Study], list[str]]:
+    return read_studies(sorted(folder.iterdir()), None)
+
+
+def labels(study: Study) -> dict[str, list[int]]:
+    return {group.label: group.seeds for group in study.groups}
+
+
+def test_seeds_of_one_method_make_a_group(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "target", [1])
+    write_run(tmp_path / "b", "target", [0])
+    write_run(tmp_path / "c", "hand_made", [0, 1])
+    (study,), notes = read(tmp_path)
+    assert labels(study) == {"target": [0, 1], "hand_made": [0, 1]}
+    assert not notes and study.title == "Tiny scale, 2×4 mazes"
+
+
+def test_other_settings_make_another_group_that_is_named_by_them(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "perf_gain", cycles=CYCLES)
+    write_run(tmp_path / "b", "perf_gain", cycles=CYCLES, proposer={"rollouts": 9})
+    write_run(tmp_path / "c", "perf_gain", cycles=CYCLES, ablation="probes_0")
+    (study,), _ = read(tmp_path)
+    assert set(labels(study)) == {
+        "perf_gain (rollouts=2)",
+        "perf_gain (rollouts=9)",
+        "perf_gain, probes_0",
+    }
+
+
+def test_many_differences_are_told_apart_by_numbers(tmp_path: Path) -> None:
+    for i, word in enumerate(("one", "two")):
+        proposer = {"some_setting": word * 9, "a": {"size": i}, "b": {"size": -i}}
+        write_run(tmp_path / word, "perf_gain", cycles=CYCLES, proposer=proposer)
+    (study,), _ = read(tmp_path)
+    assert list(labels(study)) == ["perf_gain #1", "perf_gain #2"]
+    first = study.groups[0].setting
+    assert first == f'proposer.a.size=0, proposer.b.size=0, some_setting="{"one" * 9}"'
+
+
+def test_settings_of_a_proposer_do_not_part_runs_without_one(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "target", [0])
+    write_run(tmp_path / "b", "target", [1], proposer={"rollouts": 9})
+    (study,), _ = read(tmp_path)
+    assert labels(study) == {"target": [0, 1]}
+
+
+def test_other_levels_make_another_study(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "target", [0])
+    write_run(tmp_path / "b", "target", [1])
+    write_run(tmp_path / "c", "target", [0], maze={"height": 3, "width": 4})
+    evaluation = {**config("target", 0)["evaluation"], "seed": 1}
+    write_run(tmp_path / "d", "target", [0], evaluation=evaluation)
+    studies, _ = read(tmp_path)
+    assert sorted(len(study.runs) for study in studies) == [1, 1, 2]
+    assert len(studies[0].runs) == 2
+
+
+def test_a_seed_does_not_count_twice_and_the_longer_run_stays(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", curve=[0.0, 0.1], finished=False)
+    write_run(tmp_path / "b", curve=[0.0, 0.1, 0.2])
+    (study,), notes = read(tmp_path)
+    assert [run.folder.name for run in study.runs] == ["b"]
+    assert len(notes) == 1 and "left out" in notes[0] and notes[0].endswith("as b")
+
+
+def test_runs_are_compared_at_the_length_of_most(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "target", [0], [0.0, 0.9, 0.9])
+    write_run(tmp_path / "b", "target", [1], [0.0, 0.1, 0.9])
+    write_run(tmp_path / "c", "target", [2], [0.0, 0.1, 0.1, 0.1])
+    write_run(tmp_path / "d", "hand_made", [0], [0.0, 0.1], finished=False)
+    (study,), _ = read(tmp_path)
+    assert study.horizon == 20
+    assert [group.label for group in study.compared] == ["target"]
+    assert study.restricted_to(0.8) == 20
+
+
+def test_an_unreadable_folder_is_noted_and_the_others_are_read(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    (write_run(tmp_path / "b") / "config.json").write_text("{}")
+    (study,), notes = read(tmp_path)
+    assert len(study.runs) == 1 and len(notes) == 1 and "b: an entry" in notes[0]
+    with pytest.raises(UnreadableRun, match="an entry"):
+        read_studies([tmp_path / "b"], None)
+
+
+def test_the_threshold_can_be_chosen(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    assert read_studies([tmp_path / "a"], 0.5)[0][0].threshold == 0.5
+    assert read_studies([tmp_path / "a"], None)[0][0].threshold == 0.8

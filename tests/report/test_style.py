@@ -1,0 +1,60 @@
+"""Colours: the same for a method everywhere, and apart for every reader."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from proposer_rl.cli.config import methods
+from proposer_rl.report.style import FURTHER, METHODS, Drawing, Panel, axes_of, look, save, style
+
+# Machado, Oliveira & Fernandes (IEEE TVCG 15, 2009), full severity, on linear RGB.
+SEEN_WITHOUT = {
+    "red": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998]],
+    "green": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+              [-0.011820, 0.042940, 0.968881]],
+}  # fmt: skip
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def lab(colour: str, vision: str | None) -> np.ndarray:
+    """CIE L*a*b* of a colour as somebody with that vision sees it."""
+    values = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    if vision:
+        linear = np.clip(np.array(SEEN_WITHOUT[vision]) @ linear, 0, 1)
+    ratio = TO_XYZ @ linear / (TO_XYZ @ np.ones(3))
+    f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("vision", [None, *SEEN_WITHOUT])
+def test_methods_can_be_told_apart(vision: str | None) -> None:
+    for one, other in itertools.combinations(METHODS.values(), 2):
+        # 2.3 is just noticeable side by side; lines in a legend need several times that.
+        assert np.linalg.norm(lab(one, vision) - lab(other, vision)) > 15, (one, other)
+
+
+def test_every_method_has_a_look_of_its_own() -> None:
+    looks = [look(name) for name in methods()]
+    assert len(set(looks)) == len(looks)
+
+
+def test_an_unknown_method_gets_a_stable_further_look() -> None:
+    assert look("plr") == look("plr") and look("plr").colour in FURTHER
+    assert look("perf_gain").colour not in FURTHER
+    many = {look(f"method_{i}") for i in range(300)}
+    assert len(many) == len(FURTHER) * 4
+
+
+def test_a_figure_is_the_same_file_every_time() -> None:
+    def draw(figure) -> None:
+        axes_of(figure).plot([0, 1], [1, 0], **style("plr"))
+
+    drawing = Drawing("d", "D", "", [Panel("p", "P", draw)], labels=["plr"])
+    one, two = save(drawing), save(drawing)
+    assert one == two and set(one) == {"svg", "png"}
+    assert b"<dc:date>" not in one["svg"]

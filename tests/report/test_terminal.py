@@ -1,0 +1,88 @@
+"""The state of runs in characters, without disturbing them."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from proposer_rl.cli.watch import main
+from proposer_rl.report.progress import find_progress, read_progress
+from proposer_rl.report.terminal import BLOCKS, sparkline
+from tests.report.folders import cycle, write_run
+
+
+def listing(folder: Path) -> dict[str, tuple[int, int]]:
+    return {str(path): (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
+
+
+def watch(capsys, *arguments: str) -> str:
+    main([*arguments, "--once"])
+    return capsys.readouterr().out
+
+
+def test_one_run_is_a_screen(tmp_path: Path, capsys) -> None:
+    cycles = [cycle(0, [0.25, -0.5], [[6, 0, 0], [0, 0, 0]])]
+    folder = write_run(tmp_path / "run", "perf_gain", [7], cycles=cycles, copies=600)
+    before = listing(tmp_path)
+    text = watch(capsys, str(folder))
+    assert listing(tmp_path) == before
+    assert "perf_gain, seed 7" in text and "finished" in text and "20/20 updates" in text
+    assert "2,000 frames + 12,000 of the copies" in text
+    assert "90.0%" in text and "+0.250" in text and "-0.125" in text
+    assert "███" in text  # all proposals are of one kind
+    assert "S • • G" in text  # the path of the level that was recorded
+
+
+def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
+    write_run(tmp_path / "done")
+    write_run(tmp_path / "going", finished=False)
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "config.json").write_text("{}")
+    (tmp_path / "broken").mkdir()
+    failure = {"message": "no such [level]", "kind": "E", "exit_code": 2}
+    (tmp_path / "broken" / "error.json").write_text(json.dumps(failure))
+    states = {p.folder.name: p.state for p in find_progress(tmp_path)}
+    expected = {"done": "finished", "going": "unfinished", "begun": "starting", "broken": "failed"}
+    assert states == expected
+    text = watch(capsys, str(tmp_path))
+    assert "failed: broken: no such [level]" in text
+    assert "4 runs: 1 finished, 1 failed, 1 unfinished, 1 starting" in text
+
+
+def test_an_unreadable_run_is_said_to_have_failed(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / "metrics.csv").write_text("a,b\n1,x\n")
+    progress = read_progress(folder)
+    assert progress.state == "failed" and "'x' is not a number" in progress.failure
+
+
+def test_the_age_is_that_of_the_newest_file(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    for path in folder.iterdir():
+        os.utime(path, (1_000_000, 1_000_000))
+    old = read_progress(folder).age
+    (folder / "metrics.csv").touch()
+    assert old > 1e8 and read_progress(folder).age < 60
+
+
+@pytest.mark.parametrize("arguments", [["missing"], ["."]])
+def test_wrong_folders_get_one_line(arguments, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+
+
+@given(st.lists(st.floats(-2, 3), max_size=20))
+def test_a_sparkline_rises_with_its_values(values: list[float]) -> None:
+    drawn = sparkline(sorted(values), 0, 1)
+    heights = [BLOCKS.index(block) for block in drawn]
+    assert len(drawn) == len(values) and heights == sorted(heights)
+    assert sparkline([0, 1, -5, 5, 0.5], 0, 1) == " █ █▄"
