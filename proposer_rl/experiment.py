@@ -23,7 +23,7 @@ from proposer_rl.streams import Streams
 Evaluate = Callable[[ActorCritic], TensorDictBase]
 Statistics = Callable[[Any, TensorDictBase], TensorDictBase]
 Records = Callable[[Any, TensorDictBase], list[list[dict[str, Any]]]]
-Log = Callable[[str, Mapping[str, float], int], None]
+Log = Callable[[str, Mapping[str, Any], int], None]
 
 
 @settings
@@ -169,6 +169,7 @@ class Experiment:
         if outcome.metrics:
             place = {"cycle": self.cycles, "updates": self.updates, "meta_frames": self.meta_frames}
             self.folder.append("proposer.jsonl", {**place, **outcome.metrics})
+            self._tell("proposer", outcome.metrics)
         self.cycles += 1
         if outcome.advance is not None:
             self.updates = min(self.updates + outcome.advance.updates, self.schedule.updates)
@@ -216,11 +217,16 @@ class Experiment:
         for seed, sample in zip(self.seeds, records, strict=True):
             row = {"updates": self.updates, "seed": seed, "levels": sample}
             self.folder.append("curriculum.jsonl", row)
+        self._tell("curriculum", {"levels": records[0]})
 
     def _append(self, table: str, seed: int, values: Mapping[str, float]) -> None:
         self.folder.append(table, {"seed": seed, "updates": self.updates, **values})
-        if self._log is not None and seed == self.seeds[0]:
-            self._log(Path(table).stem, values, self.updates)
+        if seed == self.seeds[0]:
+            self._tell(Path(table).stem, values)
+
+    def _tell(self, table: str, row: Mapping[str, Any]) -> None:
+        if self._log is not None:
+            self._log(table, row, self.updates)
 
     def _per_copy(self, values: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
         for copy, seed in enumerate(self.seeds):

@@ -10,19 +10,27 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
+from proposer_rl.cli.watch import main as watch_main
+from tests.report.folders import write_run
 
+DOCS = Path(__file__).parents[1] / "docs"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-def commands() -> list[list[str]]:
-    lines = [line for block in blocks("bash") for line in block.splitlines()]
+def commands(program: str) -> list[list[str]]:
+    texts = [README, *(file.read_text(encoding="utf-8") for file in DOCS.glob("*.md"))]
+    lines = [
+        line for text in texts for block in blocks("bash", text) for line in block.splitlines()
+    ]
     calls = [shlex.split(line, comments=True) for line in lines]
-    return [call[1:] for call in calls if call and call[0] == "bin/train"]
+    found = {tuple(call[1:]) for call in calls if call and call[0] == program}
+    return [list(call) for call in sorted(found)]
 
 
 def test_the_code_runs() -> None:
@@ -32,7 +40,7 @@ def test_the_code_runs() -> None:
     assert {"rollout", "snapshot"} <= names.keys()
 
 
-@pytest.mark.parametrize("arguments", commands(), ids=" ".join)
+@pytest.mark.parametrize("arguments", commands("bin/train"), ids=" ".join)
 def test_the_commands_run(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -40,11 +48,26 @@ def test_the_commands_run(
     small = [re.sub(r"^\+scale=.*", "+scale=smoke", word) for word in arguments]
     if "+scale=smoke" not in small:
         small.append("+scale=smoke")
+    if any(word.startswith("+sweep=") for word in small):
+        # Of a sweep one run, in this process: there may be no cluster here.
+        small = [word for word in small if "launcher" not in word] + ["seed=0", "+method=target"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["bin/train", *small])
     GlobalHydra.instance().clear()
     main()
     assert list(tmp_path.rglob("summary.json"))
+
+
+@pytest.mark.parametrize("program", ["bin/report", "bin/watch"])
+def test_the_commands_about_runs_run(
+    program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = commands(program)
+    assert found
+    monkeypatch.chdir(tmp_path)
+    for arguments in found:
+        write_run(tmp_path / arguments[0] / "run")
+        {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
 
 
 def test_the_files_that_it_shows_exist() -> None:

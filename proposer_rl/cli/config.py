@@ -28,6 +28,12 @@ CONFIG_FOLDER = next(
 )
 
 
+# ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
+OmegaConf.register_new_resolver(
+    "joined", lambda items: "-".join(str(item) for item in items), replace=True
+)
+
+
 class ConfigError(ValueError):
     """The configuration is wrong; the message is one line."""
 
@@ -53,6 +59,9 @@ class RunConfig(BaseModel):
     curriculum: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Field(ge=0)]
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = Field(
+        default_factory=lambda known: [known["seed"]]
+    )
     device: str
     precision: Literal["auto", "fp32", "bf16"]
     graphs: bool
@@ -73,6 +82,8 @@ class RunConfig(BaseModel):
     @model_validator(mode="after")
     def _agree(self) -> RunConfig:
         proposer, schedule, solver = self.proposer, self.schedule, self.solver
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds={self.seeds}: must be distinct")
         known, measured = sorted(self.distributions), self.evaluation.distributions
         for key, names in (("target", [self.target]), ("evaluation.distributions", measured)):
             unknown = [name for name in names if name not in known]

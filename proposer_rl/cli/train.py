@@ -19,16 +19,21 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
 from tqdm import tqdm
 
 from proposer_rl.capture import use
 from proposer_rl.checkpoint import CheckpointError
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.loggers import make_log
-from proposer_rl.cli.picture import draw_run
+from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
+from proposer_rl.machine import processor
 from proposer_rl.methods import Parts
+from proposer_rl.report.levels import draw_run
+from proposer_rl.report.progress import read_progress
+from proposer_rl.report.terminal import screen
 from proposer_rl.run_folder import RunFolder
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask, faster_precision
@@ -52,15 +57,20 @@ def main() -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
+    path = Path(HydraConfig.get().runtime.output_dir)
     try:
+        forget_failure(path)
         check_order(HydraConfig.get().overrides.task)
         config = read_config(hydra_config)
-        experiment = build(config, Path(HydraConfig.get().runtime.output_dir))
+        experiment = build(config, path)
         return run(experiment, config)
-    except INPUT_ERRORS as error:
+    except Exception as error:
+        foreseen = isinstance(error, INPUT_ERRORS)
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise  # Hydra goes on with the other runs and fails at the end.
-        _refuse(error)
+            return record_failure(path, error, _one_line(error), BAD_INPUT if foreseen else 1)
+        if foreseen:
+            _refuse(error)
+        raise
 
 
 def _refuse(error: Exception) -> NoReturn:
@@ -93,15 +103,15 @@ def build(config: RunConfig, path: Path) -> Experiment:
     folder = RunFolder(path)
     _check_same_run(folder, config)
     return Experiment(
-        task.solvers([Streams(config.seed, "solver")]),
+        task.solvers([Streams(seed, "solver") for seed in config.seeds]),
         curriculum,
         schedule=config.schedule,
-        seeds=[config.seed],
+        seeds=config.seeds,
         folder=folder,
         evaluate=task.measure,
         statistics=task.statistics,
         records=task.records,
-        log=make_log(config.logger, path, f"{config.method}_seed_{config.seed}"),
+        log=make_log(config.logger, path, _name(config)),
         progress=config.progress,
     )
 
@@ -141,17 +151,46 @@ def run(experiment: Experiment, config: RunConfig) -> float:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     folder = experiment.folder
+    identity = _identity(experiment, config)
+    finished = _finished(folder.path, config)
+    if finished is not None:
+        tqdm.write(f"{_name(config)}: finished before, nothing to do. Files: {folder.path}")
+        return _value(finished, config)
+    folder.write_json("run.json", {**identity, "planned_updates": config.schedule.updates})
     try:
         result = experiment.run()
     except KeyboardInterrupt:
         again = shlex.join([*HydraConfig.get().overrides.task, f"hydra.run.dir={folder.path}"])
         tqdm.write(f"Interrupted. To go on from the last checkpoint: bin/train {again}")
         raise
-    folder.write_json("summary.json", {**_identity(experiment, config), **result})
-    picture = draw_run(folder.path, title=f"{config.method}, seed {config.seed}")
-    tqdm.write(_summary_text(config, result))
+    folder.write_json("summary.json", {**identity, **result})
+    picture = draw_run(folder.path, title=_name(config))
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        Console().print(screen(read_progress(folder.path)))
+    for seed, reached, final in zip(
+        config.seeds, result["updates_to_threshold"], result["final"], strict=True
+    ):
+        tqdm.write(f"{config.method}, seed {seed}: {_outcome_text(result, reached, final)}")
+    tqdm.write(_cost_text(result, len(config.seeds)))
     tqdm.write(f"Files: {folder.path}  (picture: {picture.name})")
-    return float(result["final"][0][config.schedule.headline])
+    return _value(result, config)
+
+
+def _name(config: RunConfig) -> str:
+    ablation = "" if config.ablation == "none" else f"_{config.ablation}"
+    return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
+
+
+def _value(result: dict[str, Any], config: RunConfig) -> float:
+    finals = [float(row[config.schedule.headline]) for row in result["final"]]
+    return sum(finals) / len(finals)
+
+
+def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
+    """The summary of a run that is already at the end of its schedule."""
+    file = folder / "summary.json"
+    summary: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"updates": 0}
+    return summary if summary["updates"] >= config.schedule.updates else None
 
 
 class EpisodeBar:
@@ -187,12 +226,19 @@ class EpisodeBar:
 
 def _curriculum(config: RunConfig, task: MazeTask) -> Curriculum:
     bar = EpisodeBar(config.proposer.lookahead, config.progress)
-    parts = Parts(task, config.proposer, config.seed, bar)
+    parts = Parts(task, config.proposer, config.seeds[0], bar)
     try:
         factory = instantiate(config.curriculum, _partial_=True)
-        return factory(parts)
+        curriculum: Curriculum = factory(parts)
     except TypeError as error:
         raise ConfigError(f"curriculum: {_one_line(error)}") from error
+    most = curriculum.most_solvers
+    if most is not None and len(config.seeds) > most:
+        raise ConfigError(
+            f"seeds={config.seeds}: {config.method} trains at most {most} at a time; "
+            "give one run for each, as in -m seed=0,1,2"
+        )
+    return curriculum
 
 
 def _device(name: str) -> torch.device:
@@ -240,7 +286,7 @@ def _different(before: Any, now: Any, prefix: str = "") -> list[str]:
 
 def _identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     device = experiment.solver.env.device
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor()
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
     packages = ("proposer_rl", "torch", "torchrl", "tensordict", "hydra-core")
     parameters = sum(p.numel() for p in experiment.solver.agent.parameters())
     return {
@@ -248,26 +294,30 @@ def _identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "scale": config.scale,
         "ablation": config.ablation,
         "seed": config.seed,
+        "seeds": config.seeds,
         "overrides": list(HydraConfig.get().overrides.task),
         "solver_parameters": parameters,
         "device": f"{device.type} {name}".strip(),
+        "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": torch.get_num_threads(),
         "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
     }
 
 
-def _summary_text(config: RunConfig, result: dict[str, Any]) -> str:
-    reached = result["updates_to_threshold"][0]
+def _outcome_text(result: dict[str, Any], reached: int | None, final: dict[str, float]) -> str:
     level = f"{result['threshold']:.0%} {result['headline'].replace('_', ' ')}"
-    final = result["final"][0][result["headline"]]
     outcome = (
         f"{level} after {reached} updates"
         if reached is not None
         else f"{level} not reached in {result['updates']} updates (censored)"
     )
+    return f"{outcome}; {final[result['headline']]:.1%} at the end."
+
+
+def _cost_text(result: dict[str, Any], seeds: int) -> str:
+    together = f" for each of {seeds} seeds" if seeds > 1 else ""
     return (
-        f"{config.method}, seed {config.seed}: {outcome}; {final:.1%} at the end. "
-        f"Cost: {result['frames']:,} frames of the Solver, "
+        f"Cost: {result['frames']:,} frames of the Solver{together}, "
         f"{result['meta_frames']:,} of its copies, {result['seconds']:.0f} s."
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 
@@ -47,7 +47,12 @@ class Curriculum:
 
     A Solver is a :class:`~proposer_rl.ppo.PPO` of a population of K; ``streams`` has the K copies'
     random streams for the present update or cycle.
+
+    Attributes:
+        most_solvers: the largest K that it serves; None for any.
     """
+
+    most_solvers: ClassVar[int | None] = None
 
     def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
         """Levels [K, P] for the Solver's next update."""

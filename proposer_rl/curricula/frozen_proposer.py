@@ -36,6 +36,8 @@ class FrozenProposer(Curriculum):
         ValueError: for an unknown ``own_action``.
     """
 
+    most_solvers = 1
+
     def __init__(
         self,
         agent: ActorCritic,

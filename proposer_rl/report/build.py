@@ -74,9 +74,10 @@ def write_report(
             for study in studies
         ]
     title = "Curricula for a maze Solver: what the runs show"
-    html = page.render(title, [content.section for content in contents], notes)
+    command = page.report_command(folders, threshold)
+    html = page.render(title, command, [content.section for content in contents], notes)
     files = {name: data for content in contents for name, data in content.files.items()}
-    files["report.md"] = _markdown(title, contents).encode()
+    files["report.md"] = _markdown(title, command, contents).encode()
     _write(output, files)
     write_atomically(output / PAGE, html.encode())
     return output / PAGE
@@ -158,9 +159,10 @@ def _write(output: Path, files: dict[str, bytes]) -> None:
         write_atomically(output / name, content)
 
 
-def _markdown(title: str, contents: Sequence[_Content]) -> str:
+def _markdown(title: str, command: str, contents: Sequence[_Content]) -> str:
     """The report in short, for where HTML is not shown."""
-    parts = [f"# {title}\n", f"The whole report is [{PAGE}]({PAGE}), one file for a browser.\n"]
+    parts = [f"# {title}\n", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
+    parts += ["It is written by\n", f"```bash\n{command}\n```\n"]
     for content in contents:
         section = content.section
         parts += [f"## {section.study.title}\n"]

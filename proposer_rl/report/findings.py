@@ -289,7 +289,7 @@ def _present(study: Study, *labels: str) -> list[Group]:
 
 
 def _missing(*labels: str) -> tuple[Verdict, str]:
-    return "no data", f"needs full runs of {' and '.join(labels)}"
+    return "no data", f"needs full runs of {' and '.join(labels)}, each in one variant"
 
 
 def _range(values: Iterator[float]) -> str:

@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from jinja2 import Environment, StrictUndefined
@@ -39,14 +40,14 @@ class Section(NamedTuple):
     configs: Sequence[tuple[str, str]]
 
 
-def render(title: str, sections: Sequence[Section], notes: Sequence[str]) -> str:
+def render(title: str, command: str, sections: Sequence[Section], notes: Sequence[str]) -> str:
     """The page as HTML; whatever comes from a run is escaped."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
     page = environment.from_string(source)
-    return page.render(title=title, sections=sections, notes=notes)
+    return page.render(title=title, command=command, sections=sections, notes=notes)
 
 
 def figure(drawing: Drawing, animations: Mapping[str, bytes]) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def facts(study: Study) -> list[tuple[str, str]]:
     return [
         (
             "Runs",
-            f"{len(runs)} of {len(study.groups)} methods or variants, compared at "
+            f"{len(runs)}, of {len(study.groups)} methods or variants, compared at "
             f"{study.horizon} updates of the Solver",
         ),
         (
@@ -144,6 +145,12 @@ def _animation(content: bytes, panel: Panel) -> dict[str, Any]:
         "height": height,
         "wide": False,
     }
+
+
+def report_command(folders: Sequence[Path], threshold: float | None) -> str:
+    """What writes this report again, without the places of this machine."""
+    asked = [] if threshold is None else [f"--threshold={threshold:g}"]
+    return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked]))
 
 
 def _command(group: Group) -> str:

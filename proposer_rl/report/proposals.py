@@ -188,10 +188,10 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
 def _draw_gains(figure: FigureBase, group: Group, limits: tuple[float, float]) -> None:
     axes = axes_of(figure)
     colour = look(group.label).colour
-    for run in group.runs:
-        for cycle in run.cycles:
-            points = cycle["total_gain"]
-            axes.plot([cycle["updates"]] * len(points), points, ".", color=colour, ms=3, alpha=0.35)
+    cycles = [cycle for run in group.runs for cycle in run.cycles]
+    points = np.array([(c["updates"], gain) for c in cycles for gain in c["total_gain"]], float)
+    # As pixels also in SVG, where thousands of dots would make the page heavy.
+    axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
     lines: list[tuple[str, Callable[[Any], float], str]] = [
         ("maximum", lambda cycle: float(np.max(cycle["total_gain"])), "-"),
         ("mean", lambda cycle: float(np.mean(cycle["total_gain"])), "--"),

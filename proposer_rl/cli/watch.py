@@ -1,0 +1,82 @@
+"""``bin/watch`` and ``proposer-watch``: look at running experiments; nothing is written."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+
+from proposer_rl.report.progress import find_progress
+from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.terminal import overview, screen
+
+BAD_INPUT = 2
+EPILOG = """\
+examples:
+  bin/watch outputs/perf_gain/2026-11-21_00-37-50_seed_0   one run: curves, gains, levels
+  bin/watch sweeps/quick                                   a sweep: one line for each run
+  bin/watch sweeps/quick --once                            print once, for a file or a pipe"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point: exit code 0, also when stopped with Ctrl-C; 2 for bad input."""
+    options = _parser().parse_args(arguments)
+    console = Console()
+    try:
+        picture = draw(options.folder)
+        if options.once or not console.is_terminal:
+            console.print(picture)
+            return
+        with Live(picture, console=console, auto_refresh=False, screen=True) as live:
+            while True:
+                time.sleep(options.seconds)
+                live.update(draw(options.folder), refresh=True)
+    except UnreadableRun as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        return
+
+
+def draw(folder: Path) -> RenderableType:
+    """The folder's run as a screen, or its runs as a table.
+
+    Raises:
+        UnreadableRun: if there is nothing to look at.
+    """
+    found = find_progress(folder)
+    return screen(found[0]) if len(found) == 1 else overview(found)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bin/watch",
+        description="Draw the state of a run or a sweep in the terminal, again and again.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, help="a run's folder, or one with runs in it")
+    parser.add_argument("--once", action="store_true", help="draw once and stop")
+    parser.add_argument(
+        "--seconds", type=_seconds, default=2.0, help="between two looks (default: 2)"
+    )
+    return parser
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 3600:
+        raise argparse.ArgumentTypeError(f"must be from 0.1 to 3600, got {text!r}")
+    return value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Sweeps: stopped and started again, with failures, on Hydra's launchers; seeds side by side."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
+from proposer_rl.cli.train import main
+from proposer_rl.experiment import Experiment
+from proposer_rl.run_folder import read_csv, read_jsonl
+
+SMOKE = ["+scale=smoke", "progress=false"]
+ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
+
+
+@pytest.fixture
+def train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Call the command in this process and a folder of its own; returns its exit code."""
+    monkeypatch.chdir(tmp_path)
+    # Launchers start other processes, which shall run this checkout too.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+
+    def call(*arguments: str) -> int:
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", ["proposer-train", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    return call
+
+
+def measured(folder: Path, seed: int) -> dict[str, object]:
+    """All that was measured of a seed, without what depends on the clock or on other seeds."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.glob("*.csv")):
+        rows = [row for row in read_csv(path) if row["seed"] == seed]
+        found[path.name] = [{**row, "seconds": 0} for row in rows]
+    samples = read_jsonl(folder / "curriculum.jsonl")
+    found["samples"] = [row for row in samples if row["seed"] == seed]
+    return found
+
+
+@pytest.mark.parametrize("method", ["target", "hand_made"])
+def test_seeds_side_by_side_give_what_they_give_alone(method: str, train) -> None:
+    assert train(f"+method={method}", *SMOKE, "seeds=[2,0]", "hydra.run.dir=together") == 0
+    for seed in (2, 0):
+        assert train(f"+method={method}", *SMOKE, f"seed={seed}", f"hydra.run.dir={seed}") == 0
+        alone, together = measured(Path(str(seed)), seed), measured(Path("together"), seed)
+        assert alone["samples"] == together["samples"]
+        # Sums over another batch are rounded in another order.
+        for row, other in zip(alone["metrics.csv"], together["metrics.csv"], strict=True):
+            assert row == pytest.approx(other, abs=1e-6)
+    summary = json.loads(Path("together/summary.json").read_text())
+    assert summary["seeds"] == [2, 0] and len(summary["updates_to_threshold"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["+method=perf_gain", "seeds=[0,1]"], "seeds=[0, 1]: perf_gain trains at most 1 at a"),
+        (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
+        (["+method=target", "seeds=[]"], "seeds=[]: list should have at least 1 item"),
+    ],
+)
+def test_wrong_seeds_get_one_line(arguments, message: str, train, capsys) -> None:
+    assert train(*arguments, *SMOKE) == 2
+    assert message in capsys.readouterr().err
+
+
+def states(folder: Path) -> dict[str, float]:
+    """When the summary of each run was written."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/summary.json")}
+
+
+def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
+    train, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    sweep = ["-m", "+method=target,hand_made", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    updates = []
+    original = Experiment._update
+
+    def breaking(self: Experiment) -> None:
+        updates.append(self.updates)
+        if len(updates) == 6 + 4:  # in the second run, after its checkpoint at update 2
+            raise KeyboardInterrupt
+        original(self)
+
+    monkeypatch.setattr(Experiment, "_update", breaking)
+    assert train(*sweep) == 130
+    before = states(Path("all"))
+    assert len(before) == 1
+    updates.clear()
+    updates += [0] * 100  # never breaks again
+    capsys.readouterr()
+    assert train(*sweep) == 0
+    assert updates[100:104] == [2, 3, 4, 5]  # the broken run, from its checkpoint
+    assert len(updates) == 100 + 4 + 2 * 6  # the finished one not at all
+    after = states(Path("all"))
+    assert len(after) == 4 and before.items() <= after.items()
+    said = capsys.readouterr().out
+    assert said.count("finished before, nothing to do") == 1 and "4 runs: 4 finished" in said
+
+
+def test_a_failed_run_is_listed_and_tried_again(
+    train, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    sweep = ["-m", "+method=target", "seed=0,1,2", *SMOKE, "hydra.sweep.dir=all"]
+    original = Experiment.run
+
+    def failing(self: Experiment):
+        if self.seeds == [1]:
+            raise RuntimeError("the disk\nis on fire")
+        return original(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Experiment, "run", failing)
+        assert train(*sweep) == 1
+    printed = capsys.readouterr()
+    assert "failed: 1_target_seed_1: the disk is on fire" in printed.out
+    assert "3 runs: 2 finished, 1 failed" in printed.out
+    assert "Traceback" in printed.err and "error: the disk is on fire" in printed.err
+    assert train(*sweep) == 0
+    assert "3 runs: 3 finished" in capsys.readouterr().out
+    assert not list(Path("all").rglob("error.json"))
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"],
+    ],
+    ids=["joblib", "submitit"],
+)
+def test_other_launchers_run_a_sweep(launcher: list[str], train, capfd) -> None:
+    arguments = ["-m", "+method=target", "solver.ppo.epochs=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    assert train(*arguments, *launcher) == 2
+    assert len(states(Path("all"))) == 1
+    assert "2 runs: 1 finished, 1 failed" in capfd.readouterr().out
+
+
+@pytest.fixture
+def composed(train, monkeypatch: pytest.MonkeyPatch):
+    """Which runs a sweep makes, without making them: each reads its configuration and stops."""
+
+    def call(*arguments: str) -> set[tuple[str, str, str, int]]:
+        made = []
+
+        def note(config: RunConfig, path: Path):
+            (seed,) = config.seeds
+            made.append((path.parent.name, config.method, config.ablation, seed))
+            raise KeyError("enough")
+
+        monkeypatch.setattr("proposer_rl.cli.train.build", note)
+        assert train(*arguments) == 1
+        assert len(set(made)) == len(made)
+        return set(made)
+
+    return call
+
+
+@pytest.mark.parametrize("name", ["paper", "quick"])
+def test_the_experiment_is_one_command(name: str, composed) -> None:
+    made = composed(f"+sweep={name}", "seed=0,3")
+    found = {method for _, method, _, _ in made}
+    assert {"perf_gain", "task_difficulty", "target", "domain_randomization"} <= found
+    assert made == {(name, method, "none", seed) for method in found for seed in (0, 3)}
+
+
+def test_a_family_of_ablations_is_one_command(composed) -> None:
+    """Beside the experiment's own runs, at the same scale."""
+    made = composed("+sweep=ablations", "+scale=quick", "+ablation=glob(probes_*)", "seed=1")
+    family = [name for name in ABLATIONS if name.startswith("probes_")]
+    assert family and made == {("quick", "perf_gain", name, 1) for name in family}
