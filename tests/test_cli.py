@@ -207,8 +207,8 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "choose one with +method=NAME, NAME one of: domain_randomization, hand_made, perf"),
-        (["+method=magic"], "method/magic: unknown; choose one of: domain_randomization, hand"),
+        ([], "choose one with +method=NAME, NAME one of: domain_randomization, frozen_proposer"),
+        (["+method=magic"], "method/magic: unknown; choose one of: domain_randomization, fro"),
         (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: paper, quick"),
         (["+method=target", "sede=1"], "Could not override 'sede'"),
         (["+method=target", "+sede=1"], "sede: there is no such key"),
