@@ -97,9 +97,7 @@ QUICK = Scale(
         "id": DistributionSettings(specifications=[(0.4, 8)]),
         "ood": DistributionSettings(specifications=[(0.5, 10)], mechanism="path_first"),
     },
-    space=SpaceSettings(
-        obstacle_fractions=[0.0, 0.2, 0.4, 0.5], path_lengths=[2, 4, 6, 8, 10]
-    ),
+    space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4, 0.5], path_lengths=[2, 4, 6, 8, 10]),
     solver=SolverSettings(channels=[16, 32], problems=32, ppo=_QUICK_PPO),
     proposer=replace(
         PAPER.proposer,
