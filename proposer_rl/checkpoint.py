@@ -22,9 +22,9 @@ from typing import Any
 
 import torch
 
-from proposer_rl.run_folder import write_atomically
+from proposer_rl.run_folder import storage, write_atomically
 
-FORMAT = 1
+FORMAT = 2
 
 _LOG = logging.getLogger(__name__)
 _FILE_NAME = re.compile(r"step_(\d+)\.pt")
@@ -34,7 +34,7 @@ State = dict[str, Any]
 
 
 class CheckpointError(ValueError):
-    """A checkpoint cannot be written or read; the message is one line that names the file."""
+    """A checkpoint is not what it should be; the message is one line that names the file."""
 
 
 class _DamagedError(CheckpointError):
@@ -55,9 +55,11 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
         The checkpoint's file.
 
     Raises:
-        CheckpointError: if the state holds anything else, the disk cannot take it, or the folder
-            already holds an intact checkpoint of a later step: then it is another run's folder, or
-            this run was not resumed from it. The checkpoints that were there stay as they were.
+        CheckpointError: if the state holds anything else, or the folder already holds an intact
+            checkpoint of a later step: then it is another run's folder, or this run was not resumed
+            from it.
+        StorageError: if the disk cannot take it. In either case the checkpoints that were there
+            stay as they were.
     """
     if step < 0 or keep < 1:
         raise CheckpointError(f"step must be at least 0 and keep at least 1, got {step} and {keep}")
@@ -65,17 +67,16 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
     path = folder / f"step_{step:09d}.pt"
     content = _encode(step, state)
     later = _later_damaged(folder, step)
-    try:
+    with storage(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for leftover in folder.glob(".step_*.pt.tmp"):
             leftover.unlink()
-        write_atomically(path, content)
+    write_atomically(path, content)
+    with storage(folder):
         for damaged in later:
             damaged.unlink()
         for old in _files(folder)[:-keep]:
             old.unlink()
-    except OSError as error:
-        raise CheckpointError(f"cannot write the checkpoint {path}: {error}") from error
     return path
 
 
@@ -90,7 +91,8 @@ def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
 
     Raises:
         CheckpointError: if there are checkpoints and all are damaged, or if the newest intact one
-            was written by a newer version or holds more than plain data.
+            was written by another version or holds more than plain data.
+        StorageError: if one cannot be read.
     """
     files = _files(Path(folder))
     for path in reversed(files):
@@ -113,14 +115,16 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
         Its step and its state, tensors on the CPU.
 
     Raises:
-        CheckpointError: if the file cannot be read or is damaged, was written by a newer version,
-            or holds more than plain data (reading it would then run code).
+        CheckpointError: if the file is damaged, was written by a version with another format, or
+            holds more than plain data (reading it would then run code).
+        StorageError: if the file cannot be read.
     """
     version, step, payload = _verified(Path(path))
-    if version > FORMAT:
+    if version != FORMAT:
+        age = "a newer" if version > FORMAT else "an older"
         raise CheckpointError(
-            f"the checkpoint {path} has format {version}, this version reads up to {FORMAT}: "
-            "update proposer_rl"
+            f"the checkpoint {path} has format {version}, this version of proposer_rl reads only "
+            f"format {FORMAT}: go on with {age} version, or start in another folder"
         )
     try:
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
@@ -162,10 +166,8 @@ def _plain(value: object, where: str) -> object:
 
 def _verified(path: Path) -> tuple[int, int, bytes]:
     """Returns format, step and payload of a file, none of them looked at before the checksum."""
-    try:
+    with storage(path, "read"):
         content = path.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"cannot read the checkpoint {path}: {error}") from error
     digest, _, body = content.partition(b"\n")
     if digest != hashlib.sha256(body).hexdigest().encode():
         raise _DamagedError(
@@ -175,7 +177,7 @@ def _verified(path: Path) -> tuple[int, int, bytes]:
     try:
         header = json.loads(line)
         return int(header["format"]), int(header["step"]), payload
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise CheckpointError(f"{path} is not a checkpoint of proposer_rl") from None
 
 

@@ -8,16 +8,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge, Interval
+from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from proposer_rl.checkpoint import load_latest, save_checkpoint
+from proposer_rl.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.curricula import Curriculum
+from proposer_rl.finite import located
 from proposer_rl.models import ActorCritic
 from proposer_rl.ppo import PPO, Update
 from proposer_rl.run_folder import RunFolder, read_csv
 from proposer_rl.settings import settings
+from proposer_rl.signals import StopSignals
 from proposer_rl.streams import Streams
 
 Evaluate = Callable[[ActorCritic], TensorDictBase]
@@ -35,6 +37,8 @@ class Schedule:
         cycle_length: updates between two improvements of the curriculum.
         evaluate_every: updates between two rows of metrics.
         checkpoint_every: updates between two checkpoints; one more follows every improvement.
+        checkpoint_seconds: time after which a checkpoint is due, also in the middle of an
+            improvement; None for no such limit.
         keep_checkpoints: how many of the newest checkpoints stay.
         headline: the measurement that the run is summed up by.
         threshold: sample efficiency is the first update at which the headline reaches this.
@@ -44,6 +48,7 @@ class Schedule:
     cycle_length: Annotated[int, Ge(1)] = 50
     evaluate_every: Annotated[int, Ge(1)] = 10
     checkpoint_every: Annotated[int, Ge(1)] = 50
+    checkpoint_seconds: Annotated[float, Gt(0)] | None = 600.0
     keep_checkpoints: Annotated[int, Ge(1)] = 2
     headline: str = "id_success"
     threshold: Annotated[float, Interval(gt=0, le=1)] = 0.8
@@ -63,6 +68,7 @@ class Experiment:
         records: of levels and the rollout on them: for each copy a list for JSON.
         log: receives each row of the first copy: its table, its values and its update.
         progress: whether to draw a progress bar.
+        signals: which may ask the run to stop; None where nothing does.
     """
 
     def __init__(
@@ -78,6 +84,7 @@ class Experiment:
         records: Records,
         log: Log | None = None,
         progress: bool = True,
+        signals: StopSignals | None = None,
     ) -> None:
         self.solver = solver
         self.curriculum = curriculum
@@ -92,9 +99,11 @@ class Experiment:
         self._records = records
         self._log = log
         self._progress = progress
+        self._signals = signals or StopSignals()
         self._headline: list[float] = []
+        self._checkpoints = 0
         self._seconds_before = 0.0
-        self._started = time.monotonic()
+        self._started = self._saved = time.monotonic()
 
     @property
     def seconds(self) -> float:
@@ -112,6 +121,12 @@ class Experiment:
 
         Returns:
             The summary of the run, ready for JSON.
+
+        Raises:
+            CheckpointError: if the folder's checkpoint is unusable or another experiment's.
+            DivergedError: if a number is not finite, saying where. The checkpoint before stays.
+            Interrupted: if a signal asked the run to stop; all is saved then.
+            StorageError: if the disk does not take a file.
         """
         if not self._resume():
             self._measure()
@@ -128,10 +143,12 @@ class Experiment:
         with bar:
             while self.updates < self.schedule.updates:
                 before = self.updates
-                if self.updates >= self.cycles * self.schedule.cycle_length:
-                    self._improve()
-                else:
-                    self._update()
+                cycle = self.updates // self.schedule.cycle_length
+                with located(f"cycle {cycle}, after {self.updates} Solver updates"):
+                    if self.updates >= self.cycles * self.schedule.cycle_length:
+                        self._improve()
+                    else:
+                        self._update()
                 bar.set_postfix_str(self._headline_text(), refresh=False)
                 bar.update(self.updates - before)
         return self.summary()
@@ -164,7 +181,8 @@ class Experiment:
         }
 
     def _improve(self) -> None:
-        outcome = self.curriculum.improve(self.solver, self._streams("cycle", self.cycles))
+        streams = self._streams("cycle", self.cycles)
+        outcome = self.curriculum.improve(self.solver, streams, self._pause)
         self.meta_frames += outcome.meta_frames
         if outcome.metrics:
             place = {"cycle": self.cycles, "updates": self.updates, "meta_frames": self.meta_frames}
@@ -175,9 +193,8 @@ class Experiment:
             self.updates = min(self.updates + outcome.advance.updates, self.schedule.updates)
             self._measure()
             self._record(outcome.advance.levels, outcome.advance.update)
-        if outcome.metrics:
-            # Improving can be nearly all of a cycle's work, so it is saved at once.
-            self._save()
+        # Improving can be nearly all of a cycle's work, so it is saved at once.
+        self._pause(due=bool(outcome.metrics))
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
@@ -187,14 +204,14 @@ class Experiment:
         update = self.solver.update(
             [stream.generator("actions", device=device) for stream in streams]
         )
+        self.solver.check()
         self.curriculum.observe(levels, update.rollout)
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
             self._record(levels, update)
-        if last or self.updates % self.schedule.checkpoint_every == 0:
-            self._save()
+        self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _measure(self) -> None:
         """Append a row of measurements for every copy."""
@@ -239,8 +256,26 @@ class Experiment:
         mean = sum(self._headline) / len(self._headline)
         return f"{self.schedule.headline} {mean:.3f}"
 
+    def _pause(self, due: bool = False) -> None:
+        """A safe point: save if it is due or the time has come, stop if a signal asked for it."""
+        limit = self.schedule.checkpoint_seconds
+        late = limit is not None and time.monotonic() - self._saved >= limit
+        if due or late or self._signals.pending:
+            self._save()
+        self._signals.deliver()
+
     def _save(self) -> None:
-        state = {
+        self._checkpoints += 1
+        save_checkpoint(
+            self.folder.path / "checkpoints",
+            self._checkpoints,
+            self._state(),
+            self.schedule.keep_checkpoints,
+        )
+        self._saved = time.monotonic()
+
+    def _state(self) -> State:
+        return {
             "updates": self.updates,
             "cycles": self.cycles,
             "meta_frames": self.meta_frames,
@@ -250,23 +285,28 @@ class Experiment:
             "solver": self.solver.snapshot().to_dict(),
             "curriculum": self.curriculum.state_dict(),
         }
-        # Updates and cycles together count up by one at least between two checkpoints.
-        step = self.updates + self.cycles
-        save_checkpoint(
-            self.folder.path / "checkpoints", step, state, self.schedule.keep_checkpoints
-        )
 
     def _resume(self) -> bool:
-        latest = load_latest(self.folder.path / "checkpoints")
+        checkpoints = self.folder.path / "checkpoints"
+        latest = load_latest(checkpoints)
         if latest is None:
             self.folder.cut_back({})
             return False
-        _, state = latest
+        self._checkpoints, state = latest
+        try:
+            self._set_state(state)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise CheckpointError(
+                f"checkpoint {self._checkpoints} in {checkpoints} does not fit this run: {reason}"
+            ) from error
+        return True
+
+    def _set_state(self, state: State) -> None:
+        self.solver.restore(TensorDict(state["solver"], [len(self.seeds)]))
+        self.curriculum.load_state_dict(state["curriculum"])
         self.updates, self.cycles = state["updates"], state["cycles"]
         self.meta_frames = state["meta_frames"]
         self._seconds_before = state["seconds"]
         self._headline = state["headline"]
         self.folder.cut_back(state["rows"])
-        self.solver.restore(TensorDict(state["solver"], [len(self.seeds)]))
-        self.curriculum.load_state_dict(state["curriculum"])
-        return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,11 +11,16 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from proposer_rl.finite import located
 from proposer_rl.ppo import PPO
 from proposer_rl.proposals import Proposals
 from proposer_rl.rewards import Reward, TrainingStep
 from proposer_rl.solver_view import SolverView
 from proposer_rl.streams import Streams
+
+
+class ReplayError(RuntimeError):
+    """An interrupted episode cannot go on: its agent now chooses other actions."""
 
 
 class SolverTrainingEnv(EnvBase):
@@ -85,12 +91,15 @@ class SolverTrainingEnv(EnvBase):
         """Steps, that is actions, of an episode."""
         return self.episode_length // self.updates_per_step
 
-    def fork(self, solver: TensorDictBase, streams: Streams) -> None:
+    def fork(
+        self, solver: TensorDictBase, streams: Streams, pause: Callable[[], None] | None = None
+    ) -> None:
         """Start the next episodes from copies of one Solver, on new validation and probe levels.
 
         Args:
             solver: a snapshot of one Solver, batch [] (weights and Adam's state).
             streams: where the randomness of the levels and of the Solvers' actions comes from.
+            pause: called between two updates, where :meth:`episode` is all that is needed to go on.
         """
         self.streams = streams
         self.view.draw_levels(streams)
@@ -98,8 +107,37 @@ class SolverTrainingEnv(EnvBase):
         self.solvers.restore(self._origin)
         self._episode = -1
         self._updates = 0
+        self._pause = pause or (lambda: None)
+        self._taken: list[dict[str, Tensor]] = []  # what came of the present episode's updates
+        self._replaying = False
         self._origin_return = self._validation_return()
         self._origin_probes = self.view.see(self.solvers.agent)
+
+    def episode(self) -> dict[str, Any] | None:
+        """What is needed to go on with the present episode; None between episodes."""
+        if self._updates == 0:
+            return None
+        solvers = self.solvers.snapshot().to_dict()
+        return {"number": self._episode, "updates": self._taken, "solvers": solvers}
+
+    def resume(self, episode: dict[str, Any]) -> None:
+        """Go on with an interrupted episode of the same fork, which has just been repeated.
+
+        The episode is then played from its beginning. What came of the updates before the
+        interruption is remembered instead of trained again. Where the agent chooses another action
+        than then, which rounding can bring about on another machine, it gets a ReplayError.
+
+        Args:
+            episode: what :meth:`episode` returned.
+        """
+        # Choices stay where they are made, on the host.
+        self._taken = [
+            {key: x if key == "choices" else x.to(self.device) for key, x in taken.items()}
+            for taken in episode["updates"]
+        ]
+        self._replaying = True
+        self._episode = episode["number"]
+        self.solvers.restore(TensorDict(episode["solvers"], self.batch_size).to(self.device))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         # Only marks the start: a collector resets as soon as an episode has ended, and the trained
@@ -111,39 +149,69 @@ class SolverTrainingEnv(EnvBase):
         return self._state(self._origin_return, self._origin_probes, none_yet)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._updates == 0:
+        if self._updates == 0 and not self._replaying:
             self.solvers.restore(self._origin)
             self._return = self._origin_return
             self._episode += 1
-        reward = torch.zeros_like(self._return)
+            self._taken = []
+        reward = torch.zeros_like(self._origin_return)
         choices = []
         for update in range(self.updates_per_step):
             last = update == self.updates_per_step - 1
-            gained, chosen = self._train(tensordict["action"], measure=last)
-            reward += gained
-            choices.append(chosen)
+            taken = self._update(tensordict["action"], measure=last)
+            reward += taken["reward"]
+            choices.append(taken["choices"])
         proposed = _count(torch.cat(choices, -1), self.proposals.choices).to(self.device)
-        state = self._state(self._return, self.view.see(self.solvers.agent), proposed)
+        state = self._state(self._return, taken["probes"], proposed)
         return state.set("reward", reward.unsqueeze(-1))
 
-    def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
-        """One update of the Solvers: its reward [K], and the choices [K, P]."""
+    def _update(self, action: Tensor, *, measure: bool) -> dict[str, Tensor]:
+        """What comes of an update: ``reward`` [K], ``choices`` [K, P], measured also ``probes``."""
+        if self._replaying:
+            taken = self._remember(action)
+        else:
+            if self._updates:
+                self._pause()
+            taken = self._train(action, measure=measure)
+            self._taken.append(taken)
+        self._on_step()
+        return taken
+
+    def _remember(self, action: Tensor) -> dict[str, Tensor]:
+        taken = self._taken[self._updates]
+        if not torch.equal(taken["action"], action):
+            raise ReplayError(f"another action for update {self._updates} of the episode")
+        self._return = taken["return"]
+        self._updates += 1
+        self._replaying = self._updates < len(self._taken)
+        return taken
+
+    def _train(self, action: Tensor, *, measure: bool) -> dict[str, Tensor]:
         streams = self._copy_streams()
         problems = self.solvers.env.batch_size[1:].numel()
         levels, choices = self.proposals.levels(action, problems, streams)
         self.solvers.env.set_levels(levels)
         actions = [stream.generator("actions", device=self.device) for stream in streams]
         # A collector steps its environment without gradients; this one learns inside.
-        with torch.enable_grad():
+        place = f"update {self._updates} of the episode of the Solver's copies"
+        with torch.enable_grad(), located(place):
             update = self.solvers.update(actions)
+            self.solvers.check()
         self.last_training = (levels, update)
         self._updates += 1
         before = self._return
         if measure:
             self._return = self._validation_return()
         step = TrainingStep(levels, update.rollout, self.solvers.agent, before, self._return)
-        self._on_step()
-        return self._reward(step), choices
+        taken = {
+            "action": action,
+            "choices": choices,
+            "reward": self._reward(step),
+            "return": self._return,
+        }
+        if measure:
+            taken["probes"] = self.view.see(self.solvers.agent).clone()
+        return taken
 
     def _set_seed(self, seed: int | None) -> None:
         self.streams = Streams(seed or 0)

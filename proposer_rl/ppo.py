@@ -24,6 +24,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from proposer_rl.capture import Captured, Recorder
+from proposer_rl.finite import require_finite
 from proposer_rl.models import ActorCritic, draw, uniform_noise
 from proposer_rl.settings import settings
 
@@ -201,7 +202,18 @@ class PPO:
         level = rollout.select(*agent.level_keys)[..., 0]
         trained = self._train(TensorDict({"steps": steps, "level": level}))
         rollout.update(trained["steps"])
-        return trained["metrics"]
+        taken = trained["metrics"]  # [S], with entries [S, K] or [S]
+        self._last_training = rollout["next", "reward"], taken
+        return TensorDict({key: value.mean() for key, value in taken.items()})
+
+    def check(self) -> None:
+        """Check what was trained on last; this waits for the device, training does not.
+
+        Raises:
+            DivergedError: if a reward, loss, gradient or weight is not finite, naming the copy.
+        """
+        weights = dict(self.agent.named_parameters())
+        require_finite(*self._last_training, weights, self.agent.copies)
 
     def snapshot(self) -> TensorDict:
         """A copy of weights and Adam's state, batch [K] with copies and [] without.
@@ -283,7 +295,7 @@ class PPO:
         return TensorDict(
             {
                 "steps": rollout.select(value, ("next", value), "advantage", "value_target"),
-                "metrics": torch.stack(metrics).mean(0),
+                "metrics": TensorDict.stack(metrics),
             }
         )
 
@@ -310,12 +322,12 @@ class PPO:
         torch.stack(list(terms.values())).sum().backward()
         norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, self.agent.copies)
         self._adam.step()
-        metrics = {key: term.detach().mean() for key, term in terms.items()}
+        metrics = {key: term.detach() for key, term in terms.items()}
         for key in ("entropy", "kl_approx", "clip_fraction"):
             metrics[key] = losses[key].detach().mean()
         value = steps.get(self.agent.value_key).detach()
         metrics["explained_variance"] = self._explained_variance(value, steps["value_target"])
-        return TensorDict({**metrics, "grad_norm": norm.mean()})
+        return TensorDict({**metrics, "grad_norm": norm})
 
     def _explained_variance(self, value: Tensor, target: Tensor) -> Tensor:
         """Share of the targets' variance that the values explain, the mean over copies."""

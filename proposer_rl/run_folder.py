@@ -13,6 +13,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 Number = int | float
@@ -20,16 +21,24 @@ Number = int | float
 _PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 
 
+class StorageError(OSError):
+    """The disk did not take or give a file; the message is one line that names it."""
+
+
 class RunFolder:
     """The folder of one run; created, with its parents, if it does not exist.
 
     Args:
         path: the folder.
+
+    Raises:
+        StorageError: if it cannot be created.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.path.mkdir(parents=True, exist_ok=True)
+        with storage(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
 
     def append(self, name: str, row: Mapping[str, object]) -> None:
         """Adds a row to a table and waits until it is on the disk: a crash loses at most this row.
@@ -42,18 +51,20 @@ class RunFolder:
         Raises:
             ValueError: if the name is not a table's, a value cannot be written, the keys are not
                 those of the header, or the table ends in the middle of a row.
+            StorageError: if the disk does not take the row.
         """
         path = self._table(name)
-        size = path.stat().st_size if path.exists() else 0
-        if size and not _ends_with_newline(path):
-            raise ValueError(f"{path} ends in the middle of a row; cut it back before adding to it")
-        lines = _new_lines(path, row, with_header=not size)
-        with open(path, "ab") as file:
-            file.write(lines.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        if not size:
-            _sync_folder(self.path)
+        with storage(path):
+            size = path.stat().st_size if path.exists() else 0
+            if size and not _ends_with_newline(path):
+                raise ValueError(f"{path} ends in the middle of a row; cut it back first")
+            lines = _new_lines(path, row, with_header=not size)
+            with open(path, "ab") as file:
+                file.write(lines.encode())
+                file.flush()
+                os.fsync(file.fileno())
+            if not size:
+                _sync_folder(self.path)
 
     def lengths(self) -> dict[str, int]:
         """Returns the number of complete rows of each table in the folder, by file name."""
@@ -70,14 +81,16 @@ class RunFolder:
 
         Raises:
             ValueError: if a table has fewer rows than it should keep.
+            StorageError: if a table cannot be changed.
         """
         ends = {name: _end_of_row(self._table(name), rows) for name, rows in lengths.items()}
         for path in self._tables():
             end = ends.get(path.name, 0)
-            if end == 0:
-                path.unlink()
-            elif end < path.stat().st_size:
-                _truncate(path, end)
+            with storage(path):
+                if end == 0:
+                    path.unlink()
+                elif end < path.stat().st_size:
+                    _truncate(path, end)
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
@@ -89,6 +102,7 @@ class RunFolder:
 
         Raises:
             ValueError: if the value cannot be written as JSON.
+            StorageError: if the disk does not take it.
         """
         path = self.path / name
         write_atomically(path, (_to_json(path, value, indent=2) + "\n").encode())
@@ -131,7 +145,7 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
     for number, line in _lines(Path(path)):
         try:
             row = json.loads(line)
-        except json.JSONDecodeError as error:
+        except (json.JSONDecodeError, RecursionError) as error:
             raise ValueError(f"{path}, line {number}: not JSON: {error}") from None
         if not isinstance(row, dict):
             raise ValueError(f"{path}, line {number}: not a JSON object: {line[:60]}")
@@ -149,20 +163,39 @@ def write_atomically(path: Path, content: bytes) -> None:
         content: what it shall hold.
 
     Raises:
-        OSError: if the disk cannot take it.
+        StorageError: if the disk cannot take it.
     """
     temporary = path.with_name(f".{path.name}.tmp")
+    with storage(path):
+        try:
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            # A full disk must not stay full of an attempt.
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+
+
+@contextmanager
+def storage(path: Path, action: str = "write") -> Iterator[None]:
+    """Names the file in whatever error of the operating system arises inside.
+
+    Args:
+        path: the file or folder that is worked on.
+        action: what is done to it, a verb.
+
+    Raises:
+        StorageError: instead of any other OSError.
+    """
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        # A full disk must not stay full of an attempt.
-        temporary.unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
+        yield
+    except OSError as error:
+        raise StorageError(f"cannot {action} {path}: {error.strerror or error}") from error
 
 
 def _new_lines(path: Path, row: Mapping[str, object], with_header: bool) -> str:

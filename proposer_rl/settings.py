@@ -16,8 +16,8 @@ def settings(cls: type[T]) -> type[T]:
 
     Ranges stand in the annotations (``Annotated[int, Ge(1)]``). Library code constructs the class
     like any dataclass; the command line validates its values against the annotations first, and
-    refuses keys that the class does not have.
+    refuses keys that the class does not have, and infinite numbers.
     """
     decorated = dataclass(frozen=True, kw_only=True)(cls)
-    decorated.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
+    decorated.__pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # type: ignore[attr-defined]
     return decorated

@@ -5,9 +5,18 @@ import os
 # Before anything imports pyplot: tests draw into files, also where there is no display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
 import hypothesis
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+
+from proposer_rl.cli.train import main
+from tests.processes import Processes
 
 # A busy machine makes an example slow, not wrong.
 hypothesis.settings.register_profile("proposer_rl", deadline=None)
@@ -22,3 +31,34 @@ torch.set_num_threads(1)
 def _seeded() -> None:
     """TorchRL's distributions draw from the global generator."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Calls the command in processes of its own."""
+    running = Processes(tmp_path_factory.mktemp("processes"))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Works in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def train(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Calls the command in this process; returns its exit code."""
+
+    def call(*arguments: str) -> int:
+        GlobalHydra.instance().clear()
+        HydraConfig.instance().cfg = None
+        monkeypatch.setattr(sys, "argv", ["proposer-train", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    return call

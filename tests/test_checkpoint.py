@@ -23,6 +23,7 @@ from proposer_rl.checkpoint import (
     load_latest,
     save_checkpoint,
 )
+from proposer_rl.run_folder import StorageError
 
 
 def _names(folder: Path) -> list[str]:
@@ -133,7 +134,7 @@ def test_nothing_to_load(tmp_path: Path) -> None:
     (tmp_path / "step_x.pt").touch()
     assert load_latest(tmp_path) is None
     assert load_latest(tmp_path / "missing") is None
-    with pytest.raises(CheckpointError, match=r"cannot read the checkpoint .*none\.pt"):
+    with pytest.raises(StorageError, match=r"cannot read .*none\.pt: No such file"):
         load_checkpoint(tmp_path / "none.pt")
 
 
@@ -203,11 +204,13 @@ def _envelope(header: object, payload: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
-def test_a_newer_format_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("step", "age"), [(1, "a newer"), (-1, "an older")])
+def test_another_format_is_named(tmp_path: Path, step: int, age: str) -> None:
     save_checkpoint(tmp_path, 1, {})
-    newer = _envelope({"format": FORMAT + 1, "step": 2}, b"whatever")
-    (tmp_path / "step_000000002.pt").write_bytes(newer)
-    with pytest.raises(CheckpointError, match=f"has format {FORMAT + 1}.*update proposer_rl"):
+    other = _envelope({"format": FORMAT + step, "step": 2}, b"whatever")
+    (tmp_path / "step_000000002.pt").write_bytes(other)
+    message = f"has format {FORMAT + step}.*reads only format {FORMAT}: go on with {age} version"
+    with pytest.raises(CheckpointError, match=message):
         load_latest(tmp_path)
 
 
@@ -265,16 +268,16 @@ def test_a_full_disk_leaves_the_one_before(tmp_path: Path) -> None:
     output = _run(
         f"""
         import resource, torch
-        from proposer_rl.checkpoint import CheckpointError, save_checkpoint
+        from proposer_rl.checkpoint import save_checkpoint
+        from proposer_rl.run_folder import StorageError
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:
             save_checkpoint({str(tmp_path)!r}, 2, {{"x": torch.zeros(10_000)}}, keep=1)
-        except CheckpointError as error:
+        except StorageError as error:
             print(error)
         """
     )
-    assert output.startswith("cannot write the checkpoint")
-    assert "step_000000002.pt" in output
+    assert output.startswith(f"cannot write {tmp_path / 'step_000000002.pt'}: File too large")
     assert _names(tmp_path) == ["step_000000001.pt"]
     assert load_latest(tmp_path) == (1, {"x": 1})
 

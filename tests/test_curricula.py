@@ -174,6 +174,64 @@ def test_a_restored_proposer_proposes_and_improves_alike(mix: bool) -> None:
     assert original.outcome == resumed.outcome
 
 
+class Stop(Exception):
+    """An interruption."""
+
+
+def interrupt(curriculum: ProposerCurriculum, solver: PPO, pauses: int) -> dict:
+    """The state at a pause within improving, as a checkpoint has it."""
+    states = []
+
+    def pause() -> None:
+        states.append(curriculum.state_dict())
+        if len(states) == pauses:
+            raise Stop
+
+    with pytest.raises(Stop):
+        curriculum.improve(solver, [Streams(0, "cycle", 0)], pause)
+    return states[-1]
+
+
+KINDS = [{}, {"mix": True, "episode_length": 6, "updates_per_step": 3}]
+
+
+@pytest.mark.parametrize("pauses", [1, 4])  # within the first step, and with held actions after it
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("advance", ["train", "best"])
+def test_an_interrupted_episode_goes_on_as_if_it_had_never_stopped(
+    advance: str, kind: dict, pauses: int
+) -> None:
+    whole, solver = proposer(advance, **kind), solvers(1)
+    expected = whole.improve(solver, [Streams(0, "cycle", 0)])
+    steps = []
+    resumed, again = proposer(advance, on_step=lambda: steps.append(1), **kind), solvers(1)
+    resumed.load_state_dict(interrupt(proposer(advance, **kind), solvers(1), pauses))
+    trained = []
+    update = resumed.env.solvers.update
+    resumed.env.solvers.update = lambda *a: trained.append(1) or update(*a)
+    outcome = resumed.improve(again, [Streams(0, "cycle", 0)])
+    assert outcome.metrics == expected.metrics
+    assert (resumed.proposer.snapshot() == whole.proposer.snapshot()).all()
+    assert (again.snapshot() == solver.snapshot()).all()
+    # What had been trained before is not trained again, but is counted.
+    length = resumed.env.episode_length
+    assert len(steps) == length and len(trained) == length - pauses
+    assert resumed.env.episode() is None
+    # The next cycle begins anew.
+    expected = whole.improve(solver, [Streams(0, "cycle", 1)])
+    assert resumed.improve(again, [Streams(0, "cycle", 1)]).metrics == expected.metrics
+
+
+def test_an_episode_that_cannot_be_repeated_is_begun_anew() -> None:
+    """As on another machine, where rounding can change an action."""
+    expected = proposer().improve(solvers(1), [Streams(0, "cycle", 0)])
+    state = interrupt(proposer(), solvers(1), 2)
+    state["episode"]["updates"][1]["action"][0, 0] += 1
+    resumed = proposer()
+    resumed.load_state_dict(state)
+    assert resumed.improve(solvers(1), [Streams(0, "cycle", 0)]).metrics == expected.metrics
+
+
 def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
     options = {"mix": True, "episode_length": 4, "updates_per_step": 2}
     actions = {}

@@ -199,3 +199,9 @@ def test_the_worst_mean_counts_the_last_value_in_part(values: list[float], tenth
     expected = sum(tenfold) / len(tenfold)
     found = worst_mean(torch.tensor([values, values[::-1]]), tenths / 10)
     assert found.tolist() == pytest.approx([expected] * 2, abs=1e-5)
+
+
+def test_the_worst_mean_of_one_row_is_that_of_the_row_in_a_batch() -> None:
+    values = torch.tensor([[0.5, 0.1, 0.9], [0.3, 0.2, 0.0]])
+    alone = torch.stack([worst_mean(row, 0.5) for row in values])
+    torch.testing.assert_close(alone, worst_mean(values, 0.5))

@@ -126,9 +126,9 @@ def test_the_curriculum_is_improved_once_per_cycle_and_sees_every_update(tmp_pat
             assert rollout.batch_size == (1, 4, 8)
             events.append("observe")
 
-        def improve(self, solver, streams):
+        def improve(self, solver, streams, pause):
             events.append("improve")
-            return super().improve(solver, streams)
+            return super().improve(solver, streams, pause)
 
     experiment(tmp_path, 0, curriculum=Recorder(task().sample_target)).run()
     update = ["propose", "observe"]

@@ -15,7 +15,10 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
     {"capture"},
-    {"mazes", "models", "run_folder", "checkpoint", "settings", "streams", "machine"},
+    {
+        *("mazes", "models", "run_folder", "checkpoint", "lock"),
+        *("settings", "streams", "signals", "finite", "machine"),
+    },
     {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
     {"meta_env"},
     {"curricula", "snr"},
@@ -27,8 +30,8 @@ LAYERS = [
 ]
 RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 
-# In the lowest layer even neighbours are strangers, but for this: both lie in a run's folder.
-NEIGHBOURS = {("checkpoint", "run_folder")}
+# In the lowest layer even neighbours are strangers, but for these: all lie in a run's folder.
+NEIGHBOURS = {("checkpoint", "run_folder"), ("lock", "run_folder")}
 
 # These work with any environment and any level: they are reused where there are no mazes.
 KNOW_NO_MAZES = {"ppo", "advantages", "proposals", "solver_view", "meta_env", "snr", "experiment"}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from proposer_rl.experiment import Schedule
+from proposer_rl.mazes import LevelDistribution, SpecificationSpace
 from proposer_rl.methods import ProposerSettings
+from proposer_rl.run_folder import storage
 from proposer_rl.task import (
     DistributionSettings,
     EvaluationSettings,
@@ -32,6 +35,11 @@ CONFIG_FOLDER = next(
 OmegaConf.register_new_resolver(
     "joined", lambda items: "-".join(str(item) for item in items), replace=True
 )
+
+# No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
+LARGEST = 10**9
+LARGEST_GRID = 10**6
+LARGEST_FILE = 10**6
 
 
 class ConfigError(ValueError):
@@ -65,8 +73,8 @@ class RunConfig(BaseModel):
     device: str
     precision: Literal["auto", "fp32", "bf16"]
     graphs: bool
-    threads: Annotated[int, Field(ge=1)] | None
-    cores: Annotated[int, Field(ge=1)] | None
+    threads: Annotated[int, Field(ge=1, le=1024)] | None
+    cores: Annotated[int, Field(ge=1, le=1024)] | None
     progress: bool
     maze: MazeSettings
     distributions: dict[str, DistributionSettings]
@@ -119,13 +127,62 @@ class RunConfig(BaseModel):
                 f"solver.channels={solver.channels} must be multiples of solver.groups="
                 f"{solver.groups}"
             )
+        if proposer.probe_levels > proposer.validation_levels:
+            raise ValueError(
+                f"proposer.probe_levels={proposer.probe_levels} must be at most "
+                f"proposer.validation_levels={proposer.validation_levels}: the Proposer is shown "
+                "no more than it is paid for"
+            )
+        longest = max(length for _, length in self.distributions[self.target].specifications)
+        if longest > self.maze.max_steps:
+            raise ValueError(
+                f"maze.max_steps={self.maze.max_steps} must be at least {longest}, the path length "
+                f"of distributions.{self.target}, which is the target"
+            )
         smallest = min(self.maze.height, self.maze.width) >> (len(solver.channels) - 1)
         if smallest < 1:
             raise ValueError(
                 f"solver.channels={solver.channels} halve a {self.maze.height}x{self.maze.width} "
                 "maze to nothing; give fewer channels or a larger maze"
             )
+        for halvings, width in enumerate(solver.channels):
+            cells = (self.maze.height >> halvings) * (self.maze.width >> halvings)
+            if cells * width == solver.groups:
+                raise ValueError(
+                    f"solver.channels={solver.channels} leave a group of {width} channels with a "
+                    f"single number on a {self.maze.height}x{self.maze.width} maze: give more "
+                    f"channels, a larger maze or fewer than solver.groups={solver.groups}"
+                )
+        if self.maze.height * self.maze.width > LARGEST_GRID:
+            raise ValueError(
+                f"maze.height={self.maze.height}, maze.width={self.maze.width}: must be at most "
+                f"{LARGEST_GRID:,} cells together"
+            )
+        self._check_levels()
         return self
+
+    def _check_levels(self) -> None:
+        """Refuse levels that cannot be made, naming the key that asks for them."""
+        grid = (self.maze.height, self.maze.width)
+        space = self.space
+        makers: dict[str, Callable[[], object]] = {
+            f"distributions.{name}": partial(
+                LevelDistribution, wanted.specifications, wanted.mechanism, *grid
+            )
+            for name, wanted in self.distributions.items()
+        }
+        makers["space"] = partial(
+            SpecificationSpace,
+            space.obstacle_fractions,
+            space.path_lengths,
+            space.mechanism,
+            *grid,
+        )
+        for key, make in makers.items():
+            try:
+                make()
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from error
 
 
 def read_config(config: DictConfig) -> RunConfig:
@@ -137,12 +194,19 @@ def read_config(config: DictConfig) -> RunConfig:
     if config.method is None or config.curriculum is None:
         names = ", ".join(methods())
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {names}")
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    assert isinstance(values, dict)
+    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    for key, value in _leaves(values):
+        if isinstance(value, int | float) and abs(value) > LARGEST:
+            raise ConfigError(f"{key}={value!r}: must be finite and at most {LARGEST:,} in size")
     try:
-        return RunConfig.model_validate(values)
+        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
+        return RunConfig.model_validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        raise ConfigError(_first_line(error)) from error
+        raise ConfigError(_first_line(error, values)) from error
+    except TypeError as error:
+        raise ConfigError(
+            f"a value that is neither text, number, list nor mapping: {error}"
+        ) from error
 
 
 def saved_config(folder: Path) -> RunConfig:
@@ -160,18 +224,34 @@ def saved_config(folder: Path) -> RunConfig:
         "progress": False,
         "logger": {"type": "csv"},
     }
+    if not file.is_file():
+        raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
+    values = stored_config(file)
     try:
-        values = json.loads(file.read_text())
         values["schedule"]["updates"] = 1
-        return RunConfig.model_validate({**values, **free})
-    except OSError as error:
-        raise ConfigError(
-            f"{folder}: is no run's folder: it has no readable config.json"
-        ) from error
+        return RunConfig.model_validate_json(json.dumps({**values, **free}), strict=True)
     except ValidationError as error:
-        raise ConfigError(f"{file}: {_first_line(error)}") from error
+        raise ConfigError(f"{file}: {_first_line(error, values)}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run") from error
+
+
+def stored_config(file: Path) -> Any:
+    """The settings in a run's folder, as they stand there: nothing that they name is made.
+
+    Args:
+        file: the folder's ``config.json``.
+
+    Raises:
+        ConfigError: if it is no JSON, or far too large to be settings.
+        StorageError: if it cannot be read.
+    """
+    with storage(file, "read"), open(file, "rb") as opened:
+        content = opened.read(LARGEST_FILE + 1)
+    try:
+        return json.loads(content[:LARGEST_FILE])
+    except (ValueError, RecursionError):
+        raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
 
 
 def check_order(overrides: Sequence[str]) -> None:
@@ -193,14 +273,30 @@ def methods() -> list[str]:
     return sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
 
 
-def _first_line(error: ValidationError) -> str:
-    details: Mapping[str, Any] = error.errors()[0]
-    key = ".".join(str(part) for part in details["loc"])
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value that is no mapping or list, with its dotted key."""
+    if isinstance(value, dict | list):
+        for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves(inner, f"{key}.{part}" if key else str(part))
+    else:
+        yield key, value
+
+
+def _first_line(error: ValidationError, values: Mapping[str, Any]) -> str:
+    details = error.errors()[0]
+    *folder, last = details["loc"] or [""]
+    key = ".".join(map(str, details["loc"]))
     message = details["msg"].removeprefix("Value error, ")
     if not key:
         return message
-    if details["type"] == "extra_forbidden":
-        return f"{key}: there is no such key"
+    if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        siblings: Any = values
+        for part in folder:
+            siblings = siblings[part]
+        known = ", ".join(sorted(map(str, siblings.keys() - {last})))
+        return f"{key}: there is no such key; there are: {known}"
     if details["type"] == "missing":
         return f"{key}: missing"
-    return f"{key}={details['input']!r}: {message[0].lower()}{message[1:]}"
+    given = repr(details["input"])
+    given = given if len(given) <= 80 else f"{given[:77]}..."
+    return f"{key}={given}: {message[0].lower()}{message[1:]}"

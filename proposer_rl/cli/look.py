@@ -39,7 +39,7 @@ def main() -> None:
     arguments = _parser().parse_args()
     try:
         rows = look(arguments.proposer, arguments.solvers, arguments.seed)
-    except (ConfigError, CheckpointError, ValueError) as error:
+    except (ConfigError, CheckpointError, ValueError, OSError) as error:
         refuse(str(error))
     _print(rows)
     if arguments.output is not None:

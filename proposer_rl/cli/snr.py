@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from signal import SIGINT
 from typing import Any, NoReturn
 
 import torch
@@ -20,7 +21,8 @@ from tqdm import tqdm
 
 from proposer_rl.checkpoint import CheckpointError, load_checkpoint
 from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
-from proposer_rl.cli.train import BAD_INPUT, INTERRUPTED, make_task
+from proposer_rl.cli.errors import BAD_INPUT, SIGNALLED
+from proposer_rl.cli.train import make_task
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
 from proposer_rl.rewards import performance_gain
@@ -38,10 +40,10 @@ def main() -> None:
     arguments = _parser().parse_args()
     try:
         rows = measure(arguments)
-    except (ConfigError, CheckpointError, ValueError) as error:
+    except (ConfigError, CheckpointError, ValueError, OSError) as error:
         refuse(str(error))
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        sys.exit(SIGNALLED + SIGINT)
     _print(rows)
     if arguments.output is not None:
         write_atomically(arguments.output, (json.dumps(rows, indent=1) + "\n").encode())

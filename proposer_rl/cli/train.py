@@ -9,50 +9,56 @@ import shlex
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from signal import SIGINT
+from typing import Any
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from tqdm import tqdm
 
 from proposer_rl.capture import use
-from proposer_rl.checkpoint import CheckpointError
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
+from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, refuse
 from proposer_rl.cli.loggers import make_log
+from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
+from proposer_rl.finite import DivergedError
+from proposer_rl.lock import locked
 from proposer_rl.machine import processor
 from proposer_rl.methods import Parts
+from proposer_rl.ppo import PPO
 from proposer_rl.report.levels import draw_run
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.terminal import screen
 from proposer_rl.run_folder import RunFolder
+from proposer_rl.signals import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask, faster_precision
 
-INPUT_ERRORS = (ConfigError, CheckpointError)
-BAD_INPUT = 2
-INTERRUPTED = 130
-
 
 def main() -> None:
-    """Entry point: exit code 0 after a run, 2 for bad input, 130 when interrupted."""
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     # Hydra then lets its errors through, so that they can be told in one line.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
+        _refuse_pickles(sys.argv)
         _main()
-    except (*INPUT_ERRORS, HydraException, OmegaConfBaseException) as error:
-        _refuse(error)
+    except FORESEEN as error:
+        refuse(error)
+    except ValueError as error:
+        if HydraConfig.initialized():
+            raise
+        refuse(ConfigError(str(error)))  # Hydra's, of an override such as +method=3
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        sys.exit(SIGNALLED + SIGINT)
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
@@ -62,48 +68,67 @@ def _main(hydra_config: DictConfig) -> float:
         forget_failure(path)
         check_order(HydraConfig.get().overrides.task)
         config = read_config(hydra_config)
-        experiment = build(config, path)
-        return run(experiment, config)
+        made = parts(config)  # whatever is wrong with the input is found here
+        with locked(path), StopSignals() as signals:
+            folder = RunFolder(path)
+            # What `auto` has become, so that a run does not go on in another precision elsewhere.
+            check_same_run(folder, config.model_copy(update={"precision": made[0].precision}))
+            return run(build(config, *made, folder, signals), config)
     except Exception as error:
-        foreseen = isinstance(error, INPUT_ERRORS)
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return record_failure(path, error, _one_line(error), BAD_INPUT if foreseen else 1)
-        if foreseen:
-            _refuse(error)
+            return record_failure(path, error, one_line(error), exit_code(error))
+        if isinstance(error, FORESEEN):
+            refuse(error)
         raise
 
 
-def _refuse(error: Exception) -> NoReturn:
-    """Say in one line what is wrong with the input, and exit."""
-    if isinstance(error, MissingConfigException) and error.options:
-        message = f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
-    else:
-        message = _one_line(error)
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(BAD_INPUT)
+def _refuse_pickles(arguments: list[str]) -> None:
+    """Hydra's --experimental-rerun reads a pickle, which can run whatever it likes."""
+    if any(argument.startswith("--experimental-rerun") for argument in arguments):
+        raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
 
 
-def build(config: RunConfig, path: Path) -> Experiment:
+def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
+    """Task, Solver and curriculum of an experiment; nothing is written yet.
+
+    Raises:
+        ConfigError: if settings that are each valid do not go together.
+    """
+    try:
+        task = make_task(config)
+        solver = task.solvers([Streams(seed, "solver") for seed in config.seeds])
+        return task, solver, _curriculum(config, task)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "allocate" not in str(error):
+            raise
+        raise ConfigError(f"the run does not fit in memory: {one_line(error)}") from error
+
+
+def build(
+    config: RunConfig,
+    task: MazeTask,
+    solver: PPO,
+    curriculum: Curriculum,
+    folder: RunFolder,
+    signals: StopSignals | None = None,
+) -> Experiment:
     """Put an experiment together.
 
     Args:
         config: the run's settings.
-        path: the run's folder.
+        task: as :func:`parts` makes it.
+        solver: as :func:`parts` makes it.
+        curriculum: as :func:`parts` makes it.
+        folder: the run's.
+        signals: which may ask the run to stop.
 
     Raises:
-        ConfigError: if settings that are each valid do not make an experiment.
+        ConfigError: if the logger's package is missing.
     """
-    try:
-        task = make_task(config)
-        curriculum = _curriculum(config, task)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-    # What `auto` has become, so that a run does not go on in another precision elsewhere.
-    config = config.model_copy(update={"precision": task.precision})
-    folder = RunFolder(path)
-    _check_same_run(folder, config)
     return Experiment(
-        task.solvers([Streams(seed, "solver") for seed in config.seeds]),
+        solver,
         curriculum,
         schedule=config.schedule,
         seeds=config.seeds,
@@ -111,8 +136,9 @@ def build(config: RunConfig, path: Path) -> Experiment:
         evaluate=task.measure,
         statistics=task.statistics,
         records=task.records,
-        log=make_log(config.logger, path, _name(config)),
+        log=make_log(config.logger, folder.path, _name(config)),
         progress=config.progress,
+        signals=signals,
     )
 
 
@@ -159,10 +185,19 @@ def run(experiment: Experiment, config: RunConfig) -> float:
     folder.write_json("run.json", {**identity, "planned_updates": config.schedule.updates})
     try:
         result = experiment.run()
+    except Interrupted as stop:
+        tqdm.write(f"{one_line(stop).capitalize()}; all is saved. {_how_to_go_on(folder)}")
+        sys.exit(SIGNALLED + stop.signum)
     except KeyboardInterrupt:
-        again = shlex.join([*HydraConfig.get().overrides.task, f"hydra.run.dir={folder.path}"])
-        tqdm.write(f"Interrupted. To go on from the last checkpoint: bin/train {again}")
+        tqdm.write(
+            f"Stopped at once; what came after the last checkpoint is lost. {_how_to_go_on(folder)}"
+        )
         raise
+    except DivergedError as error:
+        kept = folder.path / "checkpoints"
+        raise DivergedError(
+            f"{error}; the last checkpoints before it are kept in {kept}"
+        ) from error
     folder.write_json("summary.json", {**identity, **result})
     picture = draw_run(folder.path, title=_name(config))
     if HydraConfig.get().mode != RunMode.MULTIRUN:
@@ -191,6 +226,11 @@ def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
     file = folder / "summary.json"
     summary: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"updates": 0}
     return summary if summary["updates"] >= config.schedule.updates else None
+
+
+def _how_to_go_on(folder: RunFolder) -> str:
+    again = shlex.join([*HydraConfig.get().overrides.task, f"hydra.run.dir={folder.path}"])
+    return f"To go on: bin/train {again}"
 
 
 class EpisodeBar:
@@ -229,9 +269,12 @@ def _curriculum(config: RunConfig, task: MazeTask) -> Curriculum:
     parts = Parts(task, config.proposer, config.seeds[0], bar)
     try:
         factory = instantiate(config.curriculum, _partial_=True)
-        curriculum: Curriculum = factory(parts)
-    except TypeError as error:
-        raise ConfigError(f"curriculum: {_one_line(error)}") from error
+        curriculum = factory(parts)
+    except (TypeError, ValueError, HydraException) as error:
+        raise ConfigError(f"curriculum: {one_line(error)}") from error
+    if not isinstance(curriculum, Curriculum):
+        kind = type(curriculum).__name__
+        raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
     most = curriculum.most_solvers
     if most is not None and len(config.seeds) > most:
         raise ConfigError(
@@ -245,43 +288,14 @@ def _device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        return torch.empty(0, device=name).device
+        probe = torch.ones(1, device=name)
+        probe.item()  # the device "meta" computes nothing
+        return probe.device
     except (RuntimeError, AssertionError) as error:
-        reason = _one_line(error)
+        reason = one_line(error)[:120]
         raise ConfigError(
             f"device={name!r}: must be auto, cpu or a usable one: {reason}"
         ) from error
-
-
-def _check_same_run(folder: RunFolder, config: RunConfig) -> None:
-    """Refuse to go on with a run that was started with other settings."""
-    # What may differ: where and how it is computed and shown, and a longer schedule.
-    free = {"device", "graphs", "threads", "cores", "progress", "logger"}
-    now = config.model_dump(mode="json", exclude=free)
-    now["schedule"].pop("updates")
-    file = folder.path / "config.json"
-    if file.exists():
-        before = json.loads(file.read_text())
-        differing = sorted(_different(before, now))
-        if differing:
-            key = differing[0]
-            raise ConfigError(
-                f"{key}: the run in {folder.path} was started with another value; "
-                f"differing keys: {', '.join(differing)}"
-            )
-    else:
-        folder.write_json(file.name, now)
-
-
-def _different(before: Any, now: Any, prefix: str = "") -> list[str]:
-    if not (isinstance(before, dict) and isinstance(now, dict)):
-        return [] if before == now else [prefix.rstrip(".")]
-    keys = before.keys() | now.keys()
-    return [
-        name
-        for key in keys
-        for name in _different(before.get(key), now.get(key), f"{prefix}{key}.")
-    ]
 
 
 def _identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
@@ -320,11 +334,6 @@ def _cost_text(result: dict[str, Any], seeds: int) -> str:
         f"Cost: {result['frames']:,} frames of the Solver{together}, "
         f"{result['meta_frames']:,} of its copies, {result['seconds']:.0f} s."
     )
-
-
-def _one_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines()]
-    return " ".join(line for line in lines if line)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -61,8 +61,17 @@ class Curriculum:
     def observe(self, levels: Any, rollout: TensorDictBase) -> None:
         """Learn from an update: its levels [K, P] and the Solver's transitions [K, P, T]."""
 
-    def improve(self, solver: PPO, streams: Sequence[Streams]) -> Improvement:
-        """Prepare for the next cycle, whose first update has not begun."""
+    def improve(
+        self, solver: PPO, streams: Sequence[Streams], pause: Callable[[], None] | None = None
+    ) -> Improvement:
+        """Prepare for the next cycle, whose first update has not begun.
+
+        Args:
+            solver: as it is before the cycle.
+            streams: of the cycle.
+            pause: to be called now and then by a curriculum that takes long: wherever a repeated
+                call, after :meth:`load_state_dict`, would go on from :meth:`state_dict`.
+        """
         return Improvement()
 
     def state_dict(self) -> dict[str, Any]:

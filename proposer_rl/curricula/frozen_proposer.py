@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -59,7 +59,9 @@ class FrozenProposer(Curriculum):
         self._updates = 0  # of this cycle
         self._action: Tensor | None = None
 
-    def improve(self, solver: PPO, streams: Sequence[Streams]) -> Improvement:
+    def improve(
+        self, solver: PPO, streams: Sequence[Streams], pause: Callable[[], None] | None = None
+    ) -> Improvement:
         """Look at the Solver through new levels."""
         (stream,) = streams
         self.view.draw_levels(stream)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -11,7 +12,8 @@ from torch import Tensor
 
 from proposer_rl.curricula.base import Advance, Improvement
 from proposer_rl.curricula.frozen_proposer import FrozenProposer
-from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.finite import located
+from proposer_rl.meta_env import ReplayError, SolverTrainingEnv
 from proposer_rl.ppo import PPO, Update
 from proposer_rl.streams import Streams
 
@@ -67,20 +69,19 @@ class ProposerCurriculum(FrozenProposer):
         self.env = env
         self.advance = advance
         self._table = table or (lambda counts: counts)
+        self._begun: dict[str, Any] | None = None
 
-    def improve(self, solver: PPO, streams: Sequence[Streams]) -> Improvement:
+    def improve(
+        self, solver: PPO, streams: Sequence[Streams], pause: Callable[[], None] | None = None
+    ) -> Improvement:
         """Roll K copies of the Solver out and train the Proposer on their gains."""
         (stream,) = streams
         env = self.env
-        env.fork(solver.snapshot()[0], stream)
         self._updates = 0
-        rollout = self.proposer.collect(
-            [
-                stream.generator("proposals", copy, device=env.device)
-                for copy in range(env.batch_size[0])
-            ]
-        )
-        training = self.proposer.optimise(rollout)
+        rollout = self._roll_out(solver, stream, pause)
+        with located("the Proposer"):
+            training = self.proposer.optimise(rollout)
+            self.proposer.check()
         gains = total_gain(rollout)
         inner = env.solvers
         frames = inner.env.batch_size.numel() * inner.settings.horizon * env.episode_length
@@ -88,13 +89,43 @@ class ProposerCurriculum(FrozenProposer):
         return Improvement(self._metrics(rollout, gains, training), frames, advance)
 
     def state_dict(self) -> dict[str, Any]:
-        """That of the cycle, with the Proposer's weights and optimiser."""
-        return {**super().state_dict(), "proposer": self.proposer.snapshot().to_dict()}
+        """That of the cycle, with the Proposer's weights and optimiser, and a begun episode."""
+        return {
+            **super().state_dict(),
+            "proposer": self.proposer.snapshot().to_dict(),
+            "episode": self.env.episode(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put the Proposer and the cycle back."""
         super().load_state_dict(state)
         self.proposer.restore(TensorDict(state["proposer"], batch_size=[]))
+        self._begun = state["episode"]
+
+    def _roll_out(
+        self, solver: PPO, stream: Streams, pause: Callable[[], None] | None
+    ) -> TensorDictBase:
+        """One episode of the copies, from its beginning or from where it was interrupted."""
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            with suppress(ReplayError):
+                return self._play(solver, stream, pause, begun)
+        return self._play(solver, stream, pause)
+
+    def _play(
+        self,
+        solver: PPO,
+        stream: Streams,
+        pause: Callable[[], None] | None,
+        begun: dict[str, Any] | None = None,
+    ) -> TensorDictBase:
+        self.env.fork(solver.snapshot()[0], stream, pause)
+        if begun is not None:
+            self.env.resume(begun)
+        copies = range(self.env.batch_size[0])
+        return self.proposer.collect(
+            [stream.generator("proposals", copy, device=self.env.device) for copy in copies]
+        )
 
     def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":

@@ -1,0 +1,64 @@
+"""Whether the run in a folder is the one that is asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
+from proposer_rl.run_folder import RunFolder
+
+# What may differ: where and how it is computed, saved and shown, and a longer schedule.
+FREE = {"device", "graphs", "threads", "cores", "progress", "logger"}
+FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
+
+
+def check_same_run(folder: RunFolder, config: RunConfig) -> None:
+    """Refuse to go on with a run that was started with other settings.
+
+    The stored configuration is compared with the present one and used for nothing else.
+
+    Args:
+        folder: the run's; its ``config.json`` is written if there is none.
+        config: the settings that are asked for.
+
+    Raises:
+        ConfigError: naming the settings that differ, or what the folder holds instead of a run.
+        StorageError: if the file cannot be read or written.
+    """
+    now = config.model_dump(mode="json", exclude=FREE)
+    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
+    file = folder.path / "config.json"
+    if not file.exists():
+        # Tables here are no run's of ours, and a run begins by removing what is left of one.
+        foreign = sorted([*folder.lengths(), *(p.name for p in folder.path.glob("checkpoints"))])
+        if foreign:
+            raise ConfigError(
+                f"hydra.run.dir={folder.path}: holds {foreign[0]} but no config.json, so it is no "
+                "run's folder; give another"
+            )
+        folder.write_json(file.name, now)
+        return
+    before = stored_config(file)
+    differing = _different(before, now)
+    if differing:
+        key, (old, new) = next(iter(differing.items()))
+        raise ConfigError(
+            f"{key}={_short(new)}: the run in {folder.path} was started with {_short(old)}; "
+            f"differing keys: {', '.join(differing)}"
+        )
+
+
+def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
+    """Both values of every key that differs, by its dotted name."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return {} if before == now else {prefix.rstrip("."): (before, now)}
+    return {
+        name: values
+        for key in sorted(before.keys() | now.keys())
+        for name, values in _different(before.get(key), now.get(key), f"{prefix}{key}.").items()
+    }
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,65 @@
+"""Numbers that went wrong: found in the update in which they arise, and named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+# What a gradient step leaves behind, in the order in which it arises.
+SCALARS = ("loss_objective", "loss_entropy", "loss_critic", "grad_norm")
+
+
+class DivergedError(ArithmeticError):
+    """A number is not finite; the message is one line that says which, and in which copy."""
+
+
+def require_finite(
+    reward: Tensor, steps: TensorDictBase, weights: Mapping[str, Tensor], copies: int | None
+) -> None:
+    """Check one update; costs one number read from the device unless something is wrong.
+
+    Args:
+        reward: of the rollout, [B, ...], B the first dimension of the environment.
+        steps: of S gradient steps, [S], the losses and gradient norms of each copy, [S, K], or
+            without copies [S].
+        weights: after the update, by name, [K, ...] with copies.
+        copies: K, or None for a single network.
+
+    Raises:
+        DivergedError: naming what was not finite first, and the copies that it happened in. The
+            others are as they would be without it: nothing is shared between copies.
+    """
+    scalars = [steps[name] for name in SCALARS]
+    # A sum of magnitudes is finite only if all of them are.
+    sums = nn.utils.get_total_norm([reward, *scalars, *weights.values()], norm_type=1.0)
+    if bool(sums.isfinite()):
+        return
+    _refuse("reward", reward, len(reward))
+    for i in range(len(steps)):
+        for name in SCALARS:
+            _refuse(f"{name} of gradient step {i}", steps[name][i], copies)
+    for name, weight in weights.items():
+        _refuse(f"weight {name}", weight, copies)
+
+
+@contextmanager
+def located(place: str) -> Iterator[None]:
+    """Says in a :class:`DivergedError` from inside where in the run that was."""
+    try:
+        yield
+    except DivergedError as error:
+        raise DivergedError(f"{place}: {error}") from error
+
+
+def _refuse(name: str, tensor: Tensor, copies: int | None) -> None:
+    finite = tensor.detach().isfinite().reshape(copies or 1, -1)
+    if bool(finite.all()):
+        return
+    worst = float(tensor.detach().reshape(-1)[~finite.reshape(-1)][0])
+    which = torch.nonzero(~finite.all(1)).flatten().tolist()
+    named = "" if copies is None else f"copy {', '.join(map(str, which))}: "
+    raise DivergedError(f"{named}{name} is not finite ({worst})")

@@ -1,0 +1,197 @@
+"""The command in processes of its own, cheaply: one process imports everything, then forks.
+
+Run as a program, this file is that process. It reads one request per line, forks a child that calls
+the command, and answers with how the child ended. It must not compute anything with torch itself,
+since threads do not survive a fork.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from signal import SIGKILL
+from threading import RLock
+from typing import Any
+
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[1]
+CAPABILITIES_VERSION = 0x20080522  # capget(2)
+CAP_DAC_OVERRIDE = 1
+
+
+@dataclass
+class Ended:
+    """How a child ended: its exit code, or minus the signal's number; what it said and did.
+
+    ``writes`` names its calls of fsync and replace in order, such as ``"fsync metrics.csv"``.
+    """
+
+    code: int
+    seconds: float
+    output: str
+    writes: list[str]
+
+
+@dataclass
+class Request:
+    """What the child is to do, and what is done to it.
+
+    Attributes:
+        arguments: of the command.
+        signals: (seconds after the start, signal).
+        signal_at: {index of a write: signal}: before that write the child sends itself a signal. If
+            it is SIGKILL and the write is the fsync of a new checkpoint, half of that is there.
+        largest_file: bytes; RLIMIT_FSIZE.
+        as_anyone: give up root's right to write where permissions forbid it.
+        folder: where the child works.
+    """
+
+    arguments: list[str]
+    signals: list[tuple[float, int]] = field(default_factory=list)
+    signal_at: dict[int, int] = field(default_factory=dict)
+    largest_file: int | None = None
+    as_anyone: bool = False
+    folder: str = "."
+
+
+class Processes:
+    """Starts children of a process that has everything imported."""
+
+    def __init__(self, folder: Path) -> None:
+        self._log = folder / "output"
+        self._server = subprocess.Popen(
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        )
+
+    def __call__(self, *arguments: str, **options: Any) -> Ended:
+        """Call the command and wait for its end."""
+        return self.end(self.start(*arguments, **options))
+
+    def start(self, *arguments: str, **options: Any) -> None:
+        """Call the command; :meth:`end` waits for it."""
+        assert self._server.stdin is not None
+        self._server.stdin.write(json.dumps(vars(Request(list(arguments), **options))) + "\n")
+        self._server.stdin.flush()
+
+    def end(self, _: None = None) -> Ended:
+        """Wait for the child that was started."""
+        assert self._server.stdout is not None
+        line = self._server.stdout.readline()
+        assert line, "the process that forks has died"
+        return Ended(**json.loads(line))
+
+    def close(self) -> None:
+        """End the process that forks."""
+        assert self._server.stdin is not None
+        self._server.stdin.close()
+        self._server.wait()
+
+
+def serve() -> None:
+    from proposer_rl.cli import train
+
+    for line in sys.stdin:
+        values = json.loads(line)
+        values["signal_at"] = {int(k): v for k, v in values["signal_at"].items()}
+        request = Request(**values)
+        print(json.dumps(vars(_fork(request, train.main))), flush=True)
+
+
+def _fork(request: Request, main: Any) -> Ended:
+    said, counted = os.memfd_create("output"), os.memfd_create("writes")
+    started = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        _become_child(request, main, said, counted)
+    for delay, signum in request.signals:
+        while time.monotonic() - started < delay and not _has_ended(child):
+            time.sleep(0.001)
+        if not _has_ended(child):
+            os.kill(child, signum)
+    _, status = os.waitpid(child, 0)
+    seconds = time.monotonic() - started
+    writes = os.pread(counted, 1 << 20, 0).decode().splitlines()
+    output = os.pread(said, 1 << 20, 0).decode()
+    os.close(said)
+    os.close(counted)
+    return Ended(os.waitstatus_to_exitcode(status), seconds, output, writes)
+
+
+def _has_ended(child: int) -> bool:
+    """Whether the child waits to be waited for; it stays so that its number is not used again."""
+    return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+
+def _become_child(request: Request, main: Any, said: int, counted: int) -> None:
+    code = 1
+    try:
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        os.chdir(request.folder)
+        _note_writes(request.signal_at, counted)
+        if request.largest_file is not None:
+            limit = (request.largest_file, request.largest_file)
+            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        if request.as_anyone:
+            _give_up_override()
+        tqdm.set_lock(RLock())  # its own would be shared with other processes
+        sys.argv = ["proposer-train", *request.arguments]
+        main()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _note_writes(signal_at: dict[int, int], noted: int) -> None:
+    """Write a line to ``noted`` for every fsync and replace, and signal at some of them."""
+    originals = {name: getattr(os, name) for name in ("fsync", "replace")}
+    indices = count()
+
+    def call(name: str, file: Any, *arguments: Any) -> Any:
+        path = os.readlink(f"/proc/self/fd/{file}") if name == "fsync" else str(file)
+        os.write(noted, f"{name} {Path(path).name}\n".encode())
+        signum = signal_at.get(next(indices))
+        if signum is not None:
+            if signum == SIGKILL and name == "fsync" and Path(path).name.startswith(".step_"):
+                os.ftruncate(file, os.fstat(file).st_size // 2)
+            os.kill(os.getpid(), signum)
+        return originals[name](file, *arguments)
+
+    for name in originals:
+        setattr(os, name, lambda *arguments, name=name: call(name, *arguments))
+
+
+def _give_up_override() -> None:
+    """Let permissions count for root too: no CAP_DAC_OVERRIDE in the effective set."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(CAPABILITIES_VERSION, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; low words, then high
+    assert libc.capget(header, sets) == 0
+    sets[0] &= ~(1 << CAP_DAC_OVERRIDE)
+    assert libc.capset(header, sets) == 0
+
+
+if __name__ == "__main__":
+    serve()

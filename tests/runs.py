@@ -1,0 +1,47 @@
+"""What two runs' folders have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from proposer_rl.checkpoint import load_latest
+from proposer_rl.run_folder import read_csv
+
+
+def tables(folder: Path) -> dict[str, Any]:
+    """All that a run measured, without wall-clock times."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.glob("*.csv")):
+        # repr tells -0.0 from 0.0 and nan from nothing: the same text is the same bytes.
+        found[path.name] = [repr({**row, "seconds": 0}) for row in read_csv(path)]
+    for path in sorted(folder.glob("*.jsonl")):
+        found[path.name] = path.read_bytes()
+    return found
+
+
+def trained(folder: Path) -> dict[str, torch.Tensor]:
+    """Every tensor of the newest checkpoint, by its place: weights and Adam's state of all."""
+    latest = load_latest(folder / "checkpoints")
+    assert latest is not None
+    state = latest[1]
+    return dict(_leaves({"solver": state["solver"], "curriculum": state["curriculum"]}))
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    assert tables(one) == tables(other)
+    first, second = trained(one), trained(other)
+    assert first.keys() == second.keys()
+    assert all(_bits(first[name]) == _bits(second[name]) for name in first)
+
+
+def _leaves(value: Any, place: str = "") -> list[tuple[str, torch.Tensor]]:
+    if isinstance(value, dict):
+        return [leaf for key, inner in value.items() for leaf in _leaves(inner, f"{place}/{key}")]
+    return [(place, value)] if isinstance(value, torch.Tensor) else []
+
+
+def _bits(tensor: torch.Tensor) -> bytes:
+    return tensor.contiguous().numpy().tobytes()

@@ -1,0 +1,389 @@
+"""Wrong input: one line that names key, value and what is allowed, and nothing written."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hypothesis import HealthCheck, given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from proposer_rl.checkpoint import load_latest, save_checkpoint
+from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
+from proposer_rl.cli.errors import FORESEEN
+from proposer_rl.cli.same_run import check_same_run
+from proposer_rl.cli.train import build, parts
+from proposer_rl.finite import DivergedError
+from proposer_rl.run_folder import RunFolder
+from proposer_rl.signals import Interrupted, StopSignals
+from tests.runs import assert_same_run
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+SMOKE = ["+scale=smoke", "progress=false"]
+
+# Changes to +method=target, and what the line must say.
+WRONG = [
+    # types
+    ("seed=many", "seed='many': input should be a valid integer"),
+    ("seed='3'", "seed='3': input should be a valid integer"),
+    ("seed=1.5", "seed=1.5: input should be a valid integer"),
+    ("seed=true", "seed=True: input should be a valid integer"),
+    ("seed=null", "seed=None: input should be a valid integer"),
+    ("seed=[1]", "seed=[1]: input should be a valid integer"),
+    ("seed=", "seed='': input should be a valid integer"),
+    ("progress=3", "progress=3: input should be a valid boolean"),
+    ("progress=maybe", "progress='maybe': input should be a valid boolean"),
+    ("target=[id]", "target=['id']: input should be a valid string"),
+    ("solver.ppo.epochs=many", "solver.ppo.epochs='many': input should be a valid integer"),
+    ("solver.ppo.epochs=1.0", "solver.ppo.epochs=1.0: input should be a valid integer"),
+    ("solver.ppo.learning_rate=fast", "learning_rate='fast': input should be a valid number"),
+    ("solver.channels=8", "solver.channels=8: input should be a valid array"),
+    ("solver.channels=[8,x]", "solver.channels.1='x': input should be a valid integer"),
+    ("solver=8", "node `solver` is not a container"),
+    ("maze.observe_agent=1", "maze.observe_agent=1: input should be a valid boolean"),
+    ("distributions.id=null", "distributions.id=None: input should be an object"),
+    ("curriculum=5", "curriculum=5: input should be an object"),
+    ("schedule.checkpoint_seconds=soon", "schedule.checkpoint_seconds='soon': input should be"),
+    # ranges
+    ("seed=-1", "seed=-1: input should be greater than or equal to 0"),
+    ("seed=1e30", "seed=1e+30: must be finite and at most 1,000,000,000 in size"),
+    ("solver.problems=0", "solver.problems=0: input should be greater than or equal to 1"),
+    ("solver.problems=-4", "solver.problems=-4: input should be greater than or equal to 1"),
+    ("solver.ppo.learning_rate=-1", "learning_rate=-1: input should be greater than 0"),
+    ("solver.ppo.learning_rate=0", "learning_rate=0: input should be greater than 0"),
+    ("solver.ppo.learning_rate=nan", "learning_rate=nan: input should be a finite number"),
+    ("solver.ppo.learning_rate=inf", "learning_rate=inf: must be finite and at most 1,000"),
+    ("solver.ppo.gamma=1.1", "solver.ppo.gamma=1.1: input should be less than or equal to 1"),
+    ("solver.ppo.lmbda=-0.1", "solver.ppo.lmbda=-0.1: input should be greater than or equal to 0"),
+    ("solver.ppo.clip_epsilon=1", "solver.ppo.clip_epsilon=1: input should be less than 1"),
+    ("solver.ppo.clip_epsilon=0", "solver.ppo.clip_epsilon=0: input should be greater than 0"),
+    ("solver.ppo.entropy_coeff=-1", "entropy_coeff=-1: input should be greater than or equal to 0"),
+    ("solver.ppo.max_grad_norm=0", "max_grad_norm=0: input should be greater than 0"),
+    ("solver.ppo.epochs=0", "solver.ppo.epochs=0: input should be greater than or equal to 1"),
+    ("solver.ppo.horizon=0", "solver.ppo.horizon=0: input should be greater than or equal to 1"),
+    ("solver.channels=[]", "solver.channels=[]: list should have at least 1 item"),
+    ("solver.channels=[8,0]", "solver.channels.1=0: input should be greater than or equal to 1"),
+    ("solver.groups=0", "solver.groups=0: input should be greater than or equal to 1"),
+    ("maze.height=0", "maze.height=0: input should be greater than or equal to 1"),
+    ("maze.max_steps=0", "maze.max_steps=0: input should be greater than or equal to 1"),
+    ("maze.step_penalty=-1", "maze.step_penalty=-1: input should be greater than or equal to 0"),
+    ("schedule.updates=0", "schedule.updates=0: input should be greater than or equal to 1"),
+    ("schedule.threshold=1.5", "schedule.threshold=1.5: input should be less than or equal to 1"),
+    ("schedule.evaluate_every=0", "evaluate_every=0: input should be greater than or equal to 1"),
+    ("schedule.checkpoint_every=0", "checkpoint_every=0: input should be greater than or equal"),
+    ("schedule.checkpoint_seconds=0", "checkpoint_seconds=0: input should be greater than 0"),
+    ("schedule.keep_checkpoints=0", "keep_checkpoints=0: input should be greater than or equal"),
+    ("proposer.rollouts=0", "proposer.rollouts=0: input should be greater than or equal to 1"),
+    ("proposer.probe_levels=-1", "probe_levels=-1: input should be greater than or equal to 0"),
+    ("threads=0", "threads=0: input should be greater than or equal to 1"),
+    ("cores=0", "cores=0: input should be greater than or equal to 1"),
+    ("evaluation.levels=0", "evaluation.levels=0: input should be greater than or equal to 1"),
+    ("hand_made_until=[0]", "hand_made_until.0=0: input should be greater than or equal to 1"),
+    ("distributions.id.specifications=[]", "specifications=[]: list should have at least 1 item"),
+    ("distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
+    ("distributions.id.specifications=[[1,4]]", "specifications.0.0=1: input should be less than"),
+    ("distributions.id.specifications=[[0.4,0]]", "specifications.0.1=0: input should be greater"),
+    ("maze={height:10000,width:10000}", "maze.height=10000, maze.width=10000: must be at most 1,0"),
+    ("solver={channels:[1000000],groups:1}", "the run does not fit in memory: "),
+    # one of a few
+    ("threads=5000", "threads=5000: input should be less than or equal to 1024"),
+    ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),
+    ("device=abacus", "device='abacus': must be auto, cpu or a usable one"),
+    ("device=''", "device='': must be auto, cpu or a usable one"),
+    ("device=meta", "device='meta': must be auto, cpu or a usable one"),
+    ("logger=paper", "logger/paper: unknown; choose one of: csv, tensorboard, wandb"),
+    ("logger.type=paper", "logger.type='paper': input should be 'csv', 'tensorboard' or 'wandb'"),
+    ("evaluation.reward=guess", "evaluation.reward='guess': input should be 'exact' or 'rollout'"),
+    ("proposer.advance=all", "proposer.advance='all': input should be "),
+    ("proposer.ratio=golden", "proposer.ratio='golden': input should be 'joint' or 'per_problem'"),
+    ("distributions.id.mechanism=x", "mechanism='x': input should be 'uniform' or 'path_first'"),
+    ("target=elsewhere", "target: must be among ['id', 'mix', 'ood'], got 'elsewhere'"),
+    ("evaluation.distributions=[far]", "evaluation.distributions: must be among ['id', 'mix'"),
+    ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
+    # unknown keys
+    ("sede=1", "Could not override 'sede'"),
+    ("+sede=1", "sede: there is no such key; there are: ablation, checkpoint, cores"),
+    ("+solver.x=1", "solver.x: there is no such key; there are: channels, groups"),
+    ("+distributions.id.x=1", "distributions.id.x: there is no such key; there are: mechanism"),
+    ("seed", "Error parsing override 'seed' missing EQUAL"),
+    ("seed=${nowhere}", "Interpolation key 'nowhere' not found"),
+    ("seed=???", "Missing mandatory value: seed"),
+    # contradictions
+    ("maze.height=3", "solver.channels=[64, 128, 256] halve a 3x10 maze to nothing"),
+    ("solver.channels=[64,64,64,8]", "with a single number on a 10x10 maze"),
+    ("maze.max_steps=5", "maze.max_steps=5 must be at least 12, the path length of"),
+    ("solver.channels=[12]", "solver.channels=[12] must be multiples of solver.groups=8"),
+    (
+        "proposer.probe_levels=513",
+        "probe_levels=513 must be at most proposer.validation_levels=512",
+    ),
+    ("proposer.ppo.horizon=3", "proposer.ppo.horizon=3 must equal proposer.lookahead=50"),
+    ("proposer.updates_per_step=7", "updates_per_step=7 must divide proposer.lookahead=50"),
+    ("space.path_lengths=[50]", "space: cannot make levels with obstacle_fraction=0, path_len"),
+    ("space.path_lengths=[2,2]", "space: path_lengths must be distinct, got [2, 2]"),
+    ("distributions.ood.specifications=[[0.9,12]]", "distributions.ood: cannot make levels with"),
+    # what a method is made of
+    ("curriculum._target_=os.nothing", "curriculum: Error locating target 'os.nothing'"),
+    ("curriculum._target_=os.system", "curriculum: Target 'os.system' is blocklisted"),
+    ("curriculum._target_=builtins.len", "curriculum: must make a Curriculum, but makes int"),
+    ("+curriculum.x=1", "curriculum: target() got an unexpected"),
+]
+WRONG_COMMANDS = [
+    ([], "method: missing; choose one with +method=NAME, NAME one of: domain_randomization"),
+    (["+method=magic"], "method/magic: unknown; choose one of: domain_randomization, frozen"),
+    (["+method=3"], "Config group override must be a string or a list. Got int"),
+    (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: paper, quick"),
+    (["+method=hand_made", "curriculum.until=[3, 2]"], "2 stages need 1 ascending positive"),
+    (["+method=hand_made", "curriculum.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
+    (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer() got an unexpected"),
+    (["+method=perf_gain", "~curriculum.reward"], "curriculum: proposer() missing 1 required"),
+    (
+        ["+method=perf_gain", "+ablation=lookahead_10", "+scale=quick"],
+        "+scale: must come before +ablation",
+    ),
+    (
+        ["+method=perf_gain", "proposer.advance=best", "schedule.cycle_length=5"],
+        "schedule.cycle_length=5 must equal proposer.lookahead=50",
+    ),
+    (["--experimental-rerun", "x.pickle"], "--experimental-rerun: not supported"),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [*((["+method=target", change], message) for change, message in WRONG), *WRONG_COMMANDS],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, train, capsys) -> None:
+    assert train(*arguments, "hydra.run.dir=run") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+    written = {path.name for path in Path("run").glob("*")}
+    assert written <= {".hydra", "train.log"}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's folder, without the run: its settings, and a checkpoint of its first state."""
+    folder = RunFolder(tmp_path_factory.mktemp("finished"))
+    config = composed("target")
+    made = parts(config)
+    check_same_run(folder, config.model_copy(update={"precision": made[0].precision}))
+    experiment = build(config, *made, folder, signals=At.once())
+    with pytest.raises(Interrupted):
+        experiment.run()
+    return folder.path
+
+
+class At(StopSignals):
+    """A signal that has come before the run has begun."""
+
+    @classmethod
+    def once(cls) -> At:
+        signals = cls()
+        signals._before[15], signals._pending = None, 15
+        return signals
+
+
+def composed(method: str):
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        return read_config(compose("train", [f"+method={method}", *SMOKE]))
+
+
+def copy_of(folder: Path, name: str = "run") -> Path:
+    return Path(shutil.copytree(folder, name))
+
+
+def refused(train, capsys, *arguments: str) -> str:
+    """The line that a resumed run is refused with; nothing is changed by it."""
+    kept = {p.name: p.read_bytes() for p in Path("run").glob("*.*") if p.is_file()}
+    assert train("+method=target", *SMOKE, "hydra.run.dir=run", *arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    kept.pop("train.log", None)
+    assert {name: (Path("run") / name).read_bytes() for name in kept} == kept
+    return line
+
+
+def test_a_resumed_run_with_other_settings_is_refused(finished: Path, train, capsys) -> None:
+    copy_of(finished)
+    line = refused(train, capsys, "solver.ppo.gamma=0.5", "maze.max_steps=9")
+    assert line.startswith("error: maze.max_steps=9: the run in ") and "started with 10" in line
+    assert line.endswith("differing keys: maze.max_steps, solver.ppo.gamma")
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, capsys) -> None:
+    folder = copy_of(finished)
+    (folder / "config.json").unlink()
+    config = json.loads((finished / "config.json").read_text())
+    config["solver"]["channels"] = [8, 8]
+    (folder / "config.json").write_text(json.dumps(config))
+    line = refused(train, capsys, "solver.channels=[8,8]")
+    assert "checkpoint 1 in " in line and "does not fit this run: the snapshot belongs to" in line
+
+
+@pytest.mark.parametrize("step", [-1, 1])
+def test_a_checkpoint_of_another_format_is_refused(
+    step: int, finished: Path, train, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from proposer_rl import checkpoint
+
+    folder = copy_of(finished)
+    number, state = load_latest(finished / "checkpoints")
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "FORMAT", checkpoint.FORMAT + step)
+        save_checkpoint(folder / "checkpoints", number + 1, state)
+    line = refused(train, capsys)
+    assert f"has format {checkpoint.FORMAT + step}" in line and "reads only format" in line
+
+
+def test_a_state_that_lacks_a_part_is_refused(finished: Path, train, capsys) -> None:
+    folder = copy_of(finished)
+    number, state = load_latest(finished / "checkpoints")
+    del state["curriculum"]
+    save_checkpoint(folder / "checkpoints", number + 1, state)
+    assert "does not fit this run: 'curriculum'" in refused(train, capsys)
+
+
+def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) -> None:
+    folder = copy_of(finished)
+    (folder / "metrics.csv").write_text("seed\n")
+    assert "metrics.csv has 0 rows, fewer than the 1 to be kept" in refused(train, capsys)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"{", "is no JSON of at most 1,000,000 bytes"),
+        (b"\xff\xfe\x00", "no JSON of at most"),
+        (b'{"a": "' + b"x" * 2_000_000 + b'"}', "no JSON of at most"),
+        (b"[" * 100_000, "no JSON of at most"),
+        (b"[1]", "started with [1]"),
+        (b"null", "started with None"),
+    ],
+)
+def test_a_stored_configuration_that_is_none_is_refused(
+    content: bytes, message: str, finished: Path, train, capsys
+) -> None:
+    (copy_of(finished) / "config.json").write_bytes(content)
+    assert message in refused(train, capsys)
+
+
+def test_a_stored_configuration_instantiates_nothing(finished: Path, train, capsys) -> None:
+    """Neither the one that is compared, nor Hydra's own copies, which nobody reads."""
+    folder = copy_of(finished)
+    evil = {"_target_": "os.mkdir", "path": str(Path("executed").resolve())}
+    stored = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**stored, "curriculum": evil}))
+    (folder / ".hydra").mkdir(exist_ok=True)
+    for name in ("config", "overrides", "hydra"):
+        (folder / ".hydra" / f"{name}.yaml").write_text(
+            "curriculum: !!python/object/apply:os.mkdir [executed]"
+        )
+    assert "curriculum._target_='proposer_rl.methods.target': the run in" in refused(train, capsys)
+    assert not Path("executed").exists()
+    (folder / "config.json").write_text(json.dumps(stored))
+    assert train("+method=target", *SMOKE, "hydra.run.dir=run") == 0
+    assert not Path("executed").exists()
+
+
+def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> None:
+    Path("run").mkdir()
+    Path("run/years.csv").write_text("year\n1\n")
+    assert "holds years.csv but no config.json" in refused(train, capsys)
+    assert Path("run/years.csv").read_text() == "year\n1\n"
+
+
+def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
+    folder = copy_of(finished)
+    free = ["schedule.checkpoint_seconds=null", "schedule.keep_checkpoints=3", "cores=1"]
+    assert train("+method=target", *SMOKE, "hydra.run.dir=run", *free) == 0
+    assert train("+method=target", *SMOKE, "hydra.run.dir=whole") == 0
+    assert_same_run(Path("whole"), folder)
+
+
+# Nonsense, and what may well be valid.
+WILD = st.one_of(
+    st.integers(-2, 9),
+    st.integers(),
+    st.floats(),
+    st.sampled_from([0.5, 1e-3, 10**30, True, False, None, "", "x", "id", "auto", "cpu"]),
+    st.lists(st.one_of(st.integers(-1, 5), st.floats(0, 1), st.just("id")), max_size=3),
+    st.dictionaries(st.sampled_from(["a", "height", "_target_"]), st.integers(), max_size=2),
+)
+
+
+def like(value: Any) -> st.SearchStrategy[Any]:
+    """Values of the same kind as one that is valid."""
+    if isinstance(value, bool):
+        return st.booleans()
+    if isinstance(value, int):
+        return st.integers(0, 9)
+    if isinstance(value, float):
+        return st.floats(0, 1)
+    if isinstance(value, list) and value:
+        return st.lists(like(value[0]), max_size=3)
+    words = ["id", "ood", "mix", "uniform", "path_first", "sample", "mode", "joint", "rollout"]
+    return st.sampled_from([*words, "best", "random", "bf16", "mixture", "linear", "all", None])
+
+
+def keys_of(values: Any, place: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    if not isinstance(values, dict):
+        return [place]
+    inner = [found for key, value in values.items() for found in keys_of(value, (*place, key))]
+    return [*([place] if place else []), *inner]
+
+
+@pytest.fixture(scope="module")
+def smoke() -> dict[str, Any]:
+    found = {}
+    for method in methods():
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+            config = compose("train", [f"+method={method}", *SMOKE])
+        found[method] = OmegaConf.to_container(config, resolve=True)
+    return found
+
+
+@hypothesis.settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
+    smoke: dict[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    values = copy.deepcopy(smoke[data.draw(st.sampled_from(methods()))])
+    for _ in range(data.draw(st.integers(1, 3))):
+        *folder, key = data.draw(st.sampled_from(keys_of(values)))
+        holder = values
+        for part in folder:
+            holder = holder[part]
+        plain = not isinstance(holder[key], dict) and data.draw(st.integers(0, 3))
+        holder[key] = data.draw(like(holder[key]) if plain else WILD)
+    folder = RunFolder(tmp_path_factory.mktemp("run"))
+    values["threads"] = None  # of this very process
+    try:
+        config = read_config(OmegaConf.create(values))
+        made = parts(config)
+        check_same_run(folder, config)
+        build(config, *made, folder, signals=At.once()).run()
+    except Interrupted:
+        hypothesis.event("a run starts")
+        assert load_latest(folder.path / "checkpoints") is not None
+    except DivergedError:
+        hypothesis.event("a run diverges")
+        assert load_latest(folder.path / "checkpoints") is None
+    except FORESEEN as error:
+        hypothesis.event("refused")
+        assert not isinstance(error, OSError), repr(error)
+        assert str(error).strip()
+        assert list(folder.path.iterdir()) == []
+    else:
+        raise AssertionError("the signal was not heeded")

@@ -1,0 +1,71 @@
+"""Real processes, killed with SIGKILL, against a run that was never stopped."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from signal import SIGKILL
+from typing import Any
+
+import pytest
+
+from proposer_rl.checkpoint import load_latest
+from proposer_rl.cli.config import methods
+from tests.processes import Ended, Processes
+from tests.runs import assert_same_run
+
+# A checkpoint at every safe point: runs resume in the middle of the Proposer's episodes too.
+SMOKE = ["+scale=smoke", "progress=false", "schedule.checkpoint_seconds=1e-6"]
+SMOKE += ["proposer.lookahead=5"]
+# Of each of the five methods: at any time; before any write; in the middle of a checkpoint's
+# temporary file; before it gets its name.
+MOMENTS = ["", "", "fsync .step_", "replace .step_"]
+
+
+def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:
+    """A seeded moment not too late in a run, which has further ones before it, as an option."""
+    if kind == 0:
+        return {"signals": [(draw.uniform(0.3, 0.6) * whole.seconds, SIGKILL)]}
+    early = whole.writes[: len(whole.writes) * 2 // 5]
+    candidates = [i for i, name in enumerate(early) if name.startswith(MOMENTS[kind])]
+    return {"signal_at": {draw.choice(candidates): SIGKILL}}
+
+
+def within_an_episode(folder: Path) -> bool:
+    latest = load_latest(folder / "checkpoints")
+    return latest is not None and latest[1]["curriculum"].get("episode") is not None
+
+
+@pytest.fixture(scope="module")
+def learnt(processes: Processes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose Proposer the method frozen_proposer goes on with."""
+    folder = tmp_path_factory.mktemp("learnt")
+    assert processes("+method=perf_gain", *SMOKE, f"hydra.run.dir={folder}").code == 0
+    return folder
+
+
+@pytest.mark.parametrize("method", methods())
+def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
+    method: str, learnt: Path, processes: Processes, tmp_path: Path
+) -> None:
+    draw = random.Random(f"moments of {method}")
+    command = [f"+method={method}", *SMOKE, f"checkpoint={learnt}"]
+    whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
+    assert whole.code == 0, whole.output
+    kinds, attempt, in_episodes = list(range(len(MOMENTS))), 0, 0
+    while kinds:
+        folder = tmp_path / str(attempt)
+        options = moment(draw, kinds[-1], whole)
+        ended = processes(*command, f"hydra.run.dir={folder}", **options)
+        if ended.code == -SIGKILL:
+            kinds.pop()
+            in_episodes += within_an_episode(folder)
+        else:  # it came to its end before that moment; the next is that of another run
+            assert ended.code == 0, ended.output
+            assert_same_run(tmp_path / "whole", folder)
+            attempt += 1
+    ended = processes(*command, f"hydra.run.dir={folder}")
+    assert ended.code == 0, ended.output
+    assert_same_run(tmp_path / "whole", folder)
+    # The later kinds come first and depend on the seed alone.
+    assert in_episodes or not (folder / "proposer.jsonl").exists()

@@ -1,0 +1,176 @@
+"""The command in a process of its own: signals, two at once, disks that take no more."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1, SIGUSR2
+
+import pytest
+
+from proposer_rl.checkpoint import load_latest, save_checkpoint
+from proposer_rl.lock import locked
+from tests.processes import Ended, Processes
+from tests.runs import assert_same_run
+
+TRAIN = ["+method=target", "+scale=smoke", "progress=false"]
+ROW = "fsync metrics.csv"
+
+
+@pytest.fixture(scope="module")
+def whole(processes: Processes, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended]:
+    folder = tmp_path_factory.mktemp("whole")
+    ended = processes(*TRAIN, f"hydra.run.dir={folder}")
+    assert ended.code == 0, ended.output
+    return folder, ended
+
+
+def nth(writes: list[str], name: str, n: int) -> int:
+    return [i for i, write in enumerate(writes) if write == name][n]
+
+
+def checkpoints(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / "checkpoints").glob("step_*.pt")}
+
+
+@pytest.mark.parametrize("signum", [SIGINT, SIGTERM, SIGHUP, SIGUSR1, SIGUSR2])
+def test_a_signal_saves_and_ends_and_the_same_command_goes_on(
+    signum: int, whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path / 'run'}"]
+    # With the second row, at update 2; checkpoints by count are at 2, 4 and 6 too.
+    signal_at = {nth(whole[1].writes, ROW, 1): int(signum)}
+    stopped = processes(*command, signal_at=signal_at)
+    assert stopped.code == 128 + signum
+    assert f"{signum.name}: saving at the next safe point" in stopped.output
+    assert f"To go on: bin/train {' '.join(command)}" in stopped.output
+    latest = load_latest(tmp_path / "run" / "checkpoints")
+    assert latest is not None and latest[1]["updates"] == 2
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path / "run")
+
+
+def test_a_signal_in_the_proposers_episode_loses_nothing(
+    processes: Processes, tmp_path: Path
+) -> None:
+    command = ["+method=perf_gain", "+scale=smoke", "progress=false"]
+    whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
+    # While the first row is written; what follows is the first episode.
+    signal_at = {nth(whole.writes, ROW, 0): int(SIGTERM)}
+    stopped = processes(*command, f"hydra.run.dir={tmp_path / 'run'}", signal_at=signal_at)
+    assert stopped.code == 128 + SIGTERM
+    latest = load_latest(tmp_path / "run" / "checkpoints")
+    assert latest is not None and len(latest[1]["curriculum"]["episode"]["updates"]) == 1
+    assert processes(*command, f"hydra.run.dir={tmp_path / 'run'}").code == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_a_second_ctrl_c_stops_at_once(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path / 'run'}"]
+    row = nth(whole[1].writes, ROW, 1)
+    # The second comes with the next write, long before the safe point.
+    stopped = processes(*command, signal_at={row: int(SIGINT), row + 1: int(SIGINT)})
+    assert stopped.code == 128 + SIGINT
+    assert "Stopped at once" in stopped.output
+    assert checkpoints(tmp_path / "run") == {}
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path / "run")
+
+
+def test_a_folder_in_use_is_refused_naming_the_holder(processes: Processes, tmp_path: Path) -> None:
+    with locked(tmp_path):
+        refused = processes(*TRAIN, f"hydra.run.dir={tmp_path}")
+    assert refused.code == 5
+    assert f"error: {tmp_path} is in use by process {os.getpid()} on " in refused.output
+    assert not (tmp_path / "config.json").exists()
+
+
+def test_the_lock_of_a_dead_process_blocks_nobody(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
+    killed = processes(*command, signal_at={nth(whole[1].writes, ROW, 2): int(SIGKILL)})
+    assert killed.code == -SIGKILL
+    holder = json.loads((tmp_path / ".holder.json").read_text())
+    with pytest.raises(ProcessLookupError):
+        os.kill(holder["process"], 0)
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path)
+
+
+def test_a_full_disk_ends_the_run_and_leaves_the_checkpoint_before(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
+    row = nth(whole[1].writes, ROW, 2)
+    assert processes(*command, signal_at={row: int(SIGKILL)}).code == -SIGKILL
+    before = checkpoints(tmp_path)
+    assert len(before) == 1
+    full = processes(*command, largest_file=20_000)
+    assert full.code == 4
+    assert full.output.strip().splitlines() == [
+        f"error: cannot write {tmp_path}/checkpoints/step_000000002.pt: File too large"
+    ]
+    assert checkpoints(tmp_path) == before
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path)
+
+
+@pytest.mark.parametrize("sealed", [".", "checkpoints"])
+def test_a_folder_that_may_not_be_written_to(
+    sealed: str, whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
+    row = nth(whole[1].writes, ROW, 2)
+    assert processes(*command, signal_at={row: int(SIGKILL)}).code == -SIGKILL
+    before = checkpoints(tmp_path)
+    # A folder that is left as it is may still hold files that can be written to.
+    (tmp_path / ".hydra" / "config.yaml").chmod(0o444)
+    (tmp_path / sealed).chmod(0o555)
+    try:
+        refused = processes(*command, as_anyone=True)
+    finally:
+        (tmp_path / sealed).chmod(0o755)
+        (tmp_path / ".hydra" / "config.yaml").chmod(0o644)
+    assert refused.code == 4
+    assert refused.output.startswith("error: cannot ") and "Permission denied" in refused.output
+    assert len(refused.output.strip().splitlines()) == 1
+    assert checkpoints(tmp_path) == before
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path)
+
+
+def test_no_permission_to_make_the_folder(processes: Processes, tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    try:
+        refused = processes(*TRAIN, f"hydra.run.dir={tmp_path / 'run'}", as_anyone=True)
+    finally:
+        tmp_path.chmod(0o755)
+    assert refused.code == 4
+    assert refused.output == f"error: cannot use {tmp_path / 'run'}: Permission denied\n"
+
+
+def test_numbers_that_go_wrong_end_the_run_and_the_last_good_checkpoint_stays(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
+    processes(*command, signal_at={nth(whole[1].writes, ROW, 1): int(SIGTERM)})
+    latest = load_latest(tmp_path / "checkpoints")
+    assert latest is not None
+    step, state = latest
+    for entry in state["solver"].values():
+        entry["value"] *= 1e30  # still finite, but their products are not
+    save_checkpoint(tmp_path / "checkpoints", step + 1, state)
+    before = checkpoints(tmp_path)
+    diverged = processes(*command)
+    assert diverged.code == 3, diverged.output
+    assert re.match(
+        r"error: cycle 0, after 2 Solver updates: copy 0: (loss_[a-z]+|grad_norm)"
+        rf" of gradient step 0 is not finite .*; .* {tmp_path}/checkpoints\n$",
+        diverged.output,
+    ), diverged.output
+    assert checkpoints(tmp_path) == before
