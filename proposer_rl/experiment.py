@@ -69,6 +69,7 @@ class Experiment:
         log: receives each row of the first copy: its table, its values and its update.
         progress: whether to draw a progress bar.
         signals: which may ask the run to stop; None where nothing does.
+        scope: put before the address of every random draw; tells several lives of one seed apart.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class Experiment:
         log: Log | None = None,
         progress: bool = True,
         signals: StopSignals | None = None,
+        scope: Sequence[str | int] = (),
     ) -> None:
         self.solver = solver
         self.curriculum = curriculum
@@ -100,6 +102,7 @@ class Experiment:
         self._log = log
         self._progress = progress
         self._signals = signals or StopSignals()
+        self._scope = tuple(scope)
         self._headline: list[float] = []
         self._checkpoints = 0
         self._seconds_before = 0.0
@@ -250,7 +253,7 @@ class Experiment:
             yield seed, {str(key): float(value) for key, value in values[copy].items()}
 
     def _streams(self, *scope: str | int) -> list[Streams]:
-        return [Streams(seed, *scope) for seed in self.seeds]
+        return [Streams(seed, *self._scope, *scope) for seed in self.seeds]
 
     def _headline_text(self) -> str:
         mean = sum(self._headline) / len(self._headline)

@@ -13,6 +13,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl.checkpoint import load_latest
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, methods, read_config
 from proposer_rl.cli.train import build, parts
 from proposer_rl.experiment import Schedule
@@ -105,7 +106,7 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkey
     assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
     monkeypatch.setattr("proposer_rl.cli.train.faster_precision", lambda *_: "bf16")
     assert train(*command) == 2
-    assert "error: precision: the run in" in capsys.readouterr().err
+    assert "error: precision='bf16': the run in" in capsys.readouterr().err
 
 
 def test_multirun_goes_over_methods_and_seeds(train) -> None:
@@ -141,3 +142,25 @@ def test_the_module_runs_as_a_program() -> None:
     assert result.returncode == 0, result.stderr
     assert "outputs/target/" in result.stdout
     shutil.rmtree("outputs")
+
+
+def test_a_proposer_goes_on_learning_over_several_lifetimes(train) -> None:
+    arguments = ["+method=perf_gain", *SMOKE, "lifetimes=2", "evaluation.levels=16"]
+    assert train(*arguments, "hydra.run.dir=whole") == 0
+    first, second = Path("whole/lifetime_0"), Path("whole/lifetime_1")
+    # The first is the run that it would be alone; the second has another Solver, and the Proposer.
+    alone = [a for a in arguments if not a.startswith("lifetimes")]
+    assert train(*alone, "hydra.run.dir=alone") == 0
+    assert_same_run(first, Path("alone"))
+    steps = []
+    for folder in (first, second):
+        latest = load_latest(folder / "checkpoints")
+        assert latest is not None
+        steps += {int(entry["step"]) for entry in latest[1]["curriculum"]["proposer"].values()}
+    assert steps == [4, 8]  # Adam's steps: 2 cycles of 2 epochs in each lifetime
+    assert tables(first)["metrics.csv"][0] != tables(second)["metrics.csv"][0]
+    # Interrupted between two lifetimes, it goes on as if it had not been.
+    shutil.copytree("whole", "again")
+    shutil.rmtree("again/lifetime_1")
+    assert train(*arguments, "hydra.run.dir=again") == 0
+    assert_same_run(Path("again/lifetime_1"), second)

@@ -65,6 +65,7 @@ class RunConfig(BaseModel):
     scale: str
     ablation: str
     curriculum: dict[str, Any]
+    lifetimes: Annotated[int, Field(ge=1, le=LARGEST)]
     checkpoint: str | None
     seed: Annotated[int, Field(ge=0)]
     seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = Field(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import shlex
@@ -23,6 +24,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from proposer_rl.capture import use
+from proposer_rl.checkpoint import CheckpointError, load_latest
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, refuse
 from proposer_rl.cli.loggers import make_log
@@ -70,10 +72,7 @@ def _main(hydra_config: DictConfig) -> float:
         config = read_config(hydra_config)
         made = parts(config)  # whatever is wrong with the input is found here
         with locked(path), StopSignals() as signals:
-            folder = RunFolder(path)
-            # What `auto` has become, so that a run does not go on in another precision elsewhere.
-            check_same_run(folder, config.model_copy(update={"precision": made[0].precision}))
-            return run(build(config, *made, folder, signals), config)
+            return live(config, *made, path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error), exit_code(error))
@@ -106,6 +105,47 @@ def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
         raise ConfigError(f"the run does not fit in memory: {one_line(error)}") from error
 
 
+def live(
+    config: RunConfig,
+    task: MazeTask,
+    solver: PPO,
+    curriculum: Curriculum,
+    path: Path,
+    signals: StopSignals,
+) -> float:
+    """Run all lifetimes: one Solver after another, on a curriculum that goes on learning.
+
+    Args:
+        config: the run's settings.
+        task: as :func:`parts` makes it.
+        solver: as :func:`parts` makes it; that of the first lifetime.
+        curriculum: as :func:`parts` makes it.
+        path: the run's folder, which has one for each lifetime if there are several.
+        signals: which may ask the run to stop.
+
+    Returns:
+        The headline measurement at the end of the last lifetime.
+    """
+    value = math.nan
+    before: RunFolder | None = None
+    for lifetime in range(config.lifetimes):
+        folder = RunFolder(path / f"lifetime_{lifetime}" if config.lifetimes > 1 else path)
+        # What `auto` has become, so that a run does not go on in another precision elsewhere.
+        check_same_run(folder, config.model_copy(update={"precision": task.precision}))
+        scope: tuple[str | int, ...] = ()
+        if before is not None:
+            scope = ("lifetime", lifetime)
+            solver = task.solvers([Streams(seed, *scope, "solver") for seed in config.seeds])
+            latest = load_latest(before.path / "checkpoints")
+            if latest is None:
+                raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
+            curriculum.load_state_dict(latest[1]["curriculum"])
+            curriculum.begin()
+        value = run(build(config, task, solver, curriculum, folder, signals, scope), config)
+        before = folder
+    return value
+
+
 def build(
     config: RunConfig,
     task: MazeTask,
@@ -113,6 +153,7 @@ def build(
     curriculum: Curriculum,
     folder: RunFolder,
     signals: StopSignals | None = None,
+    scope: tuple[str | int, ...] = (),
 ) -> Experiment:
     """Put an experiment together.
 
@@ -123,6 +164,7 @@ def build(
         curriculum: as :func:`parts` makes it.
         folder: the run's.
         signals: which may ask the run to stop.
+        scope: of its random draws; empty, or the lifetime.
 
     Raises:
         ConfigError: if the logger's package is missing.
@@ -139,6 +181,7 @@ def build(
         log=make_log(config.logger, folder.path, _name(config)),
         progress=config.progress,
         signals=signals,
+        scope=scope,
     )
 
 

@@ -54,6 +54,9 @@ class Curriculum:
 
     most_solvers: ClassVar[int | None] = None
 
+    def begin(self) -> None:
+        """A fresh Solver begins: forget the last one, but not what was learnt from it."""
+
     def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
         """Levels [K, P] for the Solver's next update."""
         raise TypeError(f"{type(self).__name__} must define propose(solver, streams)")

@@ -50,6 +50,10 @@ class ScheduleCurriculum(Curriculum):
             )
         self._stages = list(stages)
         self._until = list(until)
+        self.begin()
+
+    def begin(self) -> None:
+        """Go back to the first stage."""
         self._updates = 0
 
     def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ LONGEST_NAME = 80
 WIDEST_GRID = 64
 
 COST = ("updates", "frames", "meta_frames", "seconds")
+_LIFETIME = re.compile(r"lifetime_(\d{1,9})")
 Column = NDArray[np.float64]
 
 
@@ -66,6 +68,14 @@ class Run:
     def ablation(self) -> str:
         """Name of the ablation, ``none`` without one."""
         return str(self.config.get("ablation", "none"))
+
+    @property
+    def lifetime(self) -> int | None:
+        """Which Solver of several lifetimes this was, from 0; None for a run of one."""
+        found = (
+            _LIFETIME.fullmatch(self.folder.name) if self.config.get("lifetimes", 1) != 1 else None
+        )
+        return int(found[1]) if found else None
 
     @property
     def headline(self) -> str:

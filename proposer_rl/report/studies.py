@@ -161,6 +161,7 @@ def _variant(run: Run) -> dict[str, Any]:
     ignored |= set() if run.cycles else {"proposer"}  # it had none
     kept = {key: value for key, value in run.config.items() if key not in ignored}
     kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
+    kept["lifetime"] = run.lifetime
     kept["precision"] = run.config.get("precision", "fp32")
     kept["reward"] = run.config["evaluation"].get("reward") if run.cycles else None
     return kept
@@ -208,7 +209,8 @@ def _groups(runs: Sequence[Run]) -> tuple[Group, ...]:
 
 
 def _plain_label(run: Run) -> str:
-    return run.method if run.ablation == "none" else f"{run.method}, {run.ablation}"
+    named = run.method if run.ablation == "none" else f"{run.method}, {run.ablation}"
+    return named if run.lifetime is None else f"{named}, lifetime {run.lifetime}"
 
 
 def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:
