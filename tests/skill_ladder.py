@@ -52,6 +52,9 @@ class SkillLadder:
         self.agent.skills = train(skills, taught.float().mean(1))
         return Update(TensorDict({}, [*self.env.batch_size, 1]), TensorDict({}))
 
+    def check(self) -> None:
+        """Everything is finite."""
+
     def snapshot(self) -> TensorDict:
         return TensorDict({"skills": self.agent.skills.clone()}, [self.agent.copies])
 

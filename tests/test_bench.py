@@ -143,8 +143,11 @@ def test_the_plain_way_learns_the_same_numbers() -> None:
     """Same rollout, same weights: the reference and the library's PPO end in the same weights."""
     # Coarsest maps of 2x2 and two channels per group: what GroupNorm sees is then not constant,
     # for otherwise gradients are rounding errors, which Adam would blow up.
+    tiny = TINY.with_solver(channels=[16, 16, 16])
     scale = replace(
-        TINY.with_solver(channels=[16, 16, 16]), maze=replace(TINY.maze, height=8, width=8)
+        tiny,
+        solver=replace(tiny.solver, groups=8),  # the plain network's
+        maze=replace(tiny.maze, height=8, width=8),
     )
     solvers = Solvers(scale.task(TRIED))
     solvers.next_levels()

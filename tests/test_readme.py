@@ -52,9 +52,15 @@ def test_the_commands_run(
         # Of a sweep one run, in this process: there may be no cluster here.
         small = [word for word in small if "launcher" not in word] + ["seed=0", "+method=target"]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["bin/train", *small])
-    GlobalHydra.instance().clear()
-    main()
+    before = [
+        ["+method=perf_gain", "+scale=smoke", word.replace("checkpoint", "hydra.run.dir")]
+        for word in small
+        if word.startswith("checkpoint=")
+    ]
+    for call in (*before, small):
+        monkeypatch.setattr(sys, "argv", ["bin/train", *call])
+        GlobalHydra.instance().clear()
+        main()
     assert list(tmp_path.rglob("summary.json"))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
 from proposer_rl.cli.train import main
@@ -154,12 +155,13 @@ def composed(train, monkeypatch: pytest.MonkeyPatch):
     def call(*arguments: str) -> set[tuple[str, str, str, int]]:
         made = []
 
-        def note(config: RunConfig, path: Path):
+        def note(config: RunConfig):
             (seed,) = config.seeds
+            path = Path(HydraConfig.get().runtime.output_dir)
             made.append((path.parent.name, config.method, config.ablation, seed))
             raise KeyError("enough")
 
-        monkeypatch.setattr("proposer_rl.cli.train.build", note)
+        monkeypatch.setattr("proposer_rl.cli.train.parts", note)
         assert train(*arguments) == 1
         assert len(set(made)) == len(made)
         return set(made)

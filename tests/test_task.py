@@ -57,20 +57,25 @@ def test_recorded_measurements_follow_the_solver(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("observe_agent", [False, True])
 @pytest.mark.parametrize("reward", [performance_gain, task_difficulty])
-def test_a_meta_step_waits_for_the_device_only_to_hear_the_action(reward, observe_agent) -> None:
+def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
+    reward, observe_agent
+) -> None:
     maze = task(observe_agent)
     every_update = replace(TINY.proposer, updates_per_step=1)
     env = proposer(Parts(maze, every_update, seed=0), reward).env
     for module in env.solvers.agent.modules():
         if isinstance(module, Population):
             module.way = "4 streams"
-    levels = env.proposals.levels
 
-    def on_the_host(action, problems, streams):
-        with _disable_current_modes():
-            return levels(action, problems, streams)
+    def on_the_host(function):
+        def call(*arguments):
+            with _disable_current_modes():
+                return function(*arguments)
 
-    env.proposals.levels = on_the_host
+        return call
+
+    env.proposals.levels = on_the_host(env.proposals.levels)
+    env.solvers.check = on_the_host(env.solvers.check)
     state = env.reset()
     with torch.no_grad():
         for step in range(2):
