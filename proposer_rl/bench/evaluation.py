@@ -12,12 +12,14 @@ from proposer_rl.mazes import planes
 from proposer_rl.models import cell_logits
 from proposer_rl.streams import Streams
 
+PAPERS_LEVELS = 75  # of the paper's validation batch, which is evaluated after every update
+
 
 def exact_evaluation(options: Options) -> Result:
     """The evaluation of a meta-environment step against one update of one Solver."""
     scale = TINY if options.tiny else PAPER
     task = scale.task(options)
-    copies, count = scale.proposer.rollouts, scale.proposer.validation_levels
+    copies, count = scale.proposer.rollouts, PAPERS_LEVELS
     generator = Streams(0, "validation").generator()
     validation = task.sample_target(count, generator)
     solver, population = Solvers(task), Solvers(task, copies, batches=1)
