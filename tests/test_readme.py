@@ -71,8 +71,9 @@ def test_the_commands_about_runs_run(
     found = commands(program)
     assert found
     monkeypatch.chdir(tmp_path)
+    for folder in {arguments[0] for arguments in found}:
+        write_run(tmp_path / folder / "run")
     for arguments in found:
-        write_run(tmp_path / arguments[0] / "run")
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
 
 
