@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from proposer_rl.adam import CopiesAdam
 from proposer_rl.capture import Captured, Recorder
 from proposer_rl.finite import require_finite
 from proposer_rl.models import ActorCritic, draw, uniform_noise
@@ -139,14 +140,9 @@ class PPO:
         self._parameters = list(agent.parameters())
         device = self._parameters[0].device
         self._loss.to(device)
-        self._adam = torch.optim.Adam(
-            self._parameters,
-            lr=settings.learning_rate,
-            eps=settings.adam_eps,
-            fused=True,
-            capturable=device.type == "cuda",
+        self._adam = CopiesAdam(
+            self._parameters, agent.copies, settings.learning_rate, settings.adam_eps
         )
-        self._start_adam()
         self._act = Captured(self._roll_out, recorder)
         self._train = Captured(self._train_on, recorder)
 
@@ -222,8 +218,8 @@ class PPO:
         """
         batch = self._batch
         entries: dict[str, TensorDict] = {}
-        for name, parameter in self.agent.named_parameters():
-            state = self._adam.state[parameter]
+        for i, (name, parameter) in enumerate(self.agent.named_parameters()):
+            state = self._adam.state(i)
             entries[name] = TensorDict(
                 {
                     "value": parameter.detach().clone(),
@@ -256,8 +252,8 @@ class PPO:
         # The one question here that waits for the device.
         if not bool((steps == steps[:, :1]).all()):
             raise ValueError("the snapshot's copies have made different numbers of Adam steps")
-        for name, parameter in parameters.items():
-            entry, state = snapshot[name], self._adam.state[parameter]
+        for i, (name, parameter) in enumerate(parameters.items()):
+            entry, state = snapshot[name], self._adam.state(i)
             parameter.data.copy_(entry["value"])
             state["exp_avg"].copy_(entry["exp_avg"])
             state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
@@ -266,15 +262,6 @@ class PPO:
     @property
     def _batch(self) -> torch.Size:
         return torch.Size([] if self.agent.copies is None else [self.agent.copies])
-
-    def _start_adam(self) -> None:
-        # Adam makes its state at the first step; made at once, a snapshot is always complete.
-        for parameter in self._parameters:
-            self._adam.state[parameter] = {
-                "step": torch.zeros((), device=parameter.device),
-                "exp_avg": torch.zeros_like(parameter),
-                "exp_avg_sq": torch.zeros_like(parameter),
-            }
 
     @torch.no_grad()
     def _roll_out(self, inputs: TensorDictBase) -> TensorDict:
@@ -406,12 +393,13 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     Returns:
         The norms before clipping, [K] or [].
     """
-    if copies is None or copies == 1:  # a few kernels for all parameters together
-        norm = nn.utils.clip_grad_norm_(parameters, max_norm)
-        return norm if copies is None else norm.unsqueeze(0)
+    if copies is None:
+        return nn.utils.clip_grad_norm_(parameters, max_norm)
     gradients = [p.grad for p in parameters if p.grad is not None]
-    norms = [torch.linalg.vector_norm(g.flatten(1), dim=1) for g in gradients]
-    norm = torch.linalg.vector_norm(torch.stack(norms), dim=0)  # [K]
+    # Slice by slice, since a norm over a row of several is rounded otherwise than over one alone.
+    slices = [gradient[k] for k in range(copies) for gradient in gradients]
+    norms = torch.stack(torch._foreach_norm(slices)).view(copies, len(gradients))
+    norm = norms.square().sum(1).sqrt()  # [K]
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))

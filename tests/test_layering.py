@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
 LAYERS = [
-    {"capture"},
+    {"capture", "adam"},
     {
         *("mazes", "models", "run_folder", "checkpoint", "lock"),
         *("settings", "streams", "signals", "finite", "machine"),

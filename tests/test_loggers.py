@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from io import BytesIO
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from proposer_rl.cli.config import ConfigError, LoggerSettings
-from proposer_rl.cli.loggers import make_log
+from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.mazes import Level, draw_grid
 from tests.report.folders import LEVEL, cycle, write_run
 
@@ -30,10 +29,12 @@ def test_rows_go_to_tensorboard(tmp_path: Path) -> None:
     assert found == [(10, 0.25), (20, 0.5)]
 
 
-def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "wandb", None)
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", {"tensorboard": object()}.get)
+    require_logger(LoggerSettings(type="csv"))
+    require_logger(LoggerSettings(type="tensorboard"))
     with pytest.raises(ConfigError, match=r"logger=wandb.*pip install 'proposer_rl\[wandb\]'"):
-        make_log(LoggerSettings(type="wandb", mode="disabled"), tmp_path, "run")
+        require_logger(LoggerSettings(type="wandb", mode="disabled"))
 
 
 def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,31 +15,33 @@ from proposer_rl.mazes import Level, draw_grid
 from proposer_rl.report.proposals import last_map
 
 
+def require_logger(settings: LoggerSettings) -> None:
+    """Check that a logger can be used, before anything is written.
+
+    Raises:
+        ConfigError: if its package, of the same name, is not installed.
+    """
+    if settings.type != "csv" and find_spec(settings.type) is None:
+        raise ConfigError(
+            f"logger={settings.type}: its package is missing; install it with "
+            f"pip install 'proposer_rl[{settings.type}]'"
+        )
+
+
 def make_log(settings: LoggerSettings, path: Path, name: str) -> Log | None:
     """A function that logs a row of a table, or None where the run's folder is enough.
 
     Args:
-        settings: which logger.
+        settings: which logger, of an installed package.
         path: the run's folder, where files of the logger go.
         name: of the run.
-
-    Raises:
-        ConfigError: if the logger's package is not installed.
     """
     if settings.type == "csv":
         return None
     options: dict[str, Any] = {}
     if settings.type == "wandb":
         options["wandb_kwargs"] = {"project": settings.project, "mode": settings.mode}
-    try:
-        logger = get_logger(settings.type, str(path), name, **options)
-    except ImportError as error:
-        raise ConfigError(
-            f"logger={settings.type}: its package is missing; install it with "
-            f"pip install 'proposer_rl[{settings.type}]'"
-        ) from error
-    if logger is None:
-        raise ConfigError(f"logger={settings.type}: TorchRL has no such logger")
+    logger = get_logger(settings.type, str(path), name, **options)
 
     def log(table: str, row: Mapping[str, Any], step: int) -> None:
         for key, value in _numbers(row):

@@ -27,7 +27,7 @@ from proposer_rl.capture import use
 from proposer_rl.checkpoint import CheckpointError, load_latest
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, refuse
-from proposer_rl.cli.loggers import make_log
+from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.curricula import Curriculum
@@ -93,6 +93,7 @@ def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
     Raises:
         ConfigError: if settings that are each valid do not go together.
     """
+    require_logger(config.logger)
     try:
         task = make_task(config)
         solver = task.solvers([Streams(seed, "solver") for seed in config.seeds])
@@ -165,9 +166,6 @@ def build(
         folder: the run's.
         signals: which may ask the run to stop.
         scope: of its random draws; empty, or the lifetime.
-
-    Raises:
-        ConfigError: if the logger's package is missing.
     """
     return Experiment(
         solver,
