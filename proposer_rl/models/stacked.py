@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -159,6 +160,10 @@ def _pool(cores: int) -> ThreadPoolExecutor:
     """Threads that each compute on one core."""
     return ThreadPoolExecutor(cores, "copy", initializer=torch.set_num_threads, initargs=(1,))
 
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # A forked process inherits the pool, but not its threads.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 _networks = threading.local()
 

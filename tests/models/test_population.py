@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from functools import partial
 
@@ -96,6 +98,19 @@ def test_the_number_of_cores_changes_no_bit() -> None:
         results.append(trained(cores))
     for other in results[1:]:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    population = together(2, cores=2)
+    population(torch.rand(2, 1, 3, 8, 8))
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # without threads the child would wait for ever
+        population(torch.rand(2, 1, 3, 8, 8))
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert status == 0
 
 
 def test_every_way_is_measured_as_it_will_be_run_and_leaves_no_trace() -> None:
