@@ -79,7 +79,7 @@ class ProposerSettings:
     common_random_numbers: bool = False
     proposals: Literal["problems", "mixture"] = "mixture"
     ratio: Literal["joint", "per_problem"] = "per_problem"
-    directions: Literal["linear", "quadratic", "all"] = "linear"
+    directions: Literal["linear", "target", "quadratic", "all"] = "linear"
     spread: Annotated[float, Gt(0)] = 1.5
     own_action: Literal["sample", "mode"] = "mode"
     advance: Literal["train", "best", "random"] = "train"

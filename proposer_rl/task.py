@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
@@ -231,16 +232,30 @@ class MazeTask:
         """What the numbers of a mixture add to the log-shares of the space, float [D, M * N].
 
         Args:
-            kind: ``"linear"``: more obstacles and longer paths (D = 2); ``"quadratic"``: also the
-                squares and the product of both, so that a mixture can favour the middle (D = 5);
-                ``"all"``: every specification by itself (D = M * N).
+            kind: ``"linear"``: more obstacles and longer paths (D = 2). Besides these two,
+                ``"target"``: a number that at 1 makes the target's specifications half of an
+                otherwise even mixture, or a little more (D = 3); ``"quadratic"``: their squares and
+                product, so that a mixture can favour the middle (D = 5). ``"all"``: every
+                specification by itself (D = M * N).
+
+        Raises:
+            ValueError: for ``"target"``, if the space has none or nothing but the target's.
         """
         if kind == "all":
             return torch.eye(self.space.size)
         x, y = self.space.coordinates.unbind(-1)
-        linear = [x, y]
-        quadratic = [*linear, x.square(), y.square(), x * y]
-        return torch.stack({"linear": linear, "quadratic": quadratic}[kind])
+        if kind == "linear":
+            return torch.stack([x, y])
+        if kind == "quadratic":
+            return torch.stack([x, y, x.square(), y.square(), x * y])
+        wanted = torch.tensor([s in self.target.specifications for s in self.space.specifications])
+        count = int(wanted.sum())
+        if count in (0, self.space.size):
+            raise ValueError(
+                f"proposer.directions=target: {count} of the space's {self.space.size} "
+                "specifications are the target's; some must be, and some not"
+            )
+        return torch.stack([x, y, wanted * math.log(self.space.size / count)])
 
     def sample_target(self, count: int, generator: torch.Generator) -> Level:
         """Levels [count] of the target distribution."""

@@ -12,9 +12,10 @@ from proposer_rl.bench.results import Options
 from proposer_rl.bench.scales import TINY, Solvers
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
+from proposer_rl.proposals import Mixture
 from proposer_rl.rewards import performance_gain, task_difficulty
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask, faster_precision
+from proposer_rl.task import MazeTask, SpaceSettings, faster_precision
 from tests.graphs import NoHostReads, Tapes
 
 OPTIONS = Options(size="tiny", precision="fp32")
@@ -53,6 +54,23 @@ def test_recorded_measurements_follow_the_solver(monkeypatch: pytest.MonkeyPatch
                 with torch.enable_grad():
                     solvers.update()
     assert tapes.recorded == 3 * 2
+
+
+def test_a_mixture_can_favour_the_target() -> None:
+    mixture = Mixture(task().directions("target"), lambda choices, generators: choices)
+    even, favoured, disfavoured = mixture.shares(
+        torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    )
+    wanted = [pair == (0.2, 4) for pair in task().space.specifications]
+    assert sum(wanted) == 1 and even.tolist() == [0.25] * 4
+    assert favoured[wanted] == pytest.approx(4 / 7) and disfavoured[wanted] == pytest.approx(1 / 13)
+    assert favoured[[not here for here in wanted]].tolist() == pytest.approx([1 / 7] * 3)
+
+
+def test_a_space_without_the_target_cannot_favour_it() -> None:
+    elsewhere = replace(TINY, space=SpaceSettings(obstacle_fractions=[0.0], path_lengths=[2, 4]))
+    with pytest.raises(ValueError, match=r"proposer\.directions=target: 0 of the space's 2 spec"):
+        elsewhere.task(OPTIONS).directions("target")
 
 
 @pytest.mark.parametrize("observe_agent", [False, True])
