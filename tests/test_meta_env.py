@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.evaluation import ExactEvaluator
 from proposer_rl.mazes import Level, MazeEnv, SpecificationSpace, planes
-from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.meta_env import ReplayError, SolverTrainingEnv
 from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.proposals import Mixture, ProblemChoices
@@ -234,6 +236,55 @@ def test_with_common_random_numbers_equal_actions_have_equal_consequences() -> N
         returns = play(env, action)["next", "validation_return"]
         spread.append(returns.std(0).max())
     assert spread[0] == 0 < spread[1]
+
+
+def test_the_seed_decides_what_an_episode_draws() -> None:
+    env, actions, trained = meta_env(), some_actions(), []
+    for seed in (1, 2, 1):
+        env.set_seed(seed)
+        env.fork(solvers(1).snapshot()[0], env.streams)
+        play(env, actions)
+        levels, _ = env.last_training
+        trained.append(levels.walls)
+    assert torch.equal(trained[0], trained[2]) and not torch.equal(trained[0], trained[1])
+
+
+def interrupted(actions: torch.Tensor, after: int) -> tuple[dict, TensorDict]:
+    """An episode as it was before an update, and all of it."""
+    env, seen = meta_env(), {}
+
+    def pause() -> None:
+        episode = env.episode()
+        seen[len(episode["updates"])] = copy.deepcopy(episode)
+
+    env.fork(solvers(1).snapshot()[0], Streams(9), pause)
+    assert env.episode() is None
+    steps = play(env, actions)
+    assert sorted(seen) == list(range(1, L))
+    return seen[after], steps
+
+
+@pytest.mark.parametrize("after", [1, 3])
+def test_an_interrupted_episode_goes_on_where_it_was(after: int) -> None:
+    episode, whole = interrupted(some_actions(), after)
+    env, trained = meta_env(), []
+    update = env.solvers.update
+    env.solvers.update = lambda *arguments: trained.append(1) or update(*arguments)
+    env.fork(solvers(1).snapshot()[0], Streams(9))
+    env.resume(episode)
+    assert (play(env, some_actions()) == whole).all()
+    assert len(trained) == L - after
+    assert env.episode() is None
+
+
+def test_an_interrupted_episode_takes_no_other_action() -> None:
+    episode, _ = interrupted(some_actions(), 2)
+    env, actions = meta_env(), some_actions()
+    env.fork(solvers(1).snapshot()[0], Streams(9))
+    env.resume(episode)
+    actions[1, 0, 0] = (actions[1, 0, 0] + 1) % SPACE.size
+    with pytest.raises(ReplayError, match="another action for update 1 of the episode"):
+        play(env, actions)
 
 
 def test_refuses_lengths_and_solvers_that_make_no_sense() -> None:
