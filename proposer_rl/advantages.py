@@ -21,6 +21,15 @@ class CopiesBaseline(TensorDictModuleBase):
 
     Raises:
         ValueError: when called on fewer than two copies.
+
+    Example:
+        Three copies, one step each:
+
+        >>> reward = torch.tensor([1.0, 2.0, 6.0]).view(3, 1, 1)
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"next": {"reward": reward, "done": reward > 0}}, [3, 1])
+        >>> CopiesBaseline(gamma=1.0)(rollout)["advantage"].flatten()
+        tensor([-3.0000, -1.5000,  4.5000])
     """
 
     def __init__(self, gamma: float) -> None:

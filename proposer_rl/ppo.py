@@ -83,6 +83,16 @@ class PPO:
 
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of copies.
+
+    Example:
+        >>> from proposer_rl import MazeEnv, Population, UNet, generate_levels
+        >>> from proposer_rl.models import map_actor_critic
+        >>> copies = Population(lambda: UNet(channels=(8, 8)), copies=2)
+        >>> env = MazeEnv(generate_levels(torch.full((2, 4), 0.2), 4, 6, 6))
+        >>> learner = PPO(env, map_actor_critic(copies), PPOSettings(horizon=5, epochs=1))
+        >>> rollout, metrics = learner.update()
+        >>> rollout.batch_size
+        torch.Size([2, 4, 5])
     """
 
     def __init__(

@@ -68,6 +68,11 @@ class ProblemChoices(Proposals):
 
     The P draws are independent, so that all batches of one policy look alike: the composition of
     a batch varies by about 1 / sqrt(P) only.
+
+    Example:
+        >>> proposals = ProblemChoices(6, generate=lambda choices, generators: choices)
+        >>> proposals.action_spec(2, 4, torch.device("cpu")).shape
+        torch.Size([2, 4])
     """
 
     def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
@@ -94,6 +99,19 @@ class Mixture(Proposals):
 
     Raises:
         ValueError: if ``directions`` is no matrix, or not finite.
+
+    Example:
+        Two choices, and one number that says how much more of the second there is:
+
+        >>> import math
+        >>> directions = torch.tensor([[0.0, 1.0]])
+        >>> mixture = Mixture(directions, generate=lambda choices, generators: choices)
+        >>> mixture.shares(torch.tensor([[0.0], [math.log(3)]]))
+        tensor([[0.5000, 0.5000],
+                [0.2500, 0.7500]])
+        >>> choices = mixture.draw(torch.tensor([[math.log(3)]]), 8, [torch.Generator()])
+        >>> choices.sum()  # the second occurs in 3/4 of 8 problems
+        tensor(6)
     """
 
     def __init__(self, directions: Tensor, generate: Generate) -> None:

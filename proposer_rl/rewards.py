@@ -33,7 +33,14 @@ Reward = Callable[[TrainingStep], Tensor]
 
 
 def performance_gain(step: TrainingStep) -> Tensor:
-    """How much the Solver's return on the validation levels went up (the paper's reward)."""
+    """How much the Solver's return on the validation levels went up (the paper's reward).
+
+    Example:
+        >>> import torch
+        >>> before, after = torch.tensor([0.1, 0.4]), torch.tensor([0.3, 0.2])
+        >>> performance_gain(TrainingStep(None, None, None, before, after))
+        tensor([ 0.2000, -0.2000])
+    """
     return step.return_after - step.return_before
 
 
@@ -53,6 +60,15 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
 
     Returns:
         bool [*B].
+
+    Example:
+        >>> import torch
+        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
+        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
+        >>> first_episode_success(rollout)  # the second one does not count
+        tensor([False])
     """
     done = rollout["next", "done"].squeeze(-1).long()
     first = done.cumsum(-1) - done == 0  # up to and including the first end

@@ -50,6 +50,13 @@ def variance_components(gains: Tensor) -> Signal:
 
     Raises:
         ValueError: for fewer than two proposals or two copies of each.
+
+    Example:
+        Two proposals that differ much, and two copies of each that do not:
+
+        >>> signal = variance_components(torch.tensor([[0.1, 0.2], [0.6, 0.7]]))
+        >>> round(signal.noise, 3), round(signal.signal, 3)
+        (0.071, 0.35)
     """
     groups, replicates = gains.shape
     if min(groups, replicates) < 2:

@@ -19,6 +19,13 @@ class Streams:
     Args:
         seed: the run's seed.
         scope: keys put before every generator's own.
+
+    Example:
+        >>> streams = Streams(7)
+        >>> first = torch.rand(2, generator=streams.generator("levels", 3))
+        >>> again = torch.rand(2, generator=Streams(7).generator("levels", 3))
+        >>> torch.equal(first, again)
+        True
     """
 
     def __init__(self, seed: int, *scope: str | int) -> None:

@@ -378,4 +378,5 @@ def _cost_text(result: dict[str, Any], seeds: int) -> str:
 
 
 if __name__ == "__main__":
+    sys.argv[0] = "train"  # the name in the shell, bin/train: Hydra installs completion for it
     main()

@@ -27,6 +27,17 @@ def distance_field(walls: Tensor, source: Tensor, limit: int | None = None) -> T
     Returns:
         int64 ``[*B, H, W]``: the least number of moves from the source, -1 for obstacles, for cells
         that cannot be reached, and for cells beyond the limit.
+
+    Example:
+        >>> level = Level.from_text('''
+        ... S.#
+        ... #..
+        ... #.G
+        ... ''')
+        >>> distance_field(level.walls, level.start)
+        tensor([[ 0,  1, -1],
+                [-1,  2,  3],
+                [-1,  3,  4]])
     """
     height, width = walls.shape[-2:]
     free = cells_first(~walls)
@@ -51,6 +62,14 @@ def shortest_path_length(level: Level) -> Tensor:
 
     Returns:
         int64 ``[*B]``, -1 where the goal cannot be reached.
+
+    Example:
+        >>> shortest_path_length(Level.from_text('''
+        ... S.#
+        ... #..
+        ... #.G
+        ... '''))
+        tensor(4)
     """
     height, width = level.walls.shape[-2:]
     start, goal = (cell_index(cell, width).flatten() for cell in (level.start, level.goal))

@@ -27,6 +27,14 @@ class LevelDistribution:
 
     Raises:
         ValueError: If a specification cannot be met, or there is none.
+
+    Example:
+        >>> easy_and_hard = LevelDistribution([(0.0, 2), (0.4, 12)])
+        >>> fractions, lengths = easy_and_hard.decode(torch.tensor([0, 1]))
+        >>> lengths
+        tensor([ 2, 12])
+        >>> easy_and_hard.sample((4, 8)).batch_size
+        torch.Size([4, 8])
     """
 
     def __init__(
@@ -140,6 +148,13 @@ class SpecificationSpace(LevelDistribution):
 
     Raises:
         ValueError: If an entry is repeated or a specification cannot be met.
+
+    Example:
+        >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
+        >>> space.shape, space.size
+        ((2, 3), 6)
+        >>> space.specifications[4]
+        LevelSpec(obstacle_fraction=0.2, path_length=4)
     """
 
     def __init__(

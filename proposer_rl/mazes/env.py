@@ -44,6 +44,15 @@ class MazeEnv(EnvBase):
 
     Raises:
         ValueError: If ``max_steps`` is less than 1.
+
+    Example:
+        >>> from proposer_rl import Level
+        >>> env = MazeEnv(Level.from_text("S.G"))
+        >>> state = env.reset()
+        >>> for _ in range(2):
+        ...     state = env.step(state.set("action", torch.tensor(3)))["next"]
+        >>> state["reward"], state["terminated"]
+        (tensor([0.9900]), tensor([True]))
     """
 
     def __init__(

@@ -73,6 +73,14 @@ def generate_levels(
         ValueError: If an argument is invalid, or if a specification is impossible or so rare that
             the mechanism did not meet it within a bounded number of candidates; the message names
             the specification.
+
+    Example:
+        >>> levels = generate_levels(0.25, [3, 5], height=6, width=6)
+        >>> levels.walls.sum((-2, -1))
+        tensor([9, 9])
+        >>> from proposer_rl import shortest_path_length
+        >>> shortest_path_length(levels)
+        tensor([3, 5])
     """
     target = _target_device(obstacle_fraction, path_length, generator, device)
     fraction, length = _broadcast(obstacle_fraction, path_length)

@@ -52,6 +52,17 @@ class Level(TensorClass):
         Raises:
             ValueError: If a drawing is not a rectangle, holds another character, or does not
                 have exactly one start and one goal; or if the drawings differ in size.
+
+        Example:
+            >>> level = Level.from_text('''
+            ... S.#
+            ... #.G
+            ... ''')
+            >>> level.goal
+            tensor([1, 2])
+            >>> print(level.to_text())
+            S.#
+            #.G
         """
         if isinstance(text, str):
             return _parse(text)

@@ -160,7 +160,7 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
 def uniform_noise(
     shape: torch.Size, steps: int, generators: list[torch.Generator] | None, device: torch.device
 ) -> Tensor:
-    """Uniform numbers [T, *shape] for T steps; slice [:, k] comes from the k-th generator.
+    """Uniform numbers ``[T, *shape]`` for T steps; slice [:, k] comes from the k-th generator.
 
     Without generators all of it comes from torch's default one.
     """

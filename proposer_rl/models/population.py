@@ -42,6 +42,11 @@ class Population(nn.Module):
     Raises:
         ValueError: for fewer than one copy or core, an unknown precision or way, or a network with
             buffers.
+
+    Example:
+        >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
+        >>> population(torch.ones(5, 10, 3)).shape
+        torch.Size([5, 10, 2])
     """
 
     def __init__(

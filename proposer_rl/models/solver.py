@@ -29,6 +29,13 @@ def map_actor_critic(
             False if they belong to the level, which then costs one forward pass per rollout.
         planes_key: entry of the planes.
         agent_key: entry of the agent's row and column, int64 [*B, 2].
+
+    Example:
+        >>> from proposer_rl import MazeEnv, UNet, generate_levels
+        >>> solver = map_actor_critic(UNet(channels=(8, 8)))
+        >>> env = MazeEnv(generate_levels(torch.full((5,), 0.2), 4, 6, 6))
+        >>> env.rollout(3, solver.actor(), break_when_any_done=False)["logits"].shape
+        torch.Size([5, 3, 4])
     """
     maps = TensorDictModule(network, [planes_key], ["policy_map", "value_map"])
     head = TensorDictModule(

@@ -42,6 +42,12 @@ class UNet(nn.Module):
 
     Raises:
         ValueError: if a channel count is not a multiple of ``groups``.
+
+    Example:
+        >>> network = UNet(channels=(8, 16))
+        >>> logits, value = network(torch.zeros(2, 3, 9, 13))
+        >>> logits.shape, value.shape
+        (torch.Size([2, 4, 9, 13]), torch.Size([2, 1, 9, 13]))
     """
 
     def __init__(
