@@ -38,7 +38,7 @@ from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
 from proposer_rl.rewards import Reward
 from proposer_rl.settings import settings
-from proposer_rl.solver_view import SolverView
+from proposer_rl.solver_view import SolverView, episode_return, log_success
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask
 
@@ -56,6 +56,7 @@ class ProposerSettings:
         observes: what is seen beside the probes.
         number_bands: frequencies at which that is told to the network; 0: as it is.
         common_random_numbers: whether the copies differ by their actions alone.
+        measure: what the gain is counted in, on the validation levels.
         proposals: an action's meaning: the choice of every problem, or a mixture of choices.
         ratio: of ``problems``: PPO's ratio over the P draws together, or for each draw.
         directions: of a ``mixture``: what an action's numbers stand for.
@@ -77,6 +78,7 @@ class ProposerSettings:
     )
     number_bands: Annotated[int, Ge(0)] = 0
     common_random_numbers: bool = False
+    measure: Literal["return", "log_success"] = "return"
     proposals: Literal["problems", "mixture"] = "mixture"
     ratio: Literal["joint", "per_problem"] = "per_problem"
     directions: Literal["linear", "target", "quadratic", "all"] = "linear"
@@ -228,6 +230,7 @@ def _mixture(task: MazeTask, chosen: ProposerSettings) -> _Action:
     )
 
 
+MEASURES = {"return": episode_return, "log_success": log_success}
 ACTIONS = {"problems": _problems, "mixture": _mixture}
 
 
@@ -236,6 +239,7 @@ def _view(task: MazeTask, chosen: ProposerSettings) -> SolverView:
         target=task.sample_target,
         evaluate=task.evaluate,
         probe=task.probe,
+        measure=MEASURES[chosen.measure],
         validation_levels=chosen.validation_levels,
         probe_levels=chosen.probe_levels,
         device=task.device,

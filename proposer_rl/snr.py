@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.meta_env import SolverTrainingEnv
-from proposer_rl.solver_view import Evaluate, Levels
+from proposer_rl.solver_view import Evaluate, Levels, Measure, episode_return
 from proposer_rl.streams import Streams
 
 
@@ -92,6 +92,7 @@ def total_gains(
     levels: Levels,
     evaluate: Evaluate,
     streams: Streams,
+    measure: Measure = episode_return,
 ) -> Tensor:
     """Gains of copies of a Solver over one episode, level by level.
 
@@ -100,24 +101,25 @@ def total_gains(
         solver: a snapshot of one Solver, batch [].
         actions: those of G proposals in an episode of T steps, [T, G, ...]; R copies follow each.
         levels: on which the gain is measured, [E].
-        evaluate: measures it.
+        evaluate: the Solvers' performance there.
         streams: of all randomness, which is different for every copy.
+        measure: what counts of the performance, a number for each level or several.
 
     Returns:
-        float [G, R, E].
+        float [G, R, E], or [G, R, E, ...] for several measures.
     """
     groups = actions.shape[1]
     replicates = env.batch_size[0] // groups
 
-    def returns() -> Tensor:
-        return evaluate(env.solvers.agent, levels, streams.generator("gain"))["return"]
+    def measured() -> Tensor:
+        return measure(evaluate(env.solvers.agent, levels, streams.generator("gain")))
 
     env.fork(solver, streams)
-    before = returns()
+    before = measured()
     state = env.reset()
     for action in actions.repeat_interleave(replicates, 1):
         _, state = env.step_and_maybe_reset(state.set("action", action))
-    return (returns() - before).unflatten(0, (groups, replicates))
+    return (measured() - before).unflatten(0, (groups, replicates))
 
 
 def by_validation_size(gains: Tensor, sizes: Sequence[int]) -> dict[int, Signal]:

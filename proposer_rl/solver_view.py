@@ -21,8 +21,30 @@ SampleLevels = Callable[[int, torch.Generator], Levels]
 # has no use for the generator.
 Evaluate = Callable[[ActorCritic, Levels, torch.Generator], TensorDictBase]
 
+# What such performance on levels [*B] counts for, float [*B].
+Measure = Callable[[TensorDictBase], Tensor]
+
 # What is seen of K Solvers on levels [C]: float [K, C, ...].
 Probe = Callable[[ActorCritic, Levels], Tensor]
+
+
+LEAST_SUCCESS = 1e-3
+"""Below it, success hardly counts for :func:`log_success`."""
+
+
+def episode_return(performance: TensorDictBase) -> Tensor:
+    """The return on each level (the paper's measure)."""
+    return performance["return"]
+
+
+def log_success(performance: TensorDictBase) -> Tensor:
+    """The logarithm of the probability of success on each level, not below that of 0.001.
+
+    A beginner's return on the target hardly moves, whatever it trains on: from one success in five
+    hundred to one in a hundred is a step of 0.008. Its logarithm moves by 1.6, and shows what was
+    due to the training.
+    """
+    return (performance["success"] + LEAST_SUCCESS).log()
 
 
 class SolverView:
@@ -32,6 +54,7 @@ class SolverView:
         target: draws validation and probe levels.
         evaluate: the Solvers' performance on the validation levels.
         probe: their answers on the probe levels.
+        measure: what counts of it; its mean over the levels is called the validation return.
         validation_levels: size E of the validation batch.
         probe_levels: number of probes C.
         device: where the levels live.
@@ -46,6 +69,7 @@ class SolverView:
         target: SampleLevels,
         evaluate: Evaluate,
         probe: Probe,
+        measure: Measure = episode_return,
         validation_levels: int = 75,
         probe_levels: int = 16,
         device: torch.device | str | None = None,
@@ -61,6 +85,7 @@ class SolverView:
         self._target = target
         self._evaluate = evaluate
         self._probe = probe
+        self._measure = measure
         self.draw_levels(Streams(0))
 
     def draw_levels(self, streams: Streams) -> None:
@@ -71,7 +96,7 @@ class SolverView:
 
     @torch.no_grad()
     def validation_return(self, solver: ActorCritic, *place: int) -> Tensor:
-        """Mean return on the validation levels, float [K].
+        """Mean over the validation levels of what is measured, float [K].
 
         Args:
             solver: K Solvers.
@@ -79,7 +104,8 @@ class SolverView:
                 that draws episodes.
         """
         generator = self.streams.generator("evaluation", *place, device=self.device)
-        return self._evaluate(solver, self.validation, generator)["return"].mean(1)
+        performance = self._evaluate(solver, self.validation, generator)
+        return self._measure(performance).mean(1)
 
     @torch.no_grad()
     def see(self, solver: ActorCritic) -> Tensor:

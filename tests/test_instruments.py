@@ -40,9 +40,15 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
     rows = json.loads(output.read_text())
     stages = sorted({row["updates"] for row in rows})
     assert stages == [4, 6]
-    assert len(rows) == len(stages) * len(snr.EXPLORATIONS) * 2
+    assert len(rows) == len(stages) * len(snr.EXPLORATIONS) * 2 * 2
     for row in rows:
         assert row["noise"] >= 0 and row["signal"] >= 0 and row["low"] <= row["high"]
+    by_return, by_logarithm = (
+        [row for row in rows if row["measure"] == name] for name in ("return", "log_success")
+    )
+    assert all(
+        one["mean"] != other["mean"] for one, other in zip(by_return, by_logarithm, strict=True)
+    )
     said = capsys.readouterr().out
     assert "learnt: total gain over 3 updates" in said and "uneven" in said
     assert call(snr, str(run), *sizes) == 0

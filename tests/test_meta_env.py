@@ -16,7 +16,7 @@ from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.proposals import Mixture, ProblemChoices
 from proposer_rl.rewards import Reward, performance_gain, task_difficulty
-from proposer_rl.solver_view import SolverView
+from proposer_rl.solver_view import Measure, SolverView, episode_return, log_success
 from proposer_rl.streams import Streams
 
 K, P, C, E, L = 3, 4, 2, 6, 5
@@ -50,22 +50,27 @@ def solvers(copies: int, learning_rate: float = 3e-3) -> PPO:
     return PPO(env, map_actor_critic(population), settings)
 
 
-def view(probe_levels: int = C) -> SolverView:
+def view(probe_levels: int = C, measure: Measure = episode_return) -> SolverView:
     return SolverView(
         target=target,
         evaluate=evaluate,
         probe=probe,
+        measure=measure,
         validation_levels=E,
         probe_levels=probe_levels,
     )
 
 
 def meta_env(
-    reward: Reward = performance_gain, *, probe_levels: int = C, **options
+    reward: Reward = performance_gain,
+    *,
+    probe_levels: int = C,
+    measure: Measure = episode_return,
+    **options,
 ) -> SolverTrainingEnv:
     parts = {"proposals": ProblemChoices(SPACE.size, generate), "episode_length": L}
     return SolverTrainingEnv(
-        solvers(K), view=view(probe_levels), reward=reward, **{**parts, **options}
+        solvers(K), view=view(probe_levels, measure), reward=reward, **{**parts, **options}
     )
 
 
@@ -130,6 +135,18 @@ def test_rewards_sum_to_the_total_gain_on_the_one_validation_batch() -> None:
     final = evaluate(env.solvers.agent, validation, None)["return"].mean(1)
     initial = evaluate(solvers(1).agent, validation, None)["return"].mean(1)
     torch.testing.assert_close(steps["next", "reward"].sum((1, 2)), final - initial)
+
+
+def test_the_gain_is_counted_in_what_is_measured() -> None:
+    env = meta_env(measure=log_success)
+    env.fork(solvers(1).snapshot()[0], Streams(9))
+    steps = play(env, some_actions())
+    validation = target(E, Streams(9).generator("validation"))
+    success = evaluate(env.solvers.agent, validation, None)["success"]
+    after = (success + 0.001).log().mean(1)
+    torch.testing.assert_close(steps["next", "validation_return"][:, -1, 0], after)
+    before = steps["validation_return"][:, 0, 0]
+    torch.testing.assert_close(steps["next", "reward"].sum((1, 2)), after - before)
 
 
 def test_all_copies_start_as_the_forked_solver() -> None:

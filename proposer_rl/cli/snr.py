@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import torch
 from rich.console import Console
 from rich.table import Table
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.distributions import Dirichlet
 from tqdm import tqdm
@@ -24,6 +24,7 @@ from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.cli.errors import BAD_INPUT, SIGNALLED
 from proposer_rl.cli.train import make_task
 from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.methods import MEASURES
 from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
 from proposer_rl.rewards import performance_gain
 from proposer_rl.run_folder import write_atomically
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """A row for every checkpoint, exploration and validation size.
+    """A row for every checkpoint, exploration, measure and validation size.
 
     Raises:
         ConfigError, CheckpointError: if a folder is no run's, or a checkpoint cannot be read.
@@ -86,19 +87,31 @@ def _measure(
     actions = draw(env.steps, arguments.proposals, streams.generator("actions"))
     most = max(arguments.levels)
     levels = task.sample_target(most, streams.generator("levels", device=task.device))
+
+    def all_measures(performance: TensorDictBase) -> Tensor:
+        return torch.stack([MEASURES[name](performance) for name in arguments.measures], -1)
+
     gains = total_gains(
-        env, solver, actions.to(task.device), levels, task.evaluate, streams.within(exploration)
+        env,
+        solver,
+        actions.to(task.device),
+        levels,
+        task.evaluate,
+        streams.within(exploration),
+        all_measures,
     )
     return [
         {
             "run": folder.name,
             "updates": state["updates"],
             "exploration": exploration,
+            "measure": measure,
             "lookahead": lookahead,
             "levels": size,
             **asdict(signal),
         }
-        for size, signal in by_validation_size(gains.cpu(), arguments.levels).items()
+        for measure, own in zip(arguments.measures, gains.cpu().unbind(-1), strict=True)
+        for size, signal in by_validation_size(own, arguments.levels).items()
     ]
 
 
@@ -191,14 +204,15 @@ def _print(rows: list[dict[str, Any]]) -> None:
     for run in dict.fromkeys(row["run"] for row in rows):
         own = [row for row in rows if row["run"] == run]
         table = Table(
-            "updates", "exploration", "levels", "mean gain", "noise", "signal", "ratio", "95 %",
+            "updates", "exploration", "measure", "levels",
+            "mean gain", "noise", "signal", "ratio", "95 %",
             title=f"{run}: total gain over {own[0]['lookahead']} updates",
             caption="noise, signal: standard deviations within and between proposals; "
             "ratio: of their squares, with its confidence interval",
         )  # fmt: skip
         for row in own:
             table.add_row(
-                str(row["updates"]), row["exploration"], str(row["levels"]),
+                str(row["updates"]), row["exploration"], row["measure"], str(row["levels"]),
                 *(f"{row[key]:.4f}" for key in ("mean", "noise", "signal")),
                 f"{row['ratio']:.2f}", f"{row['low']:.2f} - {row['high']:.2f}",
             )  # fmt: skip
@@ -238,6 +252,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--explorations", nargs="+", default=list(EXPLORATIONS), metavar="NAME",
         help=f"among {', '.join(EXPLORATIONS)} (all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--measures", nargs="+", default=list(MEASURES), choices=list(MEASURES),
+        help="what gain is counted in (both)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
     parser.add_argument("--output", type=Path, help="a JSON file for the rows")

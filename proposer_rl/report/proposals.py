@@ -53,19 +53,20 @@ def gains(study: Study) -> Drawing | None:
     groups = proposers(study)
     if not groups:
         return None
-    every = [gain for g in groups for r in g.runs for c in r.cycles for gain in c["total_gain"]]
-    margin = 0.05 * (max(every) - min(every) or 1)
-    limits = (min(*every, 0.0) - margin, max(every) + margin)
+    limits = {
+        measure: _limits([group for group in groups if _measure(group) == measure])
+        for measure in {_measure(group) for group in groups}
+    }
     return Drawing(
         "gains",
         "Total gain of the copies in each cycle (the paper's Figure 4)",
-        "Dots: the total gain in mean target return of every copy of every seed over one "
+        "Dots: the total gain on the target of every copy of every seed over one "
         "meta-episode. Lines: maximum and mean over a cycle's copies, averaged over the seeds.",
         [
             Panel(
                 group.label,
                 f"Total gains of the copies against Solver updates, {group.label}.",
-                partial(_draw_gains, group=group, limits=limits),
+                partial(_draw_gains, group=group, limits=limits[_measure(group)]),
             )
             for group in groups
         ],
@@ -185,6 +186,18 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def _measure(group: Group) -> str:
+    """What the gains are counted in."""
+    return str(group.runs[0].config["proposer"].get("measure", "return")).replace("_", " ")
+
+
+def _limits(groups: Sequence[Group]) -> tuple[float, float]:
+    """Of an axis that shows all gains of these groups, and zero."""
+    every = [gain for g in groups for r in g.runs for c in r.cycles for gain in c["total_gain"]]
+    margin = 0.05 * (max(every) - min(every) or 1)
+    return min(*every, 0.0) - margin, max(every) + margin
+
+
 def _draw_gains(figure: FigureBase, group: Group, limits: tuple[float, float]) -> None:
     axes = axes_of(figure)
     colour = look(group.label).colour
@@ -205,7 +218,7 @@ def _draw_gains(figure: FigureBase, group: Group, limits: tuple[float, float]) -
         title=group.label,
         ylim=limits,
         xlabel="Solver updates",
-        ylabel="total gain in target return",
+        ylabel=f"total gain in target {_measure(group)}",
     )
     axes.legend(loc="best")
 
