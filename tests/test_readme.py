@@ -42,6 +42,15 @@ def test_the_code_runs() -> None:
     assert {"rollout", "snapshot"} <= names.keys()
 
 
+@pytest.mark.parametrize("page", ["gymnasium"])
+def test_the_code_of_the_pages_runs(page: str) -> None:
+    found = blocks("python", (DOCS / f"{page}.md").read_text(encoding="utf-8"))
+    assert found
+    names: dict[str, object] = {}
+    for block in found:
+        exec(block, names)
+
+
 @pytest.mark.parametrize("arguments", commands("bin/train"), ids=" ".join)
 def test_the_commands_run(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
