@@ -43,18 +43,6 @@ def test_the_code_runs() -> None:
     assert {"rollout", "snapshot"} <= names.keys()
 
 
-@pytest.mark.parametrize("page", ["gymnasium", "levels"])
-def test_the_code_of_the_pages_runs(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = blocks("python", (DOCS / f"{page}.md").read_text(encoding="utf-8"))
-    assert found
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    for block in found:
-        exec(block, names)
-
-
 @pytest.mark.parametrize("arguments", commands("bin/train"), ids=" ".join)
 def test_the_commands_run(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

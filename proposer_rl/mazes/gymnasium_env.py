@@ -78,7 +78,7 @@ class MazeGymnasiumEnv(gymnasium.Env[Any, Any]):
 
         Raises:
             ValueError: If the action is not 0 up, 1 down, 2 left or 3 right.
-            ResetNeeded: If the episode is over.
+            gymnasium.error.ResetNeeded: If the episode is over.
         """
         step = self._mazes.step(np.asarray(action).reshape(-1))
         return (
@@ -169,7 +169,7 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises:
             ValueError: If an action is not 0 up, 1 down, 2 left or 3 right.
-            ResetNeeded: If mazes that are over were not reset, in the mode ``"Disabled"``.
+            gymnasium.error.ResetNeeded: If mazes that are over were not reset (``"Disabled"``).
         """
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             return self._step_or_reset(actions)

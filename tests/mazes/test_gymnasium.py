@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -52,16 +49,6 @@ def test_gymnasiums_check_finds_nothing_not_even_a_warning(arguments: dict[str, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make(**arguments).unwrapped)
-
-
-def test_it_is_found_without_importing_the_package() -> None:
-    """In Gymnasium's own way since 1.0: the module is named in front of the id."""
-    code = f"import gymnasium; print(gymnasium.make('proposer_rl:{ID}').reset(seed=0)[0].keys())"
-    command = [sys.executable, "-c", code]
-    root = Path(__file__).parents[2]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert result.returncode == 0, result.stderr
-    assert "planes" in result.stdout
 
 
 @pytest.mark.parametrize("path", [3, [2, 4]])
