@@ -167,6 +167,8 @@ def _solver(run: Path, config: RunConfig, task: MazeTask, state: State) -> Actor
 def _choose(name: str, task: MazeTask) -> _Choice:
     limit = task.maze.max_steps
     if Path(name).suffix in SUFFIXES:
+        if not Path(name).is_file():
+            raise ConfigError(f"--levels {name}: there is no such file")
         return _Choice(read_levels(name), lambda length: max(limit, SLACK * length))
     for distribution in task.distributions:
         if name.casefold() == distribution.casefold():
