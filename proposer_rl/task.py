@@ -186,14 +186,18 @@ class MazeTask:
         self._rate = Captured(self._rated, self.recorder)
         self._measure = Captured(self._measured, self.recorder)
         self._see = Captured(self._seen, self.recorder)
+        self._evaluation = evaluation
         self._measured_on = {
-            name: self.distributions[name].sample(
-                evaluation.levels,
-                Streams(evaluation.seed, "evaluation", name).generator(),
-                device=self.device,
-            )
-            for name in evaluation.distributions
+            name: self.evaluation_levels(name) for name in evaluation.distributions
         }
+
+    def evaluation_levels(self, name: str) -> Level:
+        """The fixed levels of a distribution on which Solvers are measured, [E]."""
+        return self.distributions[name].sample(
+            self._evaluation.levels,
+            Streams(self._evaluation.seed, "evaluation", name).generator(),
+            device=self.device,
+        )
 
     def solvers(self, streams: Sequence[Streams]) -> PPO:
         """A population with one Solver for each of K streams, and its environment [K, P]."""

@@ -51,6 +51,7 @@ TRAIN = sorted({call for _, program, call in commands() if program == "train"})
 OTHERS = sorted({(program, call) for _, program, call in commands() if program != "train"})
 
 
+@pytest.mark.usefixtures("own_folder")
 @pytest.mark.parametrize("page", CODE)
 def test_the_code_runs(page: str) -> None:
     """The blocks of a page one after another, as a reader would type them."""

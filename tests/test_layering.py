@@ -20,6 +20,7 @@ LAYERS = [
         *("settings", "streams", "signals", "finite", "machine"),
     },
     {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
+    {"level_sets"},
     {"meta_env"},
     {"curricula", "snr"},
     {"experiment"},

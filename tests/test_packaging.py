@@ -127,3 +127,21 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert citation["title"] == PROJECT["name"]
     headings = re.findall(r"^## \[([^]]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == version
+
+
+def test_levels_and_the_gymnasium_environment_come_along(
+    installed: Installed, tmp_path: Path
+) -> None:
+    said = installed("proposer-eval", "--help", folder=tmp_path)
+    assert "that comes along: shapes" in " ".join(said.split())
+    code = "import gymnasium; print(gymnasium.make('proposer_rl:proposer_rl/Maze-v0'))"
+    process = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(installed.site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 0, process.stderr
+    assert "proposer_rl/Maze-v0" in process.stdout

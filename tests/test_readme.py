@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl.cli.evaluate import main as evaluate_main
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
@@ -77,6 +78,23 @@ def test_the_commands_about_runs_run(
         write_run(tmp_path / folder / "run")
     for arguments in found:
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
+
+
+def test_the_commands_about_levels_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a Solver of a few updates, and with the file of levels that docs/levels.md shows."""
+    monkeypatch.chdir(tmp_path)
+    (drawn,) = blocks("text", (DOCS / "levels.md").read_text(encoding="utf-8"))
+    Path("my_levels.txt").write_text(drawn)
+    monkeypatch.setattr(
+        sys, "argv", ["bin/train", "+method=target", "+scale=smoke", "hydra.run.dir=my_run"]
+    )
+    GlobalHydra.instance().clear()
+    main()
+    found = commands("bin/eval")
+    assert found
+    for arguments in found:
+        evaluate_main(arguments)
+    assert Path("scores.csv").is_file() and Path("paths.png").is_file()
 
 
 def test_the_files_that_it_shows_exist() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from gymnasium import register
+
 from proposer_rl.mazes.distance import distance_field, shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.dynamics import successors
@@ -27,3 +29,10 @@ __all__ = [
     "successors",
     "validate_levels",
 ]
+
+# By name, so that Gymnasium's environments are imported when one is made.
+register(
+    "proposer_rl/Maze-v0",
+    entry_point="proposer_rl.mazes.gymnasium_env:MazeGymnasiumEnv",
+    vector_entry_point="proposer_rl.mazes.gymnasium_env:MazeVectorEnv",
+)

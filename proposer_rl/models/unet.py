@@ -11,6 +11,8 @@ from torch.nn import functional as F
 
 from proposer_rl.models.convolution import Conv3x3
 
+LARGEST_MATRIX = 2**22  # numbers in the weights of an interpolation: a 64x64 grid from its half
+
 
 class DoubleConv(nn.Sequential):
     """Twice: 3x3 convolution, GroupNorm, ReLU."""
@@ -96,9 +98,12 @@ def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
     """Interpolate maps [B, C, h, w] bilinearly to [B, C, H, W], as ``F.interpolate`` does.
 
     One product with a constant matrix: on small maps its backward pass takes a fraction of the time
-    of the kernel's, and the result stays in the channels-last layout.
+    of the kernel's, and the result stays in the channels-last layout. Maps for which the matrix
+    would be large are left to the kernel.
     """
     height, width = size
+    if height * width * maps.shape[-2:].numel() > LARGEST_MATRIX:
+        return F.interpolate(maps, (height, width), mode="bilinear")
     pixels = maps.permute(0, 2, 3, 1).flatten(1, 2)  # [B, h * w, C]
     weights = _interpolation(*maps.shape[-2:], height, width, maps.device).to(maps.dtype)
     return (weights @ pixels).unflatten(1, (height, width)).permute(0, 3, 1, 2)

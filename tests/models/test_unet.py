@@ -9,7 +9,7 @@ from proposer_rl.models import UNet
 from proposer_rl.models.unet import upsample
 
 
-@pytest.mark.parametrize(("height", "width"), [(10, 10), (4, 4), (13, 7), (21, 21)])
+@pytest.mark.parametrize(("height", "width"), [(10, 10), (4, 4), (13, 7), (21, 21), (99, 80)])
 def test_maps_have_the_resolution_of_the_input(height: int, width: int) -> None:
     policy, value = UNet(channels=(8, 16, 16), groups=4)(torch.rand(2, 3, height, width))
     assert policy.shape == (2, 4, height, width)
@@ -53,6 +53,12 @@ def test_every_layer_is_orthogonal() -> None:
 def test_refuses_channels_that_groups_do_not_divide() -> None:
     with pytest.raises(ValueError, match=r"multiples of groups=8, got \[12, 16\]"):
         UNet(channels=(12, 16), groups=8)
+
+
+def test_large_grids_need_no_large_matrix() -> None:
+    maps = torch.rand(1, 2, 300, 300)  # the matrix would have 32 billion numbers
+    expected = F.interpolate(maps, (601, 600), mode="bilinear")
+    torch.testing.assert_close(upsample(maps, (601, 600)), expected)
 
 
 @pytest.mark.parametrize("small", [(1, 1), (2, 2), (5, 5), (3, 6)])

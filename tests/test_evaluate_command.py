@@ -1,0 +1,152 @@
+"""``bin/eval`` as users call it, on a run of a few updates."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from proposer_rl.checkpoint import load_latest, save_checkpoint
+from proposer_rl.cli.evaluate import SHOWN, main
+from proposer_rl.cli.train import main as train
+from proposer_rl.level_sets import shipped_levels
+from proposer_rl.run_folder import read_csv
+
+KEYS = ["success", "return", "greedy_success", "greedy_return"]
+
+
+@pytest.fixture
+def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Calls the command; returns its exit code and what it said."""
+
+    def call(*arguments: object) -> tuple[int, str]:
+        code = 0
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        said = capsys.readouterr()
+        return code, said.err if code else said.out
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two Solvers that were trained side by side."""
+    folder = tmp_path_factory.mktemp("runs") / "trained"
+    settings = ["+scale=smoke", "progress=false", "seeds=[3,5]", "evaluation.levels=40"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            sys, "argv", ["train", "+method=target", *settings, f"hydra.run.dir={folder}"]
+        )
+        GlobalHydra.instance().clear()
+        train()
+    return folder
+
+
+@pytest.mark.parametrize("name", ["ID", "ood"])
+def test_a_distribution_gives_the_runs_own_measurements(
+    name: str, run: Path, tmp_path: Path, evaluate
+) -> None:
+    code, said = evaluate(run, "--levels", name, "-o", tmp_path / "rows.json")
+    assert code == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert len(rows) == 2 * 40
+    for measured in read_csv(run / "metrics.csv")[-2:]:
+        own = [row for row in rows if row["seed"] == measured["seed"]]
+        for key in KEYS:
+            mean = sum(row[key] for row in own) / len(own)
+            assert mean == pytest.approx(measured[f"{name.lower()}_{key}"], abs=1e-6)
+    assert {(row["max_steps"], row["height"], row["updates"]) for row in rows} == {(10, 5, 6)}
+    assert f"the {SHOWN} hardest of 40 levels" in said and "mean of 40" in said
+    assert "Means over the seeds" in " ".join(said.split())
+
+
+def test_the_set_that_comes_along(run: Path, tmp_path: Path, evaluate) -> None:
+    files = {name: tmp_path / name for name in ("rows.csv", "rows.json", "sheet.png")}
+    first = evaluate(run, "-o", files["rows.csv"], "--pictures", files["sheet.png"])
+    assert first == evaluate(run, "--levels", "shapes", "-o", files["rows.json"])
+    assert first[0] == 0 and "spiral_21" in first[1]
+    with open(files["rows.csv"], newline="") as file:
+        table = list(csv.DictReader(file))
+    rows = json.loads(files["rows.json"].read_text())
+    assert [{key: str(value) for key, value in row.items()} for row in rows] == table
+    levels = shipped_levels("shapes")
+    assert [row["level"] for row in rows[::2]] == list(levels)
+    for row in rows:
+        assert row["max_steps"] == max(10, 2 * row["path_length"])
+        assert (row["height"], row["width"]) == tuple(levels[row["level"]].walls.shape)
+    assert files["sheet.png"].read_bytes().startswith(b"\x89PNG")
+    assert files["sheet.png"].stat().st_size > 10_000
+
+
+def test_a_file_of_levels_and_a_step_limit(run: Path, tmp_path: Path, evaluate) -> None:
+    (tmp_path / "halls.txt").write_text("[long]\nS....G\n......\n......\n......\n")
+    levels, output = tmp_path / "halls.txt", tmp_path / "rows.json"
+    limits = {}
+    for limit in ((), ("--max-steps", 4), ("--max-steps", 3000)):
+        assert evaluate(run, "--levels", levels, "-o", output, *limit)[0] == 0
+        row = json.loads(output.read_text())[0]
+        limits[row["max_steps"]] = row["success"]
+    assert list(limits) == [10, 4, 3000]
+    assert limits[4] == 0 < limits[10] < limits[3000]
+
+
+def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
+    file = sorted((run / "checkpoints").glob("*.pt"))[0]
+    assert evaluate(file, "-o", tmp_path / "rows.json")[0] == 0
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["updates"] == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["."], ".: holds no checkpoints; give a run's folder or a checkpoint"),
+        (["{run}/metrics.csv"], "metrics.csv"),
+        (["{run}", "--levels", "mazes"], "--levels mazes: must be a file that ends in .txt or "),
+        (["{run}", "--levels", "none.txt"], "--levels none.txt: there is no such file"),
+        (["{run}", "--levels", "bad.json"], "bad.json: is no JSON"),
+        (["{run}", "--levels", "small.txt"], "level 'small': its 3x5 cells are halved to nothing"),
+        (["{run}", "-o", "rows.txt"], "--output rows.txt: must end in .json or .csv"),
+        (["{run}", "-o", "no/rows.csv"], "--output no/rows.csv: there is no folder no"),
+        (["{run}", "--pictures", "a.jpg"], "--pictures a.jpg: must end in .png"),
+        (["{run}", "--max-steps", "0"], "must be from 1 to 100,000, got 0"),
+        (["{run}", "--max-steps", "many"], "invalid"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(
+    arguments: list[str], message: str, run: Path, tmp_path: Path, evaluate, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bad.json").write_text("{")
+    Path("small.txt").write_text("S....\n.....\n....G")
+    before = sorted(tmp_path.iterdir())
+    code, said = evaluate(*(word.format(run=run) for word in arguments))
+    assert code == 2
+    assert message in said.splitlines()[-1] and "Traceback" not in said
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_checkpoints_that_do_not_fit_are_refused(run: Path, tmp_path: Path, evaluate) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    checkpoints = tmp_path / "run" / "checkpoints"
+    step, state = load_latest(checkpoints)
+    for solver in ({}, {**state["solver"], "more": state["solver"]}, 3):
+        save_checkpoint(checkpoints, step, {**state, "solver": solver})
+        code, said = evaluate(tmp_path / "run")
+        assert code == 2 and "holds no Solver with the network of its config.json" in said
+    damaged = next(checkpoints.glob("*.pt"))
+    damaged.write_bytes(damaged.read_bytes()[:-9])
+    code, said = evaluate(damaged)
+    assert code == 2 and said.count("\n") == 1 and damaged.name in said
+    shutil.copy(sorted((run / "checkpoints").glob("*.pt"))[0], tmp_path / "alone.pt")
+    code, said = evaluate(tmp_path / "alone.pt")
+    assert code == 2 and "is no run's folder: it has no config.json" in said
