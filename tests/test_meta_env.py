@@ -10,12 +10,13 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.evaluation import ExactEvaluator
+from proposer_rl.finite import DivergedError
 from proposer_rl.mazes import Level, MazeEnv, SpecificationSpace, planes
 from proposer_rl.meta_env import ReplayError, SolverTrainingEnv
 from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.proposals import Mixture, ProblemChoices
-from proposer_rl.rewards import Reward, performance_gain, task_difficulty
+from proposer_rl.rewards import Reward, TrainingStep, performance_gain, task_difficulty
 from proposer_rl.solver_view import Measure, SolverView, episode_return, log_success
 from proposer_rl.streams import Streams
 
@@ -192,6 +193,31 @@ def test_any_reward_can_be_paid() -> None:
     env.fork(solvers(1).snapshot()[0], Streams(4))
     reward = play(env, some_actions())["next", "reward"]
     assert ((reward >= 0) & (reward <= 1)).all() and reward.std() > 0
+
+
+def test_a_reward_is_shown_the_whole_step() -> None:
+    seen = []
+
+    def reward(step: TrainingStep) -> torch.Tensor:
+        success = evaluate(step.solver, target(E, Streams(1).generator()), None)["success"].mean(1)
+        seen.append((step.levels.walls, step.rollout["planes"][:, :, 0, 0].bool()))
+        return success
+
+    env = meta_env(reward)
+    env.fork(solvers(1).snapshot()[0], Streams(4))
+    paid = play(env, some_actions())["next", "reward"][:, -1, 0]
+    assert all(torch.equal(levels, played) for levels, played in seen)
+    levels = target(E, Streams(1).generator())
+    torch.testing.assert_close(paid, evaluate(env.solvers.agent, levels, None)["success"].mean(1))
+
+
+def test_numbers_that_go_wrong_are_located() -> None:
+    env = meta_env()
+    broken = env.solvers.snapshot()[0].clone()
+    next(iter(broken.values()))["value"].fill_(torch.nan)
+    env.fork(broken, Streams(4))
+    with pytest.raises(DivergedError, match="update 0 of the episode of the Solver's copies"):
+        play(env, some_actions())
 
 
 def test_every_step_is_reported() -> None:
