@@ -25,6 +25,7 @@ from proposer_rl.curricula import (
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import (
     ActorCritic,
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -250,11 +251,10 @@ def _agent(task: MazeTask, chosen: ProposerSettings, action: _Action) -> ActorCr
     numbers = len(chosen.observes)
     network = ProposerNetwork(
         action.head(context_width(chosen.context, numbers, chosen.number_bands)),
-        task.probe_channels,
+        MapEncoder(task.probe_channels, chosen.channels, chosen.context),
+        context=chosen.context,
         numbers=numbers,
         number_bands=chosen.number_bands,
-        context=chosen.context,
         hidden=chosen.hidden,
-        channels=chosen.channels,
     ).to(task.device)
     return proposer_actor_critic(network, action.distribution, ["probes", *chosen.observes])

@@ -17,6 +17,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.proposer import explained_share
 from proposer_rl.models import (
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -34,7 +35,7 @@ def sample(count: int, generator: torch.Generator):
 
 
 def network(head: nn.Module) -> ProposerNetwork:
-    return ProposerNetwork(head, 7, context=8, hidden=8, channels=(8, 8))
+    return ProposerNetwork(head, MapEncoder(7, (8, 8), 8), context=8, hidden=8)
 
 
 def proposer(

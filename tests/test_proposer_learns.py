@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from torch import nn
 
 from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import total_gain
@@ -53,7 +54,7 @@ def mixtures(*, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False
 
 
 def _ppo(env, head, distribution, advantage) -> PPO:
-    network = ProposerNetwork(head, SKILLS, numbers=1, context=32, hidden=32, channels=(8,))
+    network = ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
     agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
     settings = PPOSettings(horizon=env.steps, epochs=8, gamma=1.0, learning_rate=3e-3)
     return PPO(env, agent, settings, advantage=advantage)
