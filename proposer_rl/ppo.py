@@ -30,7 +30,6 @@ from proposer_rl.finite import require_finite
 from proposer_rl.models import ActorCritic, draw, uniform_noise
 from proposer_rl.settings import settings
 
-
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
