@@ -20,8 +20,8 @@ from torchrl.modules import MLP
 import proposer_rl as prl
 from proposer_rl.models import categorical, normal, proposer_actor_critic
 
-KINDS = torch.cartesian_prod(torch.arange(1, 5) / 4, torch.arange(1, 6) * 0.4)  # gravity, power
-TARGET = torch.tensor([16])  # gravity 1, power 0.8
+KINDS = torch.cartesian_prod(torch.arange(1, 5) / 4, torch.arange(1, 6) * 0.35)  # gravity, power
+TARGET = torch.tensor([16])  # gravity 1, power 0.7
 COPIES, PROBLEMS, STEPS, UPDATES = 16, 16, 40, 20
 
 

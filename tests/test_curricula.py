@@ -250,6 +250,19 @@ def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
     torch.testing.assert_close(actions["mode"][2], expected)
 
 
+@pytest.mark.parametrize("own", ["sample", "mode"])
+def test_a_frozen_one_proposes_the_same_and_learns_no_more(own: str) -> None:
+    learnt, solver = proposer(own_action=own), solvers(1)
+    learnt.improve(solver, [Streams(0, "cycle", 0)])
+    frozen, before = learnt.frozen(), learnt.proposer.snapshot()
+    assert frozen.improve(solver, [Streams(0, "cycle", 0)]) == Improvement()
+    for update in range(3):
+        stream = Streams(0, "update", update)
+        expected = learnt.propose(solver, [stream])
+        assert (frozen.propose(solver, [stream]) == expected).all()
+    assert (learnt.proposer.snapshot() == before).all()
+
+
 def test_a_frozen_proposer_proposes_what_it_learnt_and_costs_nothing() -> None:
     learnt, solver = proposer(), solvers(1)
     learnt.improve(solver, [Streams(0, "cycle", 0)])
