@@ -23,6 +23,7 @@ from proposer_rl.models import categorical, normal, proposer_actor_critic
 KINDS = torch.cartesian_prod(torch.arange(1, 5) / 4, torch.arange(1, 6) * 0.35)  # gravity, power
 TARGET = torch.tensor([16])  # gravity 1, power 0.7
 COPIES, PROBLEMS, STEPS, UPDATES = 16, 16, 40, 20
+LEARNING = prl.PPOSettings(horizon=2, epochs=8, gamma=1.0, learning_rate=3e-3)  # the Proposer's
 
 
 class MountainCar(EnvBase):
@@ -93,7 +94,7 @@ def probe(solver: prl.ActorCritic, levels: TensorDict) -> torch.Tensor:
     return solver(state)["logits"].softmax(-1)
 
 
-def proposer(streams: prl.Streams) -> prl.ProposerCurriculum:
+def proposer(streams: prl.Streams, settings=LEARNING, loss=None) -> prl.ProposerCurriculum:
     directions = ((KINDS - KINDS.mean(0)) / KINDS.std(0)).T  # more gravity, more power
     env = prl.SolverTrainingEnv(
         solvers(COPIES, streams),
@@ -107,8 +108,7 @@ def proposer(streams: prl.Streams) -> prl.ProposerCurriculum:
         head = prl.MixtureHead(32 + 2, len(directions), hidden=32)
         network = prl.ProposerNetwork(head, torch.nn.Linear(3, 32), context=32, numbers=2)
     agent = proposer_actor_critic(network, normal, ["probes", "validation_return", "progress"])
-    settings = prl.PPOSettings(horizon=env.steps, epochs=8, gamma=1.0, learning_rate=3e-3)
-    learner = prl.PPO(env, agent, settings, advantage=prl.CopiesBaseline(gamma=1.0))
+    learner = prl.PPO(env, agent, settings, advantage=prl.CopiesBaseline(gamma=1.0), loss=loss)
     return prl.ProposerCurriculum(learner, own_action="mode")
 
 
