@@ -14,6 +14,7 @@ from proposer_rl.mazes import Level, LevelSpec, MazeEnv, generate_levels, shorte
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import (
     ActorCritic,
+    MapEncoder,
     MixtureHead,
     Population,
     ProblemHead,
@@ -37,6 +38,7 @@ __all__ = [
     "FrozenProposer",
     "Level",
     "LevelSpec",
+    "MapEncoder",
     "MazeEnv",
     "MazeTask",
     "Mixture",

@@ -9,9 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-# What a gradient step leaves behind, in the order in which it arises.
-SCALARS = ("loss_objective", "loss_entropy", "loss_critic", "grad_norm")
-
 
 class DivergedError(ArithmeticError):
     """A number is not finite; the message is one line that says which, and in which copy."""
@@ -24,8 +21,8 @@ def require_finite(
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.
-        steps: of S gradient steps, [S], the losses and gradient norms of each copy, [S, K], or
-            without copies [S].
+        steps: of S gradient steps, [S], the losses ``loss_...`` and the ``grad_norm`` of each copy,
+            [S, K], or without copies [S].
         weights: after the update, by name, [K, ...] with copies.
         copies: K, or None for a single network.
 
@@ -33,14 +30,16 @@ def require_finite(
         DivergedError: naming what was not finite first, and the copies that it happened in. The
             others are as they would be without it: nothing is shared between copies.
     """
-    scalars = [steps[name] for name in SCALARS]
+    # What a gradient step leaves behind, in the order in which it arises.
+    names = [*(key for key in steps.keys() if key.startswith("loss_")), "grad_norm"]
+    scalars = [steps[name] for name in names]
     # A sum of magnitudes is finite only if all of them are.
     sums = nn.utils.get_total_norm([reward, *scalars, *weights.values()], norm_type=1.0)
     if bool(sums.isfinite()):
         return
     _refuse("reward", reward, len(reward))
     for i in range(len(steps)):
-        for name in SCALARS:
+        for name in names:
             _refuse(f"{name} of gradient step {i}", steps[name][i], copies)
     for name, weight in weights.items():
         _refuse(f"weight {name}", weight, copies)

@@ -25,6 +25,7 @@ from proposer_rl.curricula import (
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.models import (
     ActorCritic,
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -34,7 +35,7 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.ppo import PPO, PPOSettings
+from proposer_rl.ppo import PPO, MakeLoss, PPOSettings
 from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
 from proposer_rl.rewards import Reward
 from proposer_rl.settings import settings
@@ -131,8 +132,14 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
     return ScheduleCurriculum(stages, until)
 
 
-def proposer(parts: Parts, reward: Reward) -> Curriculum:
-    """Train on the proposals of an agent that is rewarded for each of the Solver's updates."""
+def proposer(parts: Parts, reward: Reward, loss: MakeLoss | None = None) -> Curriculum:
+    """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
+
+    Args:
+        parts: the task, and the Proposer's settings.
+        reward: what an update is worth.
+        loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.ppo.PPO`.
+    """
     task, chosen = parts.task, parts.proposer
     streams = Streams(parts.seed, "proposer")
     action = ACTIONS[chosen.proposals](task, chosen)
@@ -151,7 +158,7 @@ def proposer(parts: Parts, reward: Reward) -> Curriculum:
     numbers = replace(chosen.ppo, horizon=env.steps)
     advantage = CopiesBaseline(numbers.gamma) if chosen.advantage == "copies" else None
     return ProposerCurriculum(
-        PPO(env, agent, numbers, advantage=advantage),
+        PPO(env, agent, numbers, advantage=advantage, loss=loss),
         own_action=chosen.own_action,
         advance=chosen.advance,
         table=lambda counts: counts.unflatten(0, task.space.shape),
@@ -250,11 +257,10 @@ def _agent(task: MazeTask, chosen: ProposerSettings, action: _Action) -> ActorCr
     numbers = len(chosen.observes)
     network = ProposerNetwork(
         action.head(context_width(chosen.context, numbers, chosen.number_bands)),
-        task.probe_channels,
+        MapEncoder(task.probe_channels, chosen.channels, chosen.context),
+        context=chosen.context,
         numbers=numbers,
         number_bands=chosen.number_bands,
-        context=chosen.context,
         hidden=chosen.hidden,
-        channels=chosen.channels,
     ).to(task.device)
     return proposer_actor_critic(network, action.distribution, ["probes", *chosen.observes])

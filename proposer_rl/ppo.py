@@ -10,17 +10,18 @@ number on the device.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import torch
 from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
 from proposer_rl.adam import CopiesAdam
@@ -28,6 +29,9 @@ from proposer_rl.capture import Captured, Recorder
 from proposer_rl.finite import require_finite
 from proposer_rl.models import ActorCritic, draw, uniform_noise
 from proposer_rl.settings import settings
+
+# From an actor and a critic that read what stands in a tensordict already, to a loss of both.
+MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
 
 class Update(NamedTuple):
@@ -80,9 +84,13 @@ class PPO:
             are. A recorded environment starts an episode from the same memory every time.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
             TorchRL's :class:`GAE` with the settings' numbers.
+        loss: makes another TorchRL loss of the agent's actor and critic, with
+            ``functional=False`` and ``reduction="none"``; the terms that it returns as ``loss_...``
+            are added up. None for :class:`ClipPPOLoss` with the settings' numbers.
 
     Raises:
-        ValueError: if the environment's first dimension is not the agent's number of copies.
+        ValueError: if the environment's first dimension is not the agent's number of copies, or
+            the loss reduces what belongs to different copies.
 
     Example:
         >>> from proposer_rl import MazeEnv, Population, UNet, generate_levels
@@ -103,6 +111,7 @@ class PPO:
         recorder: Recorder | None = None,
         *,
         advantage: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        loss: MakeLoss | None = None,
     ) -> None:
         if agent.copies is not None and env.batch_size[:1] != (agent.copies,):
             raise ValueError(
@@ -129,21 +138,9 @@ class PPO:
         self._advantage = advantage or GAE(
             gamma=settings.gamma, lmbda=settings.lmbda, value_network=None, vectorized=False
         )
-        actor, critic = agent.readout()
-        self._loss = _ClipPPOLoss(
-            actor,
-            critic,
-            clip_epsilon=settings.clip_epsilon,
-            entropy_coeff=settings.entropy_coeff,
-            critic_coeff=settings.critic_coeff,
-            loss_critic_type="l2",
-            normalize_advantage=settings.normalize_advantage,
-            normalize_advantage_exclude_dims=() if agent.copies is None else (0,),
-            functional=False,
-            reduction="none",
-            # TorchRL's takes the variance over the first dimension alone; see _gradient_step.
-            log_explained_variance=False,
-        )
+        self._loss = (loss or partial(_clip_ppo_loss, settings, agent.copies))(*agent.readout())
+        if self._loss.reduction != "none":
+            raise ValueError(f'reduction of the loss must be "none", got {self._loss.reduction!r}')
         self._loss.set_keys(
             action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
         )
@@ -192,9 +189,10 @@ class PPO:
         Writes ``advantage`` and ``value_target`` into the rollout.
 
         Returns:
-            Scalars averaged over the gradient steps: ``loss_objective``, ``loss_entropy``,
-            ``loss_critic`` (the mean over copies of their weighted losses), ``entropy``,
-            ``kl_approx``, ``clip_fraction``, ``explained_variance`` and ``grad_norm``.
+            Scalars averaged over the gradient steps: the loss's terms, for PPO ``loss_objective``,
+            ``loss_entropy`` and ``loss_critic`` (the mean over copies of their weighted losses);
+            ``entropy``, ``kl_approx`` and ``clip_fraction``, as far as the loss tells them;
+            ``explained_variance`` and ``grad_norm``.
         """
         agent = self.agent
         steps = rollout.select(
@@ -312,8 +310,9 @@ class PPO:
         losses = self._loss(steps)
         # [K] or []: each copy's loss is the mean over its own batch, as if it were alone.
         terms = {
-            key: losses[key].flatten(len(self._batch)).mean(-1)
-            for key in ("loss_objective", "loss_entropy", "loss_critic")
+            key: term.flatten(len(self._batch)).mean(-1)
+            for key, term in losses.items()
+            if key.startswith("loss_")
         }
         self._adam.zero_grad()
         torch.stack(list(terms.values())).sum().backward()
@@ -321,7 +320,8 @@ class PPO:
         self._adam.step()
         metrics = {key: term.detach() for key, term in terms.items()}
         for key in ("entropy", "kl_approx", "clip_fraction"):
-            metrics[key] = losses[key].detach().mean()
+            if key in losses.keys():
+                metrics[key] = losses[key].detach().mean()
         value = steps.get(self.agent.value_key).detach()
         metrics["explained_variance"] = self._explained_variance(value, steps["value_target"])
         return TensorDict({**metrics, "grad_norm": norm})
@@ -332,6 +332,25 @@ class PPO:
             x.flatten(len(self._batch)).var(-1, correction=0) for x in (target - value, target)
         )
         return (1 - residual / total.clamp_min(1e-12)).mean()
+
+
+def _clip_ppo_loss(
+    settings: PPOSettings, copies: int | None, actor: TensorDictModuleBase, critic: TensorDictModule
+) -> LossModule:
+    return _ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=settings.clip_epsilon,
+        entropy_coeff=settings.entropy_coeff,
+        critic_coeff=settings.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=settings.normalize_advantage,
+        normalize_advantage_exclude_dims=() if copies is None else (0,),
+        functional=False,
+        reduction="none",
+        # TorchRL's takes the variance over the first dimension alone; see _gradient_step.
+        log_explained_variance=False,
+    )
 
 
 class _ClipPPOLoss(ClipPPOLoss):

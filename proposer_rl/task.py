@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
@@ -138,6 +138,9 @@ class MazeTask:
         precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
         cores: Solvers of a population computed at once on a CPU; None for all cores.
         graphs: whether a GPU records rollouts, training and evaluations as CUDA graphs.
+        network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
+            ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
+            of the settings.
 
     Raises:
         ValueError: if a name is no distribution's, or levels cannot be made as specified.
@@ -156,6 +159,7 @@ class MazeTask:
         precision: str = "fp32",
         cores: int | None = None,
         graphs: bool = True,
+        network: Callable[[], nn.Module] | None = None,
     ) -> None:
         for name in (target, *evaluation.distributions):
             if name not in distributions:
@@ -176,6 +180,7 @@ class MazeTask:
             space.obstacle_fractions, space.path_lengths, space.mechanism, *grid
         )
         rules = (maze.max_steps, maze.step_penalty)
+        self._network = network or self._unet
         self._sampled = ExactEvaluator(*rules)
         self._greedy = ExactEvaluator(*rules, greedy=True)
         self._reward_evaluator: ExactEvaluator | RolloutEvaluator = (
@@ -206,13 +211,7 @@ class MazeTask:
 
         def make() -> nn.Module:
             with next(weights).as_default("weights"):
-                return UNet(
-                    in_channels=PLANES + self.maze.observe_agent,
-                    head_channels=(ACTIONS, 1),
-                    channels=self.solver.channels,
-                    groups=self.solver.groups,
-                    head_gains=(self.solver.policy_gain, self.solver.value_gain),
-                )
+                return self._network()
 
         network = Population(make, copies, self.precision, self.cores, recorder=self.recorder).to(
             self.device
@@ -227,6 +226,15 @@ class MazeTask:
             observe_agent=self.maze.observe_agent,
         )
         return PPO(env, agent, self.solver.ppo, self.recorder)
+
+    def _unet(self) -> UNet:
+        return UNet(
+            in_channels=PLANES + self.maze.observe_agent,
+            head_channels=(ACTIONS, 1),
+            channels=self.solver.channels,
+            groups=self.solver.groups,
+            head_gains=(self.solver.policy_gain, self.solver.value_gain),
+        )
 
     def generate(self, choices: Tensor, generators: list[torch.Generator]) -> Level:
         """Levels [K, P] of the Proposer's choices, int64 [K, P]; copy k's from generator k."""

@@ -78,7 +78,7 @@ def ladder_env(
         return gain.roll(1) if shuffled else gain
 
     def probe(solver: SimpleNamespace, levels: Tensor) -> Tensor:
-        return solver.skills[:, None, :, None, None].expand(-1, len(levels), -1, 2, 2)
+        return solver.skills[:, None].expand(-1, len(levels), -1)
 
     def evaluate(solver: SimpleNamespace, levels: Tensor, generator: torch.Generator) -> TensorDict:
         last = solver.skills[:, -1:].expand(-1, len(levels))

@@ -17,6 +17,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.proposer import explained_share
 from proposer_rl.models import (
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -34,7 +35,7 @@ def sample(count: int, generator: torch.Generator):
 
 
 def network(head: nn.Module) -> ProposerNetwork:
-    return ProposerNetwork(head, 7, context=8, hidden=8, channels=(8, 8))
+    return ProposerNetwork(head, MapEncoder(7, (8, 8), 8), context=8, hidden=8)
 
 
 def proposer(
@@ -247,6 +248,19 @@ def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
     assert torch.equal(first, same) and not torch.equal(first, other)
     expected = curriculum.agent(curriculum.view.observe(solver.agent, 0.5))["logits"][..., 0]
     torch.testing.assert_close(actions["mode"][2], expected)
+
+
+@pytest.mark.parametrize("own", ["sample", "mode"])
+def test_a_frozen_one_proposes_the_same_and_learns_no_more(own: str) -> None:
+    learnt, solver = proposer(own_action=own), solvers(1)
+    learnt.improve(solver, [Streams(0, "cycle", 0)])
+    frozen, before = learnt.frozen(), learnt.proposer.snapshot()
+    assert frozen.improve(solver, [Streams(0, "cycle", 0)]) == Improvement()
+    for update in range(3):
+        stream = Streams(0, "update", update)
+        expected = learnt.propose(solver, [stream])
+        assert (frozen.propose(solver, [stream]) == expected).all()
+    assert (learnt.proposer.snapshot() == before).all()
 
 
 def test_a_frozen_proposer_proposes_what_it_learnt_and_costs_nothing() -> None:

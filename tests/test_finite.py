@@ -27,6 +27,15 @@ def test_finite_numbers_pass_however_large() -> None:
     require_finite(reward, steps, {"a": torch.full((K, 100), 3e38)}, K)
 
 
+def test_every_term_of_a_loss_counts_whatever_its_name() -> None:
+    reward, steps, weights = healthy()
+    steps["loss_value"] = torch.zeros(S, K)
+    require_finite(reward, steps, weights, K)
+    steps["loss_value"][0, 2] = torch.nan
+    with pytest.raises(DivergedError, match=r"^copy 2: loss_value of gradient step 0"):
+        require_finite(reward, steps, weights, K)
+
+
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("copy", range(K))
 def test_names_the_copy_and_the_tensor(bad: float, copy: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import hypothesis
@@ -14,13 +15,14 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torch.distributions import Categorical
+from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
 from proposer_rl.capture import Recorder
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.models import Population, UNet, map_actor_critic
-from proposer_rl.ppo import PPO, PPOSettings, clip_gradients_
+from proposer_rl.ppo import PPO, MakeLoss, PPOSettings, clip_gradients_
 from tests.graphs import NoHostReads, Tapes
 
 P, T = 6, 12
@@ -40,6 +42,7 @@ def learner(
     per_step: bool | None = None,
     way: str | None = None,
     recorder: Recorder | None = None,
+    loss: MakeLoss | None = None,
 ) -> PPO:
     torch.manual_seed(3)
 
@@ -49,7 +52,7 @@ def learner(
     per_step = observe_agent if per_step is None else per_step
     agent = map_actor_critic(Population(make, copies, way=way), per_step=per_step)
     env = MazeEnv(levels(copies), max_steps=5, observe_agent=observe_agent)
-    return PPO(env, agent, settings, recorder)
+    return PPO(env, agent, settings, recorder, loss=loss)
 
 
 def train(ppo: PPO, updates: int) -> list[TensorDict]:
@@ -215,6 +218,55 @@ def test_gradients_are_clipped_per_copy(copies: int) -> None:
         torch.testing.assert_close(norms[k], torch.nn.utils.clip_grad_norm_(own, 0.5))
         for parameter, alone in zip(stacked, own, strict=True):
             torch.testing.assert_close(parameter.grad[k], alone.grad)
+
+
+def a2c(actor, critic) -> A2CLoss:
+    return A2CLoss(actor, critic, functional=False, reduction="none", critic_coeff=0.5)
+
+
+def reinforce(actor, critic) -> ReinforceLoss:
+    return ReinforceLoss(actor, critic, functional=False, reduction="none", loss_critic_type="l2")
+
+
+def plain_a2c(log_prob: Tensor, entropy: Tensor, value: Tensor, batch: TensorDict) -> Tensor:
+    """Mnih et al. 2016, section 4, with TorchRL's default coefficient and distance."""
+    critic = smooth_l1_loss(value, batch["value_target"])
+    return -(log_prob * batch["advantage"]).mean() - 0.01 * entropy.mean() + 0.5 * critic
+
+
+def plain_reinforce(log_prob: Tensor, _: Tensor, value: Tensor, batch: TensorDict) -> Tensor:
+    error = value - batch["value_target"]
+    return -(log_prob * batch["advantage"]).mean() + error.square().mean()
+
+
+@pytest.mark.parametrize(("loss", "formula"), [(a2c, plain_a2c), (reinforce, plain_reinforce)])
+def test_another_loss_gives_every_copy_its_own_gradient(loss, formula) -> None:
+    settings = replace(SETTINGS, epochs=1, max_grad_norm=1e6)
+    ppo = learner(copies=2, settings=settings, loss=loss)
+    batch, expected = ppo.collect(generators(0, 1)), []
+    before = ppo.snapshot()
+    metrics = ppo.optimise(batch)
+    gradients = [p.grad.clone() for p in ppo.agent.parameters()]
+    ppo.restore(before)
+    output = ppo.agent(batch.select("planes", "agent"))
+    distribution = Categorical(logits=output["logits"])
+    log_prob = distribution.log_prob(batch["action"]).unsqueeze(-1)
+    entropy, value = distribution.entropy(), output["state_value"]
+    expected = [formula(log_prob[k], entropy[k], value[k], batch[k]) for k in range(2)]
+    plain = torch.autograd.grad(sum(expected), list(ppo.agent.parameters()))
+    for gradient, other in zip(gradients, plain, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-3, atol=1e-6)
+    told = sum(float(metrics[key]) for key in metrics.keys() if key.startswith("loss_"))
+    assert told == pytest.approx(float(sum(expected).detach()) / 2, rel=1e-4)
+    assert "clip_fraction" not in metrics.keys()
+
+
+def test_a_loss_must_not_mix_the_copies() -> None:
+    def mean(actor, critic) -> A2CLoss:
+        return A2CLoss(actor, critic, functional=False)
+
+    with pytest.raises(ValueError, match="must be \"none\", got 'mean'"):
+        learner(loss=mean)
 
 
 def test_a_rollout_shares_the_levels_memory_and_equals_stepping_by_hand() -> None:

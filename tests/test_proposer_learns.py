@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
+from torch import nn
+from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
 
 from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import total_gain
@@ -38,7 +41,9 @@ def problem_choices(*, shuffled: bool = False) -> PPO:
     return _ppo(env, head, categorical, None)
 
 
-def mixtures(*, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False) -> PPO:
+def mixtures(
+    *, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False, **learning
+) -> PPO:
     """Mixtures as actions; the other copies tell the advantage."""
     choices = SKILLS + idle
     env = ladder_env(
@@ -49,14 +54,24 @@ def mixtures(*, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False
         episode_length=UPDATES,
         updates_per_step=updates_per_step,
     )
-    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, CopiesBaseline(1.0))
+    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, CopiesBaseline(1.0), **learning)
 
 
-def _ppo(env, head, distribution, advantage) -> PPO:
-    network = ProposerNetwork(head, SKILLS, numbers=1, context=32, hidden=32, channels=(8,))
+def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:
+    """Mixtures, and a loss that takes one gradient step on every rollout."""
+
+    def loss(actor, critic) -> LossModule:
+        return kind(actor, critic, functional=False, reduction="none")
+
+    return partial(mixtures, loss=loss, epochs=1, learning_rate=2e-2)
+
+
+def _ppo(env, head, distribution, advantage, *, loss=None, **numbers) -> PPO:
+    network = ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
     agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
-    settings = PPOSettings(horizon=env.steps, epochs=8, gamma=1.0, learning_rate=3e-3)
-    return PPO(env, agent, settings, advantage=advantage)
+    numbers = {"epochs": 8, "learning_rate": 3e-3, **numbers}
+    settings = PPOSettings(horizon=env.steps, gamma=1.0, **numbers)
+    return PPO(env, agent, settings, advantage=advantage, loss=loss)
 
 
 def learnt_gain(make: Callable[..., PPO], seed: int, cycles: int = 60, **options) -> float:
@@ -81,6 +96,11 @@ def test_the_even_mixture_is_far_from_the_best() -> None:
 @pytest.mark.parametrize("make", [problem_choices, mixtures])
 def test_it_finds_the_best_curriculum(make: Callable[..., PPO], seed: int) -> None:
     assert learnt_gain(make, seed) > 0.9 * best_sequence(SKILLS, UPDATES)
+
+
+@pytest.mark.parametrize("kind", [A2CLoss, ReinforceLoss])
+def test_it_finds_the_best_curriculum_by_another_loss(kind: type[LossModule]) -> None:
+    assert learnt_gain(other_loss(kind), 0, cycles=80) > 0.9 * best_sequence(SKILLS, UPDATES)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

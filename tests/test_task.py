@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from proposer_rl.bench.results import Options
@@ -15,7 +16,7 @@ from proposer_rl.models import Population
 from proposer_rl.proposals import Mixture
 from proposer_rl.rewards import performance_gain, task_difficulty
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask, SpaceSettings, faster_precision
+from proposer_rl.task import EvaluationSettings, MazeTask, SpaceSettings, faster_precision
 from tests.graphs import NoHostReads, Tapes
 
 OPTIONS = Options(size="tiny", precision="fp32")
@@ -54,6 +55,37 @@ def test_recorded_measurements_follow_the_solver(monkeypatch: pytest.MonkeyPatch
                 with torch.enable_grad():
                     solvers.update()
     assert tapes.recorded == 3 * 2
+
+
+def test_another_network_takes_the_unets_place() -> None:
+    """A Solver of one convolution acts, learns, is measured and is seen by the Proposer."""
+
+    class Convolution(nn.Conv2d):
+        def __init__(self) -> None:
+            super().__init__(3, 5, 3, padding=1)
+
+        def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
+            maps = super().forward(planes.flatten(0, -4)).unflatten(0, planes.shape[:-3])
+            return maps.split([4, 1], -3)
+
+    own = MazeTask(
+        maze=TINY.maze,
+        distributions=TINY.distributions,
+        target="id",
+        space=TINY.space,
+        solver=TINY.solver,
+        evaluation=EvaluationSettings(distributions=["id"], levels=8),
+        network=Convolution,
+    )
+    solvers = own.solvers([Streams(0), Streams(1)])
+    assert sum(p.numel() for p in solvers.agent.parameters()) == 2 * (3 * 9 + 1) * 5
+    before = own.measure(solvers.agent)
+    levels = own.sample_target(5, Streams(0).generator())
+    probes = own.probe(solvers.agent, levels)
+    assert not torch.equal(probes[0], probes[1])
+    solvers.update()
+    after = own.measure(solvers.agent)
+    assert (before["id_return"] != after["id_return"]).all()
 
 
 def test_a_mixture_can_favour_the_target() -> None:

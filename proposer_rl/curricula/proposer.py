@@ -88,6 +88,17 @@ class ProposerCurriculum(FrozenProposer):
         advance = self._advance(solver, gains, stream)
         return Improvement(self._metrics(rollout, gains, training), frames, advance)
 
+    def frozen(self) -> FrozenProposer:
+        """The Proposer as it is, proposing without learning; it shares network and view."""
+        return FrozenProposer(
+            self.agent,
+            self.view,
+            self.proposals,
+            episode_length=self.episode_length,
+            updates_per_step=self.updates_per_step,
+            own_action=self.own_action,
+        )
+
     def state_dict(self) -> dict[str, Any]:
         """That of the cycle, with the Proposer's weights and optimiser, and a begun episode."""
         return {

@@ -10,6 +10,7 @@ from proposer_rl.models.actor_critic import (
 )
 from proposer_rl.models.population import Population
 from proposer_rl.models.proposer import (
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -22,6 +23,7 @@ from proposer_rl.models.unet import UNet, orthogonal_
 
 __all__ = [
     "ActorCritic",
+    "MapEncoder",
     "MixtureHead",
     "Population",
     "ProblemHead",

@@ -14,48 +14,64 @@ from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.models.unet import orthogonal_
 
 
+class MapEncoder(nn.Sequential):
+    """A convolutional encoder of probes that are maps.
+
+    Args:
+        in_channels: channels of a probe, e.g. its planes and the Solver's logit map.
+        channels: channels of the convolutions; each but the first halves the resolution.
+        features: number of features of a probe.
+    """
+
+    def __init__(self, in_channels: int, channels: Sequence[int], features: int) -> None:
+        layers: list[nn.Module] = []
+        for i, (fan_in, fan_out) in enumerate(
+            zip([in_channels, *channels], channels, strict=False)
+        ):
+            layers += [nn.Conv2d(fan_in, fan_out, 3, stride=2 if i else 1, padding=1), nn.ReLU()]
+        pooled = [nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels[-1], features)]
+        super().__init__(*layers, *pooled)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Features [*B, features] of maps [*B, in_channels, H, W]."""
+        features = super().forward(maps.flatten(0, -4))
+        return features.unflatten(0, maps.shape[:-3])
+
+
 class ProposerNetwork(nn.Module):
     """Observations in, parameters of the action's distribution and a value out.
 
-    A convolutional encoder reads each probe; the mean over the probes, joined by whatever else is
-    observed, is the context g (the paper's Proposer, section 4). ``head`` makes the policy of g,
-    an MLP the value.
+    An encoder reads each probe; the mean over the probes, joined by whatever else is observed, is
+    the context g (the paper's Proposer, section 4). ``head`` makes the policy of g, an MLP the
+    value. Weights of encoder and value begin orthogonal, biases at zero.
 
     Args:
         head: from contexts [*B, width] to the parameters of the action's distribution; see
             :class:`ProblemHead` and :class:`MixtureHead`.
-        probe_channels: channels of a probe, its planes and the Solver's logit map.
+        encoder: from probes [*B, ...] of any kind to their features [*B, context]: a
+            :class:`MapEncoder` for maps, an MLP for vectors.
+        context: number of the encoder's features; the width of the context is
+            :func:`context_width`.
         numbers: how many numbers, of about 0 to 1, are observed beside the probes.
         number_bands: frequencies at which a number is told to the network by its sine and cosine,
             from half a cycle over 0 to 1 upwards, each double the last; with 0 as it is. The more
             of them, the less what is learnt at one value is taken for another.
-        context: width of the encoder's output; the context's is
-            :func:`context_width`.
         hidden: width of the value's MLP.
-        channels: channels of the encoder's convolutions; each but the first halves the resolution.
     """
 
     def __init__(
         self,
         head: nn.Module,
-        probe_channels: int,
+        encoder: nn.Module,
         *,
+        context: int = 128,
         numbers: int = 0,
         number_bands: int = 0,
-        context: int = 128,
         hidden: int = 128,
-        channels: Sequence[int] = (32, 64),
     ) -> None:
         super().__init__()
         width = context_width(context, numbers, number_bands)
-        layers: list[nn.Module] = []
-        for i, (fan_in, fan_out) in enumerate(
-            zip([probe_channels, *channels], channels, strict=False)
-        ):
-            layers += [nn.Conv2d(fan_in, fan_out, 3, stride=2 if i else 1, padding=1), nn.ReLU()]
-        self.encoder = nn.Sequential(
-            *layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels[-1], context)
-        )
+        self.encoder = encoder
         self.value = nn.Sequential(nn.Linear(width, hidden), nn.Tanh(), nn.Linear(hidden, 1))
         self.context = context
         self.number_bands = number_bands
@@ -67,7 +83,7 @@ class ProposerNetwork(nn.Module):
         """Map an observation to the distribution's parameters [*B, ...] and values [*B, 1].
 
         Args:
-            probes: float [*B, C, channels, H, W].
+            probes: float [*B, C, ...].
             numbers: of what else is observed, each [*B, 1].
         """
         told = [self._tell(number) for number in numbers]
@@ -82,11 +98,10 @@ class ProposerNetwork(nn.Module):
         return torch.cat([phase.sin(), phase.cos()], -1)
 
     def _encode(self, probes: Tensor) -> Tensor:
-        leading = probes.shape[:-4]
-        if probes.shape[-4] == 0:  # C = 0: a Proposer that does not see the Solver's answers
-            return probes.new_zeros(*leading, self.context)
-        features = self.encoder(probes.flatten(0, -4))
-        return torch.relu(features.reshape(*leading, -1, self.context).mean(-2))
+        features = self.encoder(probes)  # [*B, C, context]
+        if features.shape[-2] == 0:  # C = 0: a Proposer that does not see the Solver's answers
+            return features.new_zeros(*features.shape[:-2], self.context)
+        return torch.relu(features.mean(-2))
 
 
 def context_width(context: int, numbers: int, number_bands: int = 0) -> int:

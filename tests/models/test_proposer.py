@@ -4,8 +4,10 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
+from torch import nn
 
 from proposer_rl.models import (
+    MapEncoder,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -19,11 +21,15 @@ from proposer_rl.models import (
 )
 
 
+def maps(features: int) -> MapEncoder:
+    return MapEncoder(7, (32, 64), features)
+
+
 def network(**options) -> ProposerNetwork:
     torch.manual_seed(0)
     numbers = options.get("numbers", 0)
     head = ProblemHead(16 + numbers, problems=6, choices=5, hidden=16)
-    return ProposerNetwork(head, 7, context=16, hidden=16, **options)
+    return ProposerNetwork(head, maps(16), context=16, hidden=16, **options)
 
 
 def test_shapes() -> None:
@@ -36,6 +42,25 @@ def test_the_probes_are_a_set() -> None:
     probes = torch.rand(2, 4, 7, 10, 10)
     for one, other in zip(network()(probes), network()(probes.flip(1)), strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_probes_may_be_vectors() -> None:
+    """What an encoder makes of each, averaged and cut off at zero, is the context."""
+    torch.manual_seed(0)
+    encoder = nn.Linear(3, 4)
+    network = ProposerNetwork(nn.Identity(), encoder, context=4, hidden=8)
+    probes = torch.rand(2, 5, 3)
+    context, _ = network(probes)
+    expected = torch.stack([encoder(probe).mean(0).clamp(min=0) for probe in probes])
+    torch.testing.assert_close(context, expected)
+
+
+def test_an_encoder_of_maps_reads_each_by_itself() -> None:
+    torch.manual_seed(0)
+    encoder, probes = maps(5), torch.rand(2, 3, 7, 6, 4)
+    features = encoder(probes)
+    assert features.shape == (2, 3, 5)
+    torch.testing.assert_close(features[1, 2], encoder(probes[1:, 2:])[0, 0])
 
 
 def test_without_probes_every_state_looks_alike() -> None:
@@ -105,14 +130,14 @@ def test_the_width_of_a_context(bands: int, width: int) -> None:
     assert context_width(16, 2, bands) == width
     torch.manual_seed(0)
     head = MixtureHead(width, directions=2, hidden=8)
-    network = ProposerNetwork(head, 7, numbers=2, number_bands=bands, context=16, hidden=16)
+    network = ProposerNetwork(head, maps(16), numbers=2, number_bands=bands, context=16, hidden=16)
     parameters, value = network(torch.rand(5, 4, 7, 6, 6), torch.rand(5, 1), torch.rand(5, 1))
     assert parameters.shape == (5, 2, 2) and value.shape == (5, 1)
 
 
 def test_bands_tell_numbers_from_zero_to_one_apart() -> None:
     head = MixtureHead(context_width(4, 1, 3), directions=1, hidden=8)
-    network = ProposerNetwork(head, 7, numbers=1, number_bands=3, context=4, hidden=4)
+    network = ProposerNetwork(head, maps(4), numbers=1, number_bands=3, context=4, hidden=4)
     told = network._tell(torch.linspace(0, 1, 9)[:, None])
     torch.testing.assert_close(told[4], torch.tensor([1.0, 0, 0, 0, -1, 1]), atol=1e-6, rtol=0)
     assert (torch.cdist(told, told) + 10 * torch.eye(9)).min() > 0.3

@@ -1,0 +1,53 @@
+"""The Proposer trained with other losses of TorchRL's: A2CLoss and ReinforceLoss.
+
+``PPO`` takes a factory of the loss, called with actor and critic. These two hold only for the
+policy that collected the rollout, so each gets one gradient step on it, and a larger one than
+PPO's. All else is as in own_environment.py, also the advantages against the other copies.
+
+    python examples/other_loss.py [cycles]
+
+On the command line a method names the factory (examples/conf/method/a2c.yaml):
+
+    PYTHONPATH=examples bin/train --config-dir examples/conf +method=a2c +scale=quick \
+        proposer.ppo.epochs=1 proposer.ppo.updates=1 proposer.ppo.learning_rate=0.01
+"""
+
+from __future__ import annotations
+
+import sys
+
+import torch
+from own_environment import COPIES, proposer, solvers
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.objectives import A2CLoss, ReinforceLoss
+
+from proposer_rl import PPOSettings, Streams
+
+
+def a2c(actor: TensorDictModuleBase, critic: TensorDictModule) -> A2CLoss:
+    """Mnih et al. 2016. It takes an action as one event: for ``problems``, ``ratio: joint``."""
+    return A2CLoss(
+        actor, critic, functional=False, reduction="none", critic_coeff=0.5, loss_critic_type="l2"
+    )
+
+
+def reinforce(actor: TensorDictModuleBase, critic: TensorDictModule) -> ReinforceLoss:
+    """Williams 1992."""
+    return ReinforceLoss(actor, critic, functional=False, reduction="none", loss_critic_type="l2")
+
+
+def main(cycles: int = 20) -> None:
+    """Train a Proposer for mountain cars with each."""
+    torch.set_num_threads(1)
+    numbers = PPOSettings(horizon=2, epochs=1, gamma=1.0, learning_rate=0.02)
+    for loss in (a2c, reinforce):
+        curriculum = proposer(Streams(0), numbers, loss)
+        for cycle in range(cycles):
+            stream = Streams(0, cycle)
+            outcome = curriculum.improve(solvers(1, stream), [stream]).metrics
+            gain = sum(outcome["total_gain"]) / COPIES
+            print(f"{loss.__name__}, cycle {cycle}: mean gain of the copies {gain:.2f}")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

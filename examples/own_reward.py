@@ -1,0 +1,44 @@
+"""A reward of your own: the Proposer is paid for levels that are solved about half of the time.
+
+A reward is a function of one training step of K Solvers that gives each of them a number. This one
+is learnability, p (1 - p) with p the success rate on a level (Rutherford et al. 2024, "No Regrets",
+sections 3 and 4). In Python, at a scale of seconds:
+
+    python examples/own_reward.py [updates]
+
+On the command line, named in a method of your own (examples/conf/method/own_reward.yaml):
+
+    PYTHONPATH=examples bin/train --config-dir examples/conf +method=own_reward +scale=quick
+"""
+
+from __future__ import annotations
+
+import sys
+
+from small_mazes import proposer_settings, report, small_task, train
+from torch import Tensor
+
+from proposer_rl.methods import Parts, proposer
+from proposer_rl.rewards import TrainingStep
+
+
+def learnability(step: TrainingStep) -> Tensor:
+    """Mean of p (1 - p) over the levels just trained on, float [K].
+
+    p is the share of a level's episodes that reached the goal, of those that ended in the rollout.
+    """
+    ends = step.rollout["next"].select("terminated", "done")
+    reached, ended = (ends[key].float().sum((-2, -1)) for key in ("terminated", "done"))  # [K, P]
+    p = reached / ended.clamp(min=1)
+    return (p * (1 - p)).mean(-1)
+
+
+def main(updates: int = 60) -> None:
+    """Train a Solver on the proposals of a Proposer that is paid for learnability."""
+    task = small_task()
+    curriculum = proposer(Parts(task, proposer_settings(), seed=0), reward=learnability)
+    report(train(task, curriculum, updates))
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,62 @@
+"""A Solver's network of your own: one convolution, applied again and again.
+
+Any module without buffers will do that maps planes [*B, 3, H, W] to action logits [*B, 4, H, W] and
+values [*B, 1, H, W]. Like value iteration, this one carries news of the goal one cell further with
+every application of the same weights (Tamar et al. 2016, "Value Iteration Networks"). Afterwards it
+acts in mazes larger than those it was trained on.
+
+    python examples/own_solver.py [updates]
+
+A run's folder keeps settings, not code, and the commands make the Solver of its settings again. So
+another network is for Python; the command line has the U-Net's sizes.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import torch
+from small_mazes import report, small_task, train
+from torch import Tensor, nn
+
+from proposer_rl import ExactEvaluator, SamplingCurriculum, Streams, generate_levels
+from proposer_rl.mazes import planes
+from proposer_rl.models import cell_logits, orthogonal_
+
+
+class Iterated(nn.Module):
+    """A 3x3 convolution that is applied ``steps`` times, each time with a look at the maze."""
+
+    def __init__(self, width: int = 24, steps: int = 8) -> None:
+        super().__init__()
+        self.look = nn.Conv2d(3, width, 3, padding=1)
+        self.step = nn.Conv2d(width, width, 3, padding=1)
+        self.heads = nn.Conv2d(width, 4 + 1, 1)
+        self.steps = steps
+        orthogonal_(self)
+        orthogonal_(self.step, 1.0)
+        orthogonal_(self.heads, 0.1)
+
+    def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
+        """Map planes [*B, 3, H, W] to logits [*B, 4, H, W] and values [*B, 1, H, W]."""
+        seen = self.look(planes.flatten(0, -4))
+        hidden = torch.relu(seen)
+        for _ in range(self.steps):
+            hidden = torch.relu(self.step(hidden) + seen)
+        maps = self.heads(hidden).unflatten(0, planes.shape[:-3])
+        return maps.split([4, 1], -3)
+
+
+def main(updates: int = 100) -> None:
+    """Train it on 5x5 mazes, and measure it on 8x8 ones."""
+    task = small_task(Iterated)
+    solver = task.solvers([Streams(0, "solver")])
+    report(train(task, SamplingCurriculum(task.sample_target), updates, solver))
+    levels = generate_levels([0.2] * 128, 4, 8, 8, generator=Streams(1).generator())
+    larger = levels.unsqueeze(0)
+    outcome = ExactEvaluator(max_steps=10)(larger, cell_logits(solver.agent, planes(larger)))
+    print(f"on 8x8 mazes: success {outcome['success'].mean():.3f}")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

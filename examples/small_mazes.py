@@ -1,0 +1,76 @@
+"""What the examples on mazes share: a task that is trained on in seconds, and the outer loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from torch import nn
+
+from proposer_rl import PPO, Curriculum, Experiment, MazeTask, PPOSettings, Schedule, Streams
+from proposer_rl.methods import ProposerSettings
+from proposer_rl.run_folder import RunFolder, read_csv
+from proposer_rl.task import (
+    DistributionSettings,
+    EvaluationSettings,
+    MazeSettings,
+    SolverSettings,
+    SpaceSettings,
+)
+
+CYCLE = 10  # updates between two improvements of a curriculum
+
+
+def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
+    """5x5 mazes: the target has 5 obstacles and paths of 4 moves."""
+    ppo = PPOSettings(horizon=10, learning_rate=2e-3)
+    return MazeTask(
+        maze=MazeSettings(height=5, width=5, max_steps=10),
+        distributions={"id": DistributionSettings(specifications=[(0.2, 4)])},
+        target="id",
+        space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4], path_lengths=[1, 2, 4, 6]),
+        solver=SolverSettings(channels=[16, 32], problems=32, ppo=ppo),
+        evaluation=EvaluationSettings(distributions=["id"], levels=128),
+        network=network,
+    )
+
+
+def proposer_settings() -> ProposerSettings:
+    """A Proposer that learns from four copies of the Solver, trained for a cycle."""
+    return ProposerSettings(
+        rollouts=4,
+        lookahead=CYCLE,
+        updates_per_step=CYCLE,
+        validation_levels=64,
+        probe_levels=4,
+        channels=[8, 16],
+        ppo=PPOSettings(horizon=CYCLE, gamma=1.0, learning_rate=1e-3),
+    )
+
+
+def train(
+    task: MazeTask, curriculum: Curriculum, updates: int, solver: PPO | None = None
+) -> list[dict[str, Any]]:
+    """Train a Solver, a fresh one unless given; a row of measurements for every ten updates."""
+    with TemporaryDirectory() as folder:
+        experiment = Experiment(
+            solver or task.solvers([Streams(0, "solver")]),
+            curriculum,
+            schedule=Schedule(updates=updates, cycle_length=CYCLE, evaluate_every=CYCLE),
+            seeds=[0],
+            folder=RunFolder(Path(folder)),
+            evaluate=task.measure,
+            statistics=task.statistics,
+            records=task.records,
+            progress=False,
+        )
+        experiment.run()
+        return read_csv(Path(folder) / "metrics.csv")
+
+
+def report(rows: list[dict[str, Any]]) -> None:
+    """Print success on the target along training."""
+    for row in rows:
+        print(f"{row['updates']:4.0f} updates: success {row['id_success']:.3f}")

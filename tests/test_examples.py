@@ -1,0 +1,193 @@
+"""The examples run as they are, and do what they say."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from proposer_rl.curricula import SamplingCurriculum
+from proposer_rl.mazes import Level
+from proposer_rl.rewards import TrainingStep
+from proposer_rl.run_folder import read_csv
+from proposer_rl.streams import Streams
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+SHARED = ["small_mazes"]
+NAMES = sorted({file.stem for file in EXAMPLES.glob("*.py")} - set(SHARED))
+
+Load = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch, own_folder: None) -> Iterator[Load]:
+    """Imports an example as a script in its folder would be found."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    yield importlib.import_module
+
+
+def numbers(text: str, pattern: str) -> list[float]:
+    """What the pattern's group matches in a text, in order."""
+    return [float(found) for found in re.findall(pattern, text)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_says_what_it_shows_and_is_listed(name: str) -> None:
+    text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
+    docstring = text.split('"""')[1]
+    assert text.startswith('"""') and f"python examples/{name}.py" in docstring
+    for document in ("README.md", "docs/own_parts.md"):
+        assert f"{name}.py" in (ROOT / document).read_text(encoding="utf-8"), document
+
+
+def test_the_environment_of_the_example_is_short() -> None:
+    assert len((EXAMPLES / "own_environment.py").read_text().splitlines()) <= 150
+
+
+def test_the_mountain_car_is_gymnasiums(example: Load) -> None:
+    """At gravity 1 and power 1 it takes Gymnasium's steps, five at a time."""
+    own = example("own_environment")
+    reference = gymnasium.make("MountainCar-v0").unwrapped
+    level = {"gravity": torch.ones(1), "power": torch.ones(1), "start": torch.tensor([-0.5])}
+    env = own.MountainCar(TensorDict(level, [1]))
+    check_env_specs(env)
+    state = env.reset()
+    reference.state = np.array([-0.5, 0.0])
+    pushes = [0] * 4 + [2] * 6 + [0] * 8 + [1] * 3 + [2] * 12  # from wall to top
+    ends = []
+    for push in pushes:
+        state = env.step(state.set("action", torch.tensor([push])))["next"]
+        steps = [reference.step(push) for _ in range(5)]
+        ends.append(any(terminated for _, _, terminated, _, _ in steps))
+        place, speed = (state["observation"][0] * torch.tensor([0.9, 0.07])).tolist()
+        np.testing.assert_allclose([place, speed], reference.state, atol=2e-5)
+        assert bool(state["terminated"]) == ends[-1]
+        if ends[-1]:
+            break
+    assert ends[-1] and len(ends) > 20
+
+
+def test_a_proposer_for_another_environment_runs(
+    example: Load, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = example("own_environment")
+    for name, small in (("COPIES", 4), ("PROBLEMS", 4), ("STEPS", 8), ("UPDATES", 4)):
+        monkeypatch.setattr(own, name, small)
+    own.main(1, 2, 1)
+    printed = capsys.readouterr().out
+    gains = numbers(printed, r"gain of the copies (\S+)")
+    successes = numbers(printed, r"success (\S+) after 4 updates")
+    assert len(gains) == 2 and all(-1 <= gain <= 1 for gain in gains)
+    assert len(successes) == 3 and all(0 <= success <= 1 for success in successes)
+    assert Path("own_environment.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_reward_is_learnability_by_hand(example: Load) -> None:
+    own = example("own_reward")
+    done, terminated = torch.zeros(2, 2, 2, 6, 1, dtype=torch.bool).unbind(0)
+    done[0, 0, [1, 3, 5]] = True  # three episodes, one of them solved
+    terminated[0, 0, 1] = True
+    done[1, 0, [2, 5]] = terminated[1, 0, [2, 5]] = True  # both solved
+    done[1, 1, 5] = True  # one, not solved; of [0, 1] none has ended
+    rollout = TensorDict({"next": TensorDict({"done": done, "terminated": terminated})})
+    step = TrainingStep(None, rollout, None, torch.zeros(2), torch.zeros(2))  # type: ignore[arg-type]
+    expected = torch.tensor([(1 / 3 * 2 / 3 + 0) / 2, 0.0])
+    torch.testing.assert_close(own.learnability(step), expected)
+
+
+def failures(probability: float, example: Load) -> tuple[Level, Tensor, Level]:
+    """Levels, which of them were failed on, and what is proposed next."""
+    task = example("small_mazes").small_task()
+    solver = task.solvers([Streams(0, "solver")])
+    make = example("own_curriculum").Again
+    curriculum = make(SamplingCurriculum(task.sample_target), probability)
+    levels = curriculum.propose(solver, [Streams(0)])
+    solver.env.set_levels(levels)
+    rollout = solver.update([torch.Generator().manual_seed(0)]).rollout
+    curriculum.observe(levels, rollout)
+    resumed = make(SamplingCurriculum(task.sample_target), probability)
+    resumed.load_state_dict(curriculum.state_dict())
+    following = [c.propose(solver, [Streams(1)]) for c in (curriculum, resumed)]
+    assert (following[0] == following[1]).all()
+    ends = rollout["next"]
+    first = ends["done"].squeeze(-1).int().argmax(-1, keepdim=True)  # the first end's step
+    solved = ends["terminated"].squeeze(-1).gather(-1, first).squeeze(-1)
+    return levels, ~solved, following[0]
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_failed_levels_come_again(probability: float, example: Load) -> None:
+    levels, failed, following = failures(probability, example)
+    same = (levels.walls == following.walls).all(-1).all(-1)
+    assert failed.any() and not failed.all()
+    assert torch.equal(same, failed if probability else torch.zeros_like(failed))
+
+
+@pytest.mark.parametrize("name", ["own_reward", "own_curriculum"])
+def test_a_solver_is_trained_with_it(
+    name: str, example: Load, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example(name).main(10)
+    assert len(numbers(capsys.readouterr().out, r"success (\S+)")) == 2
+
+
+def test_the_network_learns_and_acts_in_larger_mazes(
+    example: Load, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example("own_solver").main(30)
+    success = numbers(capsys.readouterr().out, r"success (\S+)")
+    assert success[0] < 0.2 and success[-2] > 0.5 and success[-1] > 0.5
+
+
+def test_other_losses_train_the_proposer(
+    example: Load, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = example("own_environment")
+    for name, small in (("PROBLEMS", 4), ("STEPS", 8), ("UPDATES", 4)):
+        monkeypatch.setattr(own, name, small)
+    example("other_loss").main(1)
+    printed = capsys.readouterr().out
+    assert re.findall(r"^(\w+), cycle 0", printed, re.MULTILINE) == ["a2c", "reinforce"]
+
+
+def test_a_stock_script_learns_mazes(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    example("stock_ppo").main(16)
+    success = numbers(capsys.readouterr().out, r"success (\S+)")
+    assert success[0] < 0.25 and success[-1] > success[0] + 0.15
+
+
+def test_a_stock_scripts_levels_are_fresh(example: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The collector plays the levels that were set, not a copy of the first ones."""
+    stock, played = example("stock_ppo"), []
+    collect = stock.Collector.rollout
+
+    def remembered(self) -> TensorDict:
+        batch = collect(self)
+        played.append(batch["planes"][:, 0].clone())
+        return batch
+
+    monkeypatch.setattr(stock.Collector, "rollout", remembered)
+    stock.main(2)
+    assert not torch.equal(*played)
+
+
+@pytest.mark.parametrize("method", sorted(f.stem for f in EXAMPLES.glob("conf/method/*.yaml")))
+def test_methods_of_ones_own_run_from_the_command_line(
+    method: str, example: Load, train: Callable[..., int]
+) -> None:
+    folder = str(EXAMPLES / "conf")
+    arguments = ["--config-dir", folder, f"+method={method}", "+scale=smoke", "progress=false"]
+    assert train(*arguments, "hydra.run.dir=run") == 0
+    rows = read_csv(Path("run/metrics.csv"))
+    assert [row["updates"] for row in rows] == [0, 2, 4, 6]
