@@ -94,8 +94,8 @@ class Population(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
         call = Call(self._template[0], self.names, self.precision)
-        own = [self._own(tensors) for tensors in (self.stacked, inputs)]
-        outputs = [self._among_all(output) for output in self._chosen_way(inputs)(call, *own)]
+        own = self._chosen_way(inputs)(call, self._own(self.stacked), self._own(inputs))
+        outputs = [self._among_all(output) for output in own]
         return outputs[0] if len(outputs) == 1 else tuple(outputs)
 
     def _own(self, tensors: Iterable[Tensor]) -> list[Tensor]:
@@ -112,8 +112,7 @@ class Population(nn.Module):
     def seconds_of_ways(self, *inputs: Tensor) -> dict[str, float]:
         """Measure how long both passes over such inputs [K, ...] take, by each way."""
         call = Call(self._template[0], self.names, self.precision)
-        own = [self._own(tensors) for tensors in (self.stacked, inputs)]
-        return measure(WAYS, call, *own, self._recorder)
+        return measure(WAYS, call, self._own(self.stacked), self._own(inputs), self._recorder)
 
     def _chosen_way(self, inputs: Sequence[Tensor]) -> Way:
         if self.way is None and self.copies > 1:

@@ -5,7 +5,7 @@ everywhere, and every random number belongs to a copy's number, so that a copy's
 depend on where it is computed, bit for bit on processors of one kind.
 """
 
-from proposer_rl.workers.copies import CopiesInWorkers, WorkersError, shares
-from proposer_rl.workers.engines import WorkerSettings
+from proposer_rl.workers.copies import CopiesInWorkers, shares
+from proposer_rl.workers.engines import WorkersError, WorkerSettings
 
 __all__ = ["CopiesInWorkers", "WorkerSettings", "WorkersError", "shares"]

@@ -107,11 +107,10 @@ class CopiesInWorkers:
         assert self._collector is not None, "there has been no episode"
         orders = [(copy, share) for share in self._shares]
         reports: list[Report] = self._collector.map_fn("env.report", orders)
-        (own,) = [report for report in reports if report.solver is not None]
-        steps = torch.cat([report.steps for report in reports], 1)  # [S, K]
+        (own,) = [report for report in reports if report.copy]
+        steps: Any = torch.cat([report.steps for report in reports], 1)  # [S, K]
         metrics = TensorDict({key: entry.mean() for key, entry in steps.items()})
-        device = self._env.device
-        solver, levels, rollout = (x.to(device) for x in (own.solver, own.levels, own.rollout))
+        solver, levels, rollout = (entry.to(self._env.device) for entry in own.copy)
         return Trained(solver, levels, Update(rollout, metrics))
 
     def close(self) -> None:
@@ -133,7 +132,7 @@ class CopiesInWorkers:
         weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
         shape = self._env.full_action_spec[self._proposer.agent.action_key].shape
         collector.map_fn("env.fork", [(origin, streams)] * every)
-        collector.map_fn("policy.start", [(weights, streams.address, shape)] * every)
+        collector.map_fn("policy.start", [(weights, streams, shape)] * every)
         rollouts = collect(collector)
         return rollouts, collector.get_distant_attr("env.diverged")
 
@@ -155,11 +154,12 @@ class CopiesInWorkers:
 
     def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
         """The rollout [K, T] of all copies, each from the worker that computes it."""
-        own = [
+        own: list[Any] = [
             rollout[share.start : share.stop]
             for rollout, share in zip(rollouts, self._shares, strict=True)
         ]
-        rollout = torch.cat(own).exclude("collector").to(self._env.device)
+        rollout: Any = torch.cat(own)
+        rollout = rollout.exclude("collector").to(self._env.device)
         rollout.names = [None, "time"]
         return rollout
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -67,7 +68,9 @@ def start(chosen: WorkerSettings, order: Order) -> BaseCollector:
     Raises:
         WorkersError: if there is no such cluster, or it is too small.
     """
-    with _threads_kept(), _signals_kept():
+    with _threads_kept(), _signals_kept(), warnings.catch_warnings():
+        # TorchRL's, of a policy that it will not update: the weights come with every order.
+        warnings.filterwarnings("ignore", message="The policy is not an nn.Module")
         return {"multiprocess": _multiprocess, "ray": _ray}[chosen.engine](chosen, order)
 
 
@@ -119,6 +122,7 @@ def _ray(chosen: WorkerSettings, order: Order) -> BaseCollector:
             order.environments,
             policy_factory=order.policies,
             frames_per_batch=order.frames * chosen.workers,
+            total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
             reset_at_each_iter=True,
             storing_device="cpu",
             sync=True,

@@ -23,14 +23,12 @@ class Report(NamedTuple):
     Attributes:
         steps: the gradient steps of the n copies of the share, [S, n]; nan where only one number
             is known of all copies.
-        solver, levels, rollout: of the copy that was asked for, with a first dimension of one; None
-            from a worker that does not compute it.
+        copy: snapshot, levels and rollout of the copy that was asked for, each with a first
+            dimension of one; nothing from a worker that does not compute it.
     """
 
     steps: TensorDictBase
-    solver: TensorDictBase | None = None
-    levels: Any = None
-    rollout: TensorDictBase | None = None
+    copy: tuple[Any, ...]
 
 
 class WorkerEnv(SolverTrainingEnv):
@@ -61,14 +59,10 @@ class WorkerEnv(SolverTrainingEnv):
         }
         steps = TensorDict(own, [len(self.solvers.gradient_steps), len(share)]).cpu()
         if copy not in share:
-            return Report(steps)
+            return Report(steps, ())
         levels, (rollout, _) = self.last_training
-        return Report(
-            steps,
-            self.solvers.snapshot()[[copy]].cpu().consolidate(),
-            levels[[copy]].cpu(),
-            rollout[[copy]].cpu(),
-        )
+        solver = self.solvers.snapshot()[[copy]].cpu().consolidate()
+        return Report(steps, (solver, levels[[copy]].cpu(), rollout[[copy]].cpu()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:
@@ -113,17 +107,17 @@ class WorkerPolicy(RolloutPolicy):
         super().__init__(agent.to(device))
         self.horizon = horizon
 
-    def start(self, weights: TensorDictBase, address: list[str | int], shape: torch.Size) -> None:
+    def start(self, weights: TensorDictBase, streams: Streams, shape: torch.Size) -> None:
         """Expect a rollout.
 
         Args:
             weights: of the Proposer, by name.
-            address: of the cycle's random streams.
+            streams: of the cycle.
             shape: of an action of all copies, [K, ...].
         """
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():
             parameter.data.copy_(weights[name])
         device = next(agent.parameters()).device
-        generators = action_generators(Streams(*address), shape[0], device)
+        generators = action_generators(streams, shape[0], device)
         self.begin(uniform_noise(shape, self.horizon, generators, device))
