@@ -143,7 +143,13 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
 
 
 def proposer(parts: Parts, reward: Reward) -> Curriculum:
-    """Train on the proposals of an agent that is rewarded for each of the Solver's updates."""
+    """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
+
+    Raises:
+        TypeError: if the reward is no function.
+    """
+    if not callable(reward):
+        raise TypeError(f"reward must be a function of a training step, got {reward!r}")
     task, chosen = parts.task, parts.proposer
     streams = Streams(parts.seed, "proposer")
     env = _meta_env(task, chosen, parts.seed, reward, on_step=parts.on_step)

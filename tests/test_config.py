@@ -152,6 +152,7 @@ WRONG_COMMANDS = [
     (["+method=hand_made", "curriculum.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (["+method=hand_made", "curriculum.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer() got an unexpected"),
+    (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),
     (["+method=perf_gain", "~curriculum.reward"], "curriculum: proposer() missing 1 required"),
     (
         ["+method=perf_gain", "+ablation=lookahead_10", "+scale=quick"],

@@ -104,10 +104,17 @@ class Population(nn.Module):
         return [x if whole else x[self.share.start : self.share.stop] for x in tensors]
 
     def _among_all(self, output: Tensor) -> Tensor:
-        """A share's output among zeros for the other copies, [K, ...]."""
+        """A share's output among zeros for the other copies, [K, ...].
+
+        Stacked as the copies of a whole population are: concatenation would lay the numbers out in
+        another order, and sums over them would round otherwise.
+        """
+        if len(self.share) == self.copies:
+            return output
+        own = output.unbind()
+        rest = torch.zeros_like(own[0])
         before, after = self.share.start, self.copies - self.share.stop
-        rest = [output.new_zeros(count, *output.shape[1:]) for count in (before, after)]
-        return torch.cat([rest[0], output, rest[1]]) if before or after else output
+        return torch.stack([rest] * before + [*own] + [rest] * after)
 
     def seconds_of_ways(self, *inputs: Tensor) -> dict[str, float]:
         """Measure how long both passes over such inputs [K, ...] take, by each way."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 import warnings
@@ -20,6 +21,7 @@ from proposer_rl.settings import settings
 # What a collector raises when a process of its own has died or cannot be reached any more.
 LOST = (RuntimeError, EOFError, OSError, ValueError)
 SECONDS_TO_CLOSE = 5.0
+SECONDS_TO_ANSWER = 10.0
 
 
 class WorkersError(RuntimeError):
@@ -137,7 +139,7 @@ def _ray(chosen: WorkerSettings, order: Order) -> BaseCollector:
             weight_sync_schemes={},
             ray_init_config=_cluster(chosen),
         )
-    except ConnectionError as error:
+    except ConnectionError as error:  # Ray's, of an address such as auto
         raise WorkersError(f"ray_address={chosen.ray_address}: no cluster answers there") from error
     available = ray.cluster_resources()
     needed = {"CPU": chosen.cores * chosen.workers, "GPU": float(on_gpus)}
@@ -161,11 +163,23 @@ def _resources(chosen: WorkerSettings, on_gpus: bool) -> dict[str, Any]:
 def _cluster(chosen: WorkerSettings) -> dict[str, Any]:
     quiet = {"log_to_driver": False, "logging_level": "error"}
     if chosen.ray_address is not None:
+        _knock(chosen.ray_address)
         return {"address": chosen.ray_address, **quiet}
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster of ours tells nobody
     # As many as are asked for, or Ray would wait for processors that will never be there.
     processors = max(os.cpu_count() or 1, chosen.cores * chosen.workers)
     return {"address": "local", "num_cpus": processors, "include_dashboard": False, **quiet}
+
+
+def _knock(address: str) -> None:
+    """Find out at once that nobody is there: Ray would go on asking for minutes."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit():
+        return  # a name that Ray itself resolves, such as auto
+    try:
+        socket.create_connection((host, int(port)), SECONDS_TO_ANSWER).close()
+    except (OSError, OverflowError) as error:
+        raise WorkersError(f"ray_address={address}: no cluster answers there: {error}") from error
 
 
 @contextmanager
