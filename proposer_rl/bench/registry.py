@@ -12,9 +12,9 @@ from proposer_rl.bench.gpu import gpu_targets
 from proposer_rl.bench.learning import learning_curves
 from proposer_rl.bench.levels import generation, shortest_paths
 from proposer_rl.bench.meta import memory, meta_step
+from proposer_rl.bench.placement import throughput
 from proposer_rl.bench.results import Options, Result
 from proposer_rl.bench.solver import against_plain, overhead, population, precisions
-from proposer_rl.bench.placement import throughput
 
 
 class Benchmark(NamedTuple):
