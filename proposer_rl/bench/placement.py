@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Literal
@@ -17,12 +18,13 @@ from proposer_rl.rewards import performance_gain
 from proposer_rl.streams import Streams
 from proposer_rl.workers import WorkerSettings
 
+UPDATES = 5
 Engine = Literal["multiprocess", "ray"]
 
 
 def throughput(options: Options) -> Result:
     """Throughput per worker of two against one, each on one core of this machine."""
-    scale = TINY if options.tiny else QUICK
+    scale = TINY if options.tiny else _shorter(QUICK)
     engines: list[Engine] = ["multiprocess"]
     if not options.tiny and find_spec("ray") is not None:
         engines.append("ray")
@@ -51,6 +53,13 @@ def throughput(options: Options) -> Result:
         lines += [[engine, name, f"{Spread.of(s).median:.2f}"] for name, s in seconds.items()]
     title = f"Rollouts of the copies of a cycle, {copies}, one core each"
     return Result(rows, [Table(title, ["engine", "where", "seconds"], lines)])
+
+
+def _shorter(scale: Scale) -> Scale:
+    """The same with episodes of a few updates: an update takes as long in any."""
+    return replace(
+        scale, proposer=replace(scale.proposer, lookahead=UPDATES, updates_per_step=UPDATES)
+    )
 
 
 def _workers(engine: Engine, count: int, options: Options) -> WorkerSettings:
