@@ -94,9 +94,15 @@ class Population(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
         call = Call(self._template[0], self.names, self.precision)
-        own = self._chosen_way(inputs)(call, self._own(self.stacked), self._own(inputs))
-        outputs = [self._among_all(output) for output in own]
-        return outputs[0] if len(outputs) == 1 else tuple(outputs)
+        outputs = self._chosen_way(inputs)(call, list(self.stacked), inputs)
+        return outputs[0] if len(outputs) == 1 else outputs
+
+    def _of_share(
+        self, way: Way, call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
+    ) -> tuple[Tensor, ...]:
+        """Apply a way that knows no shares."""
+        outputs = way(call, self._own(stacked), self._own(inputs))
+        return tuple(self._among_all(output) for output in outputs)
 
     def _own(self, tensors: Iterable[Tensor]) -> list[Tensor]:
         """The share's slices of tensors [K, ...]."""
@@ -104,17 +110,10 @@ class Population(nn.Module):
         return [x if whole else x[self.share.start : self.share.stop] for x in tensors]
 
     def _among_all(self, output: Tensor) -> Tensor:
-        """A share's output among zeros for the other copies, [K, ...].
-
-        Stacked as the copies of a whole population are: concatenation would lay the numbers out in
-        another order, and sums over them would round otherwise.
-        """
-        if len(self.share) == self.copies:
-            return output
-        own = output.unbind()
-        rest = torch.zeros_like(own[0])
+        """A share's output among zeros for the other copies, [K, ...]."""
         before, after = self.share.start, self.copies - self.share.stop
-        return torch.stack([rest] * before + [*own] + [rest] * after)
+        rest = [output.new_zeros(count, *output.shape[1:]) for count in (before, after)]
+        return torch.cat([rest[0], output, rest[1]]) if before or after else output
 
     def seconds_of_ways(self, *inputs: Tensor) -> dict[str, float]:
         """Measure how long both passes over such inputs [K, ...] take, by each way."""
@@ -124,10 +123,10 @@ class Population(nn.Module):
     def _chosen_way(self, inputs: Sequence[Tensor]) -> Way:
         if self.way is None and self.copies > 1:
             if not self.stacked[0].is_cuda:
-                return partial(apply_on_cores, cores=self.cores)
+                return partial(apply_on_cores, cores=self.cores, share=self.share)
             seconds = self.seconds_of_ways(*inputs)
             self.way = min(seconds, key=seconds.__getitem__)
-        return WAYS[self.way or "in turn"]
+        return partial(self._of_share, WAYS[self.way or "in turn"])
 
 
 def available_cores() -> int:
