@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -42,6 +43,7 @@ from proposer_rl.settings import settings
 from proposer_rl.solver_view import SolverView, episode_return, log_success
 from proposer_rl.streams import Streams
 from proposer_rl.task import MazeTask
+from proposer_rl.workers import CopiesInWorkers, WorkerSettings
 
 
 @settings
@@ -95,12 +97,21 @@ class ProposerSettings:
 
 
 class Parts(NamedTuple):
-    """What a method's factory gets: the task, the Proposer's settings, the seed, a step counter."""
+    """What a method's factory gets.
+
+    Attributes:
+        task: the mazes and the Solver.
+        proposer: the Proposer's settings.
+        seed: of its weights.
+        on_step: called after every update of the copies, where they are trained in this process.
+        workers: where else they are trained; None for this process.
+    """
 
     task: MazeTask
     proposer: ProposerSettings
     seed: int
     on_step: Callable[[], None] | None = None
+    workers: WorkerSettings | None = None
 
 
 def target(parts: Parts) -> Curriculum:
@@ -139,30 +150,72 @@ def proposer(parts: Parts, reward: Reward, loss: MakeLoss | None = None) -> Curr
         parts: the task, and the Proposer's settings.
         reward: what an update is worth.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.ppo.PPO`.
+
+    Raises:
+        TypeError: if the reward is no function.
     """
+    if not callable(reward):
+        raise TypeError(f"reward must be a function of a training step, got {reward!r}")
     task, chosen = parts.task, parts.proposer
     streams = Streams(parts.seed, "proposer")
+    env = _meta_env(task, chosen, parts.seed, reward, on_step=parts.on_step)
     action = ACTIONS[chosen.proposals](task, chosen)
-    env = SolverTrainingEnv(
-        task.solvers([streams] * chosen.rollouts),
-        view=_view(task, chosen),
-        proposals=action.proposals,
-        reward=reward,
-        episode_length=chosen.lookahead,
-        updates_per_step=chosen.updates_per_step,
-        common_random_numbers=chosen.common_random_numbers,
-        on_step=parts.on_step,
-    )
     with streams.as_default("weights"):
         agent = _agent(task, chosen, action)
     numbers = replace(chosen.ppo, horizon=env.steps)
     advantage = CopiesBaseline(numbers.gamma) if chosen.advantage == "copies" else None
+    learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
+    workers = parts.workers
     return ProposerCurriculum(
-        PPO(env, agent, numbers, advantage=advantage, loss=loss),
+        learner,
+        copies=None
+        if workers is None
+        else CopiesInWorkers(
+            learner,
+            partial(
+                _worker_env, partial(task.recipe, cores=workers.cores), chosen, parts.seed, reward
+            ),
+            workers,
+        ),
         own_action=chosen.own_action,
         advance=chosen.advance,
         table=lambda counts: counts.unflatten(0, task.space.shape),
     )
+
+
+def _meta_env(
+    task: MazeTask,
+    chosen: ProposerSettings,
+    seed: int,
+    reward: Reward,
+    *,
+    share: range | None = None,
+    kind: type[SolverTrainingEnv] = SolverTrainingEnv,
+    on_step: Callable[[], None] | None = None,
+) -> SolverTrainingEnv:
+    return kind(
+        task.solvers([Streams(seed, "proposer")] * chosen.rollouts, share),
+        view=_view(task, chosen),
+        proposals=ACTIONS[chosen.proposals](task, chosen).proposals,
+        reward=reward,
+        episode_length=chosen.lookahead,
+        updates_per_step=chosen.updates_per_step,
+        common_random_numbers=chosen.common_random_numbers,
+        on_step=on_step,
+    )
+
+
+def _worker_env(
+    make_task: Callable[..., MazeTask],
+    chosen: ProposerSettings,
+    seed: int,
+    reward: Reward,
+    *,
+    share: range,
+    device: str,
+    kind: type[SolverTrainingEnv],
+) -> SolverTrainingEnv:
+    return _meta_env(make_task(device=device), chosen, seed, reward, share=share, kind=kind)
 
 
 def frozen_proposer(parts: Parts, checkpoint: str | None) -> Curriculum:

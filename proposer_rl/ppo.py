@@ -122,7 +122,7 @@ class PPO:
         self.agent = agent
         self.settings = settings
         self._level = _LevelAside(*agent.level_keys)
-        self._policy = _RolloutPolicy(agent)
+        self._policy = RolloutPolicy(agent)
         self._collector = Collector(
             _WithoutLevel(env, self._level),
             self._policy,
@@ -183,6 +183,16 @@ class PPO:
             rollout.set(key, along_time.expand(*rollout.shape, *entry.shape[level.ndim :]))
         return rollout
 
+    @torch.no_grad()
+    def complete(self, rollout: TensorDictBase) -> TensorDictBase:
+        """Add what :meth:`optimise` needs to a rollout [*B, T] of a :class:`RolloutPolicy`.
+
+        For a rollout that another collector than this one's has made, in another process.
+        """
+        context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
+        self._set_next_values(rollout, context)
+        return rollout
+
     def optimise(self, rollout: TensorDictBase) -> TensorDict:
         """Train on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
 
@@ -209,6 +219,11 @@ class PPO:
         taken = trained["metrics"]  # [S], with entries [S, K] or [S]
         self._last_training = rollout["next", "reward"], taken
         return TensorDict({key: value.mean() for key, value in taken.items()})
+
+    @property
+    def gradient_steps(self) -> TensorDictBase:
+        """Of the last training, [S]: what each step was like, for each copy [S, K] where told."""
+        return self._last_training[1]
 
     def check(self) -> None:
         """Check what was trained on last; this waits for the device, training does not.
@@ -362,28 +377,40 @@ class _ClipPPOLoss(ClipPPOLoss):
         return super()._get_entropy(dist, adv_shape)
 
 
-class _RolloutPolicy(TensorDictModuleBase):
-    """What the collector calls: reads the steps off the context and draws actions from noise."""
+class RolloutPolicy(TensorDictModuleBase):
+    """What a collector calls: reads the steps off the context and draws actions from noise.
+
+    :meth:`begin` comes before every rollout.
+
+    Args:
+        agent: its parameters do not become the policy's, so that a collector leaves them be.
+    """
 
     context: TensorDictBase
 
     def __init__(self, agent: ActorCritic) -> None:
         super().__init__()
-        # In a tuple: the agent's parameters are not the policy's, so the collector leaves them be.
+        # In a tuple, nn.Module does not register it.
         self._agent = (agent,)
         self.in_keys = agent.step_keys
         self.out_keys = [agent.action_key, agent.log_prob_key, agent.value_key]
 
-    def begin(self, noise: Tensor, level: _LevelAside) -> None:
-        """Expect a rollout [T] with this noise, of the level that the next reset puts aside."""
+    def begin(self, noise: Tensor, level: _LevelAside | None = None) -> None:
+        """Expect a rollout with this noise [T, ...].
+
+        Args:
+            noise: uniform numbers in [0, 1), one for each element of T actions.
+            level: where the next reset puts the level aside; None where it stays in every step.
+        """
         self._steps = enumerate(noise)
         self._level = (level,)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write action, log-probability and value of the next step."""
         (agent,), (level,) = self._agent, self._level
         index, noise = next(self._steps)
         if index == 0:
-            self.context = agent.encode(level.entries)
+            self.context = agent.encode(tensordict if level is None else level.entries)
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
         action = draw(distribution, noise)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -142,6 +143,9 @@ class MazeTask:
             ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
             of the settings.
 
+    Attributes:
+        recipe: makes the same task, or with other arguments a like one; it can be pickled.
+
     Raises:
         ValueError: if a name is no distribution's, or levels cannot be made as specified.
     """
@@ -161,6 +165,20 @@ class MazeTask:
         graphs: bool = True,
         network: Callable[[], nn.Module] | None = None,
     ) -> None:
+        self.recipe = partial(
+            MazeTask,
+            maze=maze,
+            distributions=distributions,
+            target=target,
+            space=space,
+            solver=solver,
+            evaluation=evaluation,
+            device=device,
+            precision=precision,
+            cores=cores,
+            graphs=graphs,
+            network=network,
+        )
         for name in (target, *evaluation.distributions):
             if name not in distributions:
                 raise ValueError(f"{name!r} is none of the distributions {sorted(distributions)}")
@@ -204,8 +222,13 @@ class MazeTask:
             device=self.device,
         )
 
-    def solvers(self, streams: Sequence[Streams]) -> PPO:
-        """A population with one Solver for each of K streams, and its environment [K, P]."""
+    def solvers(self, streams: Sequence[Streams], share: range | None = None) -> PPO:
+        """A population with one Solver for each of K streams, and its environment [K, P].
+
+        Args:
+            streams: from which the Solvers' weights are drawn.
+            share: the Solvers that are computed here; see :class:`Population`.
+        """
         copies, problems = len(streams), self.solver.problems
         weights = iter(streams)
 
@@ -213,9 +236,9 @@ class MazeTask:
             with next(weights).as_default("weights"):
                 return self._network()
 
-        network = Population(make, copies, self.precision, self.cores, recorder=self.recorder).to(
-            self.device
-        )
+        network = Population(
+            make, copies, self.precision, self.cores, recorder=self.recorder, share=share
+        ).to(self.device)
         agent = map_actor_critic(network, per_step=self.maze.observe_agent)
         # Placeholders of the right shape; every update sets its own levels.
         level = self._measured_on[next(iter(self._measured_on))][:1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -111,13 +112,19 @@ WRONG = [
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
     ("sede=1", "Could not override 'sede'"),
-    ("+sede=1", "sede: there is no such key; there are: ablation, checkpoint, cores"),
+    ("+sede=1", "sede: there is no such key; there are: ablation, checkpoint, collector"),
     ("+solver.x=1", "solver.x: there is no such key; there are: channels, groups"),
     ("+distributions.id.x=1", "distributions.id.x: there is no such key; there are: mechanism"),
     ("seed", "Error parsing override 'seed' missing EQUAL"),
     ("seed=${nowhere}", "Interpolation key 'nowhere' not found"),
     ("seed=???", "Missing mandatory value: seed"),
+    ("collector=spark", "collector='spark': input should be 'single', 'multiprocess' or 'ray'"),
+    ("workers=0", "workers=0: input should be greater than or equal to 1"),
+    ("worker_devices=[]", "worker_devices=[]: list should have at least 1 item"),
     # contradictions
+    ("workers=2", "workers=2: there are workers only with collector=multiprocess or collector=ray"),
+    ("worker_devices=[cpu]", "worker_devices=['cpu']: there are workers only with collector="),
+    ("ray_address=auto", "ray_address=auto: is of use only with collector=ray"),
     ("maze.height=3", "solver.channels=[64, 128, 256] halve a 3x10 maze to nothing"),
     ("solver.channels=[64,64,64,8]", "with a single number on a 10x10 maze"),
     ("maze.max_steps=5", "maze.max_steps=5 must be at least 12, the path length of"),
@@ -145,6 +152,7 @@ WRONG_COMMANDS = [
     (["+method=hand_made", "curriculum.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (["+method=hand_made", "curriculum.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer() got an unexpected"),
+    (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),
     (["+method=perf_gain", "~curriculum.reward"], "curriculum: proposer() missing 1 required"),
     (
         ["+method=perf_gain", "+ablation=lookahead_10", "+scale=quick"],
@@ -154,6 +162,12 @@ WRONG_COMMANDS = [
         ["+method=perf_gain", "proposer.advance=best", "schedule.cycle_length=5"],
         "schedule.cycle_length=5 must equal proposer.lookahead=50",
     ),
+    (
+        ["+method=perf_gain", "collector=ray", "workers=17"],
+        "workers=17 must be at most proposer.rollouts=16, the copies that they share",
+    ),
+    (["+method=target", "collector=ray"], "collector=ray: target trains no copies of the Solver"),
+    (["+method=perf_gain", "collector=multiprocess", "worker_devices=[abacus]"], "'abacus': must"),
     (["--experimental-rerun", "x.pickle"], "--experimental-rerun: not supported"),
 ]
 
@@ -169,6 +183,13 @@ def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, train, caps
     assert message in line
     written = {path.name for path in Path("run").glob("*")}
     assert written <= {".hydra", "train.log"}
+
+
+def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
+    assert train("+method=perf_gain", "collector=ray", "hydra.run.dir=run") == 2
+    line = "error: collector=ray: needs Ray: pip install 'proposer_rl[ray]'"
+    assert capsys.readouterr().err.strip() == line
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,8 @@ LAYERS = [
     {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
     {"level_sets"},
     {"meta_env"},
+    {"copies"},
+    {"workers"},
     {"curricula", "snr"},
     {"experiment"},
     {"task"},
@@ -35,7 +37,17 @@ RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 NEIGHBOURS = {("checkpoint", "run_folder"), ("lock", "run_folder")}
 
 # These work with any environment and any level: they are reused where there are no mazes.
-KNOW_NO_MAZES = {"ppo", "advantages", "proposals", "solver_view", "meta_env", "snr", "experiment"}
+KNOW_NO_MAZES = {
+    "ppo",
+    "advantages",
+    "proposals",
+    "solver_view",
+    "meta_env",
+    "snr",
+    "experiment",
+    "copies",
+    "workers",
+}
 
 # Everything but the command line takes plain arguments.
 CONFIGURATION = {"hydra", "omegaconf", "pydantic"}

@@ -12,6 +12,7 @@ from proposer_rl.bench.gpu import gpu_targets
 from proposer_rl.bench.learning import learning_curves
 from proposer_rl.bench.levels import generation, shortest_paths
 from proposer_rl.bench.meta import memory, meta_step
+from proposer_rl.bench.placement import throughput
 from proposer_rl.bench.results import Options, Result
 from proposer_rl.bench.solver import against_plain, overhead, population, precisions
 
@@ -44,6 +45,7 @@ BENCHMARKS = {
     "meta": Benchmark("a meta-environment step against its parts", meta_step),
     "population": Benchmark("K Solvers in one update against one after another", population),
     "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
+    "workers": Benchmark("rollouts of the copies in one worker and in two", throughput),
     "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
     "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
     "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),

@@ -76,6 +76,10 @@ class RunConfig(BaseModel):
     graphs: bool
     threads: Annotated[int, Field(ge=1, le=1024)] | None
     cores: Annotated[int, Field(ge=1, le=1024)] | None
+    collector: Literal["single", "multiprocess", "ray"]
+    workers: Annotated[int, Field(ge=1, le=LARGEST)] | None
+    worker_devices: Annotated[list[str], Field(min_length=1)] | None
+    ray_address: str | None
     progress: bool
     maze: MazeSettings
     distributions: dict[str, DistributionSettings]
@@ -122,6 +126,7 @@ class RunConfig(BaseModel):
                 f"proposer.ppo.horizon={proposer.ppo.horizon} must equal proposer.lookahead="
                 f"{proposer.lookahead}"
             )
+        self._check_workers()
         uneven = [width for width in solver.channels if width % solver.groups]
         if uneven:
             raise ValueError(
@@ -161,6 +166,22 @@ class RunConfig(BaseModel):
             )
         self._check_levels()
         return self
+
+    def _check_workers(self) -> None:
+        """Refuse settings of workers that there are not, or that would have nothing to do."""
+        for key in ("workers", "worker_devices"):
+            if self.collector == "single" and getattr(self, key) is not None:
+                raise ValueError(
+                    f"{key}={getattr(self, key)}: there are workers only with "
+                    "collector=multiprocess or collector=ray"
+                )
+        if self.collector != "ray" and self.ray_address is not None:
+            raise ValueError(f"ray_address={self.ray_address}: is of use only with collector=ray")
+        if self.workers is not None and self.workers > self.proposer.rollouts:
+            raise ValueError(
+                f"workers={self.workers} must be at most proposer.rollouts="
+                f"{self.proposer.rollouts}, the copies that they share"
+            )
 
     def _check_levels(self) -> None:
         """Refuse levels that cannot be made, naming the key that asks for them."""
@@ -222,6 +243,10 @@ def saved_config(folder: Path) -> RunConfig:
         "graphs": True,
         "threads": 1,
         "cores": None,
+        "collector": "single",
+        "workers": None,
+        "worker_devices": None,
+        "ray_address": None,
         "progress": False,
         "logger": {"type": "csv"},
     }

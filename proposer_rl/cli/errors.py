@@ -12,12 +12,14 @@ from proposer_rl.checkpoint import CheckpointError
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.finite import DivergedError
 from proposer_rl.lock import InUseError
+from proposer_rl.workers import WorkersError
 
 # docs/reliability.md lists them; 1 is Python's own, for an error that nobody foresaw.
 BAD_INPUT = 2
 DIVERGED = 3
 STORAGE = 4
 IN_USE = 5
+WORKERS = 6
 SIGNALLED = 128  # plus the signal's number, as a shell has it
 
 EXIT_CODES: dict[type[Exception], int] = {
@@ -28,6 +30,7 @@ EXIT_CODES: dict[type[Exception], int] = {
     DivergedError: DIVERGED,
     OSError: STORAGE,
     InUseError: IN_USE,
+    WorkersError: WORKERS,
 }
 FORESEEN = tuple(EXIT_CODES)
 

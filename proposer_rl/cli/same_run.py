@@ -9,6 +9,7 @@ from proposer_rl.run_folder import RunFolder
 
 # What may differ: where and how it is computed, saved and shown, and a longer schedule.
 FREE = {"device", "graphs", "threads", "cores", "progress", "logger"}
+FREE |= {"collector", "workers", "worker_devices", "ray_address"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
 

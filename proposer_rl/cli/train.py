@@ -30,6 +30,7 @@ from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, ref
 from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
+from proposer_rl.cli.workers import workers
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
 from proposer_rl.finite import DivergedError
@@ -72,7 +73,10 @@ def _main(hydra_config: DictConfig) -> float:
         config = read_config(hydra_config)
         made = parts(config)  # whatever is wrong with the input is found here
         with locked(path), StopSignals() as signals:
-            return live(config, *made, path, signals)
+            try:
+                return live(config, *made, path, signals)
+            finally:
+                made[2].close()
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error), exit_code(error))
@@ -307,7 +311,8 @@ class EpisodeBar:
 
 def _curriculum(config: RunConfig, task: MazeTask) -> Curriculum:
     bar = EpisodeBar(config.proposer.lookahead, config.progress)
-    parts = Parts(task, config.proposer, config.seeds[0], bar)
+    elsewhere = workers(config, task.device, _device)
+    parts = Parts(task, config.proposer, config.seeds[0], bar, elsewhere)
     try:
         factory = instantiate(config.curriculum, _partial_=True)
         curriculum = factory(parts)
@@ -316,6 +321,11 @@ def _curriculum(config: RunConfig, task: MazeTask) -> Curriculum:
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
+    if elsewhere is not None and not curriculum.uses_workers:
+        raise ConfigError(
+            f"collector={config.collector}: {config.method} trains no copies of the Solver, so "
+            "there is nothing for workers to do; leave collector=single"
+        )
     most = curriculum.most_solvers
     if most is not None and len(config.seeds) > most:
         raise ConfigError(
@@ -355,6 +365,8 @@ def _identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": torch.get_num_threads(),
+        "collector": config.collector,
+        "workers": config.workers,
         "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
     }
 

@@ -50,9 +50,11 @@ class Curriculum:
 
     Attributes:
         most_solvers: the largest K that it serves; None for any.
+        uses_workers: whether it has work for further processes.
     """
 
     most_solvers: ClassVar[int | None] = None
+    uses_workers: ClassVar[bool] = False
 
     def begin(self) -> None:
         """A fresh Solver begins: forget the last one, but not what was learnt from it."""
@@ -83,3 +85,6 @@ class Curriculum:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put back what :meth:`state_dict` returned."""
+
+    def close(self) -> None:
+        """Let go of all that is held outside of this process."""

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.copies import Copies, CopiesHere
 from proposer_rl.curricula.base import Advance, Improvement
 from proposer_rl.curricula.frozen_proposer import FrozenProposer
 from proposer_rl.finite import located
-from proposer_rl.meta_env import ReplayError, SolverTrainingEnv
-from proposer_rl.ppo import PPO, Update
+from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.ppo import PPO
 from proposer_rl.streams import Streams
 
 ADVANCES = ("train", "best", "random")
@@ -30,6 +30,8 @@ class ProposerCurriculum(FrozenProposer):
         proposer: PPO whose environment is a :class:`~proposer_rl.meta_env.SolverTrainingEnv` and
             whose horizon is the number of steps of that environment's episodes.
         own_action: what is proposed to the Solver itself; see :class:`FrozenProposer`.
+        copies: where the copies are rolled out; None for the Proposer's own environment, in this
+            process.
         advance: ``"train"``: the Solver trains on new proposals; ``"best"`` or ``"random"``: it
             becomes the copy with the greatest total gain, or any, with its optimiser.
         table: arranges counts of the choices, int64 [N], for the record.
@@ -39,10 +41,13 @@ class ProposerCurriculum(FrozenProposer):
             episode's.
     """
 
+    uses_workers = True
+
     def __init__(
         self,
         proposer: PPO,
         *,
+        copies: Copies | None = None,
         own_action: str = "sample",
         advance: str = "train",
         table: Callable[[Tensor], Tensor] | None = None,
@@ -67,6 +72,7 @@ class ProposerCurriculum(FrozenProposer):
         )
         self.proposer = proposer
         self.env = env
+        self.copies = copies or CopiesHere(proposer)
         self.advance = advance
         self._table = table or (lambda counts: counts)
         self._begun: dict[str, Any] | None = None
@@ -78,7 +84,8 @@ class ProposerCurriculum(FrozenProposer):
         (stream,) = streams
         env = self.env
         self._updates = 0
-        rollout = self._roll_out(solver, stream, pause)
+        begun, self._begun = self._begun, None
+        rollout = self.copies.roll_out(solver.snapshot()[0], stream, pause, begun)
         with located("the Proposer"):
             training = self.proposer.optimise(rollout)
             self.proposer.check()
@@ -104,7 +111,7 @@ class ProposerCurriculum(FrozenProposer):
         return {
             **super().state_dict(),
             "proposer": self.proposer.snapshot().to_dict(),
-            "episode": self.env.episode(),
+            "episode": self.copies.episode(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -113,30 +120,9 @@ class ProposerCurriculum(FrozenProposer):
         self.proposer.restore(TensorDict(state["proposer"], batch_size=[]))
         self._begun = state["episode"]
 
-    def _roll_out(
-        self, solver: PPO, stream: Streams, pause: Callable[[], None] | None
-    ) -> TensorDictBase:
-        """One episode of the copies, from its beginning or from where it was interrupted."""
-        begun, self._begun = self._begun, None
-        if begun is not None:
-            with suppress(ReplayError):
-                return self._play(solver, stream, pause, begun)
-        return self._play(solver, stream, pause)
-
-    def _play(
-        self,
-        solver: PPO,
-        stream: Streams,
-        pause: Callable[[], None] | None,
-        begun: dict[str, Any] | None = None,
-    ) -> TensorDictBase:
-        self.env.fork(solver.snapshot()[0], stream, pause)
-        if begun is not None:
-            self.env.resume(begun)
-        copies = range(self.env.batch_size[0])
-        return self.proposer.collect(
-            [stream.generator("proposals", copy, device=self.env.device) for copy in copies]
-        )
+    def close(self) -> None:
+        """Let go of the copies that are elsewhere."""
+        self.copies.close()
 
     def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
@@ -147,10 +133,9 @@ class ProposerCurriculum(FrozenProposer):
         else:
             generator = stream.generator("advance")
             chosen = int(torch.randint(copies, (), generator=generator))
-        solver.restore(self.env.solvers.snapshot()[[chosen]])
-        levels, (rollout, metrics) = self.env.last_training
-        own = Update(rollout[[chosen]], metrics)
-        return Advance(self.env.episode_length, levels[[chosen]], own)
+        trained = self.copies.trained(chosen)
+        solver.restore(trained.solver)
+        return Advance(self.env.episode_length, trained.levels, trained.update)
 
     def _metrics(
         self, rollout: TensorDictBase, gains: Tensor, training: TensorDict

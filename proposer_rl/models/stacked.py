@@ -103,11 +103,19 @@ def _streams(device: torch.device, count: int) -> list[Any]:
 
 
 def apply_on_cores(
-    call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor], cores: int
+    call: Call,
+    stacked: Sequence[Tensor],
+    inputs: Sequence[Tensor],
+    cores: int,
+    share: range | None = None,
 ) -> tuple[Tensor, ...]:
-    """Each copy on one core: small maps keep a core busy, but not several at once."""
+    """Each copy on one core: small maps keep a core busy, but not several at once.
+
+    Of copies outside of the ``share`` outputs and gradients are zeros.
+    """
+    share = range(len(stacked[0])) if share is None else share
     with_graph = torch.is_grad_enabled()  # unknown inside, where gradients are always off
-    return _OnCores.apply(call, _pool(cores), with_graph, len(inputs), *inputs, *stacked)
+    return _OnCores.apply(call, _pool(cores), share, with_graph, len(inputs), *inputs, *stacked)
 
 
 class _OnCores(torch.autograd.Function):
@@ -118,6 +126,7 @@ class _OnCores(torch.autograd.Function):
         ctx: Any,
         call: Call,
         pool: ThreadPoolExecutor,
+        share: range,
         with_graph: bool,
         n_inputs: int,
         *tensors: Tensor,
@@ -125,34 +134,42 @@ class _OnCores(torch.autograd.Function):
         def one(k: int) -> tuple[tuple[Tensor, ...], list[Tensor]]:
             leaves = [
                 x[k].detach().requires_grad_(with_graph and needs)
-                for x, needs in zip(tensors, ctx.needs_input_grad[4:], strict=True)
+                for x, needs in zip(tensors, ctx.needs_input_grad[5:], strict=True)
             ]
             own = call._replace(network=_own_network(call.network))
             with torch.set_grad_enabled(with_graph):
                 outputs = own(leaves[n_inputs:], leaves[:n_inputs])
             return outputs, leaves
 
-        results = list(pool.map(one, range(len(tensors[-1]))))
+        results = list(pool.map(one, share))
         # The graphs live in ctx, not among its saved tensors: they are made here and freed with it.
-        ctx.graphs, ctx.pool = results, pool
+        ctx.graphs, ctx.pool, ctx.share, ctx.copies = results, pool, share, len(tensors[-1])
         outputs = zip(*(outputs for outputs, _ in results), strict=True)
-        return tuple(torch.stack([o.detach() for o in slices]) for slices in outputs)
+        return tuple(
+            _among_all([o.detach() for o in slices], share, ctx.copies) for slices in outputs
+        )
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        needs = ctx.needs_input_grad[4:]
+        needs = ctx.needs_input_grad[5:]
 
         def one(k: int) -> list[Tensor]:
-            outputs, leaves = ctx.graphs[k]
+            outputs, leaves = ctx.graphs[k - ctx.share.start]
             wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
             slopes = [g[k] for g in gradients]
             # A parameter that the network does not use has a gradient of zero.
             return list(torch.autograd.grad(outputs, wanted, slopes, materialize_grads=True))
 
-        results = zip(*ctx.pool.map(one, range(len(ctx.graphs))), strict=True)
-        stacked = iter([torch.stack(slices) for slices in results])
+        results = zip(*ctx.pool.map(one, ctx.share), strict=True)
+        stacked = iter([_among_all(slices, ctx.share, ctx.copies) for slices in results])
         ctx.graphs = None
-        return None, None, None, None, *(next(stacked) if need else None for need in needs)
+        return None, None, None, None, None, *(next(stacked) if need else None for need in needs)
+
+
+def _among_all(slices: Sequence[Tensor], share: range, copies: int) -> Tensor:
+    """A share's slices stacked among zeros for the other copies, [K, ...]."""
+    rest = torch.zeros_like(slices[0])
+    return torch.stack([rest] * share.start + [*slices] + [rest] * (copies - share.stop))
 
 
 @cache

@@ -182,3 +182,26 @@ def test_a_network_with_one_output_gives_one_output() -> None:
 def test_refuses(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Population(*arguments)
+
+
+@pytest.mark.parametrize("share", [range(0, 1), range(1, 3), range(2, 5)])
+def test_a_share_has_the_bits_that_it_has_among_all(share: range) -> None:
+    torch.manual_seed(7)
+    part, whole = Population(small_unet, 5, share=share), together(5)
+    planes = torch.rand(5, 4, 3, 7, 9)
+    for population in (whole, part):
+        policy, value = population(planes)
+        (policy.square().sum() + value.sum()).backward()
+        population.outputs = policy.detach()
+    own = slice(share.start, share.stop)
+    rest = [k for k in range(5) if k not in share]
+    assert part.share == share and whole.share == range(5)
+    assert torch.equal(part.outputs[own], whole.outputs[own]) and not part.outputs[rest].any()
+    for one, other in zip(part.stacked, whole.stacked, strict=True):
+        assert torch.equal(one.grad[own], other.grad[own]) and not one.grad[rest].any()
+
+
+@pytest.mark.parametrize("share", [range(0, 0), range(0, 4), range(0, 3, 2), range(-1, 2)])
+def test_a_share_lies_within_the_copies(share: range) -> None:
+    with pytest.raises(ValueError, match="share must be a range within 3 copies"):
+        Population(small_unet, 3, share=share)
