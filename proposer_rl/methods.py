@@ -81,7 +81,7 @@ class ProposerSettings:
     )
     number_bands: Annotated[int, Ge(0)] = 0
     common_random_numbers: bool = False
-    measure: Literal["return", "log_success"] = "return"
+    measure: Literal["return", "log_success"] = "log_success"
     proposals: Literal["problems", "mixture"] = "mixture"
     ratio: Literal["joint", "per_problem"] = "per_problem"
     directions: Literal["linear", "target", "quadratic", "all"] = "linear"
