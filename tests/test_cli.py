@@ -14,8 +14,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.checkpoint import load_latest
+from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, methods, read_config
-from proposer_rl.cli.train import build, parts
 from proposer_rl.experiment import Schedule
 from proposer_rl.ppo import PPOSettings
 from proposer_rl.run_folder import RunFolder, read_csv, read_jsonl
@@ -104,7 +104,7 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkey
     command = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*command) == 0
     assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
-    monkeypatch.setattr("proposer_rl.cli.train.faster_precision", lambda *_: "bf16")
+    monkeypatch.setattr("proposer_rl.cli.build.faster_precision", lambda *_: "bf16")
     assert train(*command) == 2
     assert "error: precision='bf16': the run in" in capsys.readouterr().err
 

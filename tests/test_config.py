@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.checkpoint import load_latest, save_checkpoint
+from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
 from proposer_rl.cli.errors import FORESEEN
 from proposer_rl.cli.same_run import check_same_run
-from proposer_rl.cli.train import build, parts
 from proposer_rl.finite import DivergedError
 from proposer_rl.run_folder import RunFolder
 from proposer_rl.signals import Interrupted, StopSignals

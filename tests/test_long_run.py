@@ -13,8 +13,8 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, read_config
-from proposer_rl.cli.train import build, parts
 from proposer_rl.run_folder import RunFolder
 
 UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "200"))

@@ -18,9 +18,9 @@ from rich.text import Text
 from tensordict import TensorDict
 
 from proposer_rl.checkpoint import CheckpointError, State, load_checkpoint, load_latest
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.cli.errors import FORESEEN, refuse
-from proposer_rl.cli.train import make_task
 from proposer_rl.level_sets import (
     SUFFIXES,
     Score,

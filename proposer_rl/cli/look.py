@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.checkpoint import CheckpointError, load_checkpoint
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.snr import checkpoints, refuse
-from proposer_rl.cli.train import make_task
 from proposer_rl.curricula import FrozenProposer
 from proposer_rl.methods import Parts, frozen_proposer
 from proposer_rl.models import draw, uniform_noise

@@ -20,9 +20,9 @@ from torch.distributions import Dirichlet
 from tqdm import tqdm
 
 from proposer_rl.checkpoint import CheckpointError, load_checkpoint
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.cli.errors import BAD_INPUT, SIGNALLED
-from proposer_rl.cli.train import make_task
 from proposer_rl.meta_env import SolverTrainingEnv
 from proposer_rl.methods import MEASURES
 from proposer_rl.proposals import Mixture, ProblemChoices, Proposals

@@ -10,8 +10,8 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
-from proposer_rl.cli.train import make_task
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.rewards import Reward, performance_gain

@@ -1,0 +1,81 @@
+"""What a run is, and what came out of it."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from rich.console import Console
+from tqdm import tqdm
+
+from proposer_rl.cli.config import RunConfig
+from proposer_rl.experiment import Experiment
+from proposer_rl.machine import processor
+from proposer_rl.report.progress import read_progress
+from proposer_rl.report.terminal import screen
+from proposer_rl.run_folder import RunFolder
+
+
+def run_name(config: RunConfig) -> str:
+    """The run's name, in pictures and loggers."""
+    ablation = "" if config.ablation == "none" else f"_{config.ablation}"
+    return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
+
+
+def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
+    """What the run is, and what it is made with: method, seeds, machine, versions."""
+    device = experiment.solver.env.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
+    packages = ("proposer_rl", "torch", "torchrl", "tensordict", "hydra-core")
+    parameters = sum(p.numel() for p in experiment.solver.agent.parameters())
+    return {
+        "method": config.method,
+        "scale": config.scale,
+        "ablation": config.ablation,
+        "seed": config.seed,
+        "seeds": config.seeds,
+        "overrides": list(HydraConfig.get().overrides.task),
+        "solver_parameters": parameters,
+        "device": f"{device.type} {name}".strip(),
+        "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "threads": torch.get_num_threads(),
+        "collector": config.collector,
+        "workers": config.workers,
+        "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
+    }
+
+
+def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:
+    """Say what came out; on one screen, unless the run is one of a sweep's."""
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        Console().print(screen(read_progress(folder.path)))
+    for seed, reached, final in zip(
+        config.seeds, result["updates_to_threshold"], result["final"], strict=True
+    ):
+        tqdm.write(f"{config.method}, seed {seed}: {_outcome_text(result, reached, final)}")
+    tqdm.write(_cost_text(result, len(config.seeds)))
+    tqdm.write(f"Files: {folder.path}  (picture: {picture.name})")
+
+
+def _outcome_text(result: dict[str, Any], reached: int | None, final: dict[str, float]) -> str:
+    level = f"{result['threshold']:.0%} {result['headline'].replace('_', ' ')}"
+    outcome = (
+        f"{level} after {reached} updates"
+        if reached is not None
+        else f"{level} not reached in {result['updates']} updates (censored)"
+    )
+    return f"{outcome}; {final[result['headline']]:.1%} at the end."
+
+
+def _cost_text(result: dict[str, Any], seeds: int) -> str:
+    together = f" for each of {seeds} seeds" if seeds > 1 else ""
+    return (
+        f"Cost: {result['frames']:,} frames of the Solver{together}, "
+        f"{result['meta_frames']:,} of its copies, {result['seconds']:.0f} s."
+    )
