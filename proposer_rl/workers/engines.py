@@ -206,7 +206,8 @@ def _signals_kept() -> Iterator[None]:
 
 def collect(collector: BaseCollector) -> Any:
     """The next batch of all workers, [W, K, T]."""
-    with warnings.catch_warnings():
+    # A collector that loses a worker ends by itself.
+    with _threads_kept(), warnings.catch_warnings():
         # What TorchRL's weight synchronisation would do is done with every order.
         warnings.filterwarnings("ignore", message="RayCollector iteration started before")
         return collector.next()
