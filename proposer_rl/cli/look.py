@@ -123,7 +123,7 @@ def _row(
 
 def _print(rows: list[dict[str, Any]]) -> None:
     table = Table(
-        "updates", "return", "seen of the Solver", "fraction", "length", "changed", "from even",
+        "updates", "measured", "seen of the Solver", "fraction", "length", "changed", "from even",
         caption="Mean obstacle fraction and path length of the proposals; distances are total "
         "variation: from the proposals to the Solver as it is, and from the even mixture.",
     )  # fmt: skip
