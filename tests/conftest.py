@@ -5,6 +5,7 @@ import os
 # Before anything imports pyplot: tests draw into files, also where there is no display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,11 @@ from tests.processes import Processes
 hypothesis.settings.register_profile("proposer_rl", deadline=None)
 hypothesis.settings.load_profile("proposer_rl")
 
+
+# Started by nohup, or in the background of a script, this process ignores these two, and so would
+# every process that a test starts and then interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # Tensors in tests are too small for threads to pay, and tests share the machine.
 torch.set_num_threads(1)
