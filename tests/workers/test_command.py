@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from signal import SIGKILL
 
@@ -15,6 +16,18 @@ COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "progress
 MULTIPROCESS = ["collector=multiprocess", "workers=2"]
 
 
+def working_in(folder: Path) -> list[str]:
+    """The processes whose working folder it is."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if (process / "cwd").readlink() == folder:
+                found.append(process.name)
+        except OSError:  # it has ended
+            continue
+    return found
+
+
 @pytest.mark.slow
 def test_killed_with_its_workers_and_resumed_it_is_the_run_of_one_process(
     processes: Processes, tmp_path: Path
@@ -24,8 +37,17 @@ def test_killed_with_its_workers_and_resumed_it_is_the_run_of_one_process(
     assert whole.code == 0, whole.output
     # With the second cycle's line: its episode is over, and no checkpoint knows of it.
     at = [i for i, name in enumerate(whole.writes) if name == "fsync proposer.jsonl"][1]
-    killed = processes(*COMMAND, *MULTIPROCESS, run, signal_at={at: int(SIGKILL)})
+    folder = tmp_path / "works_here"
+    folder.mkdir()
+    killed = processes(
+        *COMMAND, *MULTIPROCESS, run, signal_at={at: int(SIGKILL)}, folder=str(folder)
+    )
     assert killed.code == -SIGKILL, killed.output
+    # Nobody can tell its workers: they see it for themselves, and end.
+    deadline = time.monotonic() + 60
+    while working_in(folder):
+        assert time.monotonic() < deadline, "workers outlive the run"
+        time.sleep(0.2)
     latest = load_latest(tmp_path / "run" / "checkpoints")
     assert latest is not None and latest[1]["cycles"] == 1
     # Where the copies are trained may change in between.
