@@ -135,9 +135,9 @@ class PPO:
             no_cuda_sync=True,
         )
         # TorchRL's vectorised form splits the batch where episodes end, which it has to look up.
-        self._advantage = advantage or GAE(
-            gamma=settings.gamma, lmbda=settings.lmbda, value_network=None, vectorized=False
-        )
+        gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None, vectorized=False)
+        gae.set_keys(value=agent.value_key)
+        self._advantage = advantage or gae
         self._loss = (loss or partial(_clip_ppo_loss, settings, agent.copies))(*agent.readout())
         if self._loss.reduction != "none":
             raise ValueError(f'reduction of the loss must be "none", got {self._loss.reduction!r}')

@@ -13,15 +13,18 @@ import pytest
 import torch
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import Categorical
 from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
 from proposer_rl.capture import Recorder
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
-from proposer_rl.models import Population, UNet, map_actor_critic
+from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
+from proposer_rl.models.solver import read_maps
 from proposer_rl.ppo import PPO, MakeLoss, PPOSettings, clip_gradients_
 from tests.graphs import NoHostReads, Tapes
 
@@ -140,6 +143,24 @@ def test_loss_and_gradients_equal_the_formulas_per_transition(observe_agent: boo
     torch.testing.assert_close(total, plain.detach(), rtol=1e-4, atol=1e-5)
     for parameter, gradient in zip(parameters, expected, strict=True):
         torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_metrics_tell_how_far_the_policy_moved() -> None:
+    """By the formulas: entropy, Schulman's first estimate of the divergence, what was clipped."""
+    ppo = learner(settings=replace(SETTINGS, learning_rate=3e-3))
+    rollout = ppo.collect(generators(0))
+    ppo.optimise(rollout)  # the policy moves on, so that ratios differ from one
+    level = rollout.select(*ppo.agent.level_keys)[..., 0]
+    with torch.no_grad():
+        steps = ppo.agent.decode(rollout.copy(), ppo.agent.encode(level))
+        policy = ppo.agent.distribution(steps)
+    moved = policy.log_prob(rollout["action"]) - rollout["action_log_prob"]
+    metrics = ppo._gradient_step(rollout, level)
+    torch.testing.assert_close(metrics["entropy"], policy.entropy().mean())
+    torch.testing.assert_close(metrics["kl_approx"], -moved.mean(), rtol=1e-4, atol=1e-7)
+    clipped = (moved.exp() - 1).abs() > ppo.settings.clip_epsilon
+    assert clipped.any() and not clipped.all()
+    torch.testing.assert_close(metrics["clip_fraction"], clipped.float().mean())
 
 
 def test_torchrls_loss_on_the_ordinary_actor_gives_the_same_gradients() -> None:
@@ -356,6 +377,37 @@ def test_refuses_an_environment_of_another_size() -> None:
         PPO(MazeEnv(levels(3)), agent, SETTINGS)
 
 
+def test_entries_may_have_other_names() -> None:
+    """Where an environment and a network call things otherwise, the same is learnt."""
+    env = TransformedEnv(
+        MazeEnv(levels(2), max_steps=5), RenameTransform([], [], ["action"], ["move"])
+    )
+    torch.manual_seed(3)
+    usual = learner(2)
+    maps = usual.agent.encoder
+    renamed = PPO(
+        env,
+        ActorCritic(
+            TensorDictModule(read_maps, [*maps.out_keys, "agent"], ["scores", "worth"]),
+            copy.deepcopy(maps),
+            distribution_class=usual.agent.distribution_class,
+            copies=2,
+            action_key="move",
+            log_prob_key="log_prob",
+            logits_key="scores",
+            value_key="worth",
+        ),
+        SETTINGS,
+    )
+    (expected, metrics), (rollout, also) = (
+        ppo.update(generators(0, 1)) for ppo in (usual, renamed)
+    )
+    names = {"move": "action", "log_prob": "action_log_prob", "worth": "state_value"}
+    for key in (*names, "advantage", "value_target"):
+        assert torch.equal(rollout[key], expected[names.get(key, key)]), key
+    assert dict(also.items()) == dict(metrics.items())
+
+
 def test_more_updates_on_one_batch_recompute_the_advantages() -> None:
     once, twice = learner(), learner(settings=PPOSettings(horizon=T, epochs=3, updates=2))
     rollout = once.collect(generators(0))
@@ -364,6 +416,7 @@ def test_more_updates_on_one_batch_recompute_the_advantages() -> None:
     second = rollout.clone()
     twice.restore(once.snapshot().apply(torch.clone))
     twice.optimise(second)
+    assert (len(once.gradient_steps), len(twice.gradient_steps)) == (3, 6)
     assert not torch.allclose(first["advantage"], second["advantage"])
     torch.testing.assert_close(
         second["advantage"], hand_gae(second, 0.99, 0.95), rtol=1e-4, atol=1e-5
