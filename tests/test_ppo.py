@@ -147,8 +147,8 @@ def test_loss_and_gradients_equal_the_formulas_per_transition(observe_agent: boo
 
 def test_metrics_tell_how_far_the_policy_moved() -> None:
     """By the formulas: entropy, Schulman's first estimate of the divergence, what was clipped."""
-    ppo = learner(settings=replace(SETTINGS, learning_rate=3e-3))
-    rollout = ppo.collect(generators(0))
+    ppo = learner(copies=2, settings=replace(SETTINGS, learning_rate=3e-3))
+    rollout = ppo.collect(generators(0, 1))
     ppo.optimise(rollout)  # the policy moves on, so that ratios differ from one
     level = rollout.select(*ppo.agent.level_keys)[..., 0]
     with torch.no_grad():
@@ -161,6 +161,10 @@ def test_metrics_tell_how_far_the_policy_moved() -> None:
     clipped = (moved.exp() - 1).abs() > ppo.settings.clip_epsilon
     assert clipped.any() and not clipped.all()
     torch.testing.assert_close(metrics["clip_fraction"], clipped.float().mean())
+    target = rollout["value_target"].flatten(1)
+    residual = target - steps["state_value"].flatten(1)
+    explained = [1 - residual[k].var() / target[k].var() for k in range(2)]
+    torch.testing.assert_close(metrics["explained_variance"], sum(explained) / 2)
 
 
 def test_torchrls_loss_on_the_ordinary_actor_gives_the_same_gradients() -> None:
