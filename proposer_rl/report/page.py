@@ -113,8 +113,8 @@ def unfinished(study: Study) -> list[str]:
 
 
 def commands(study: Study) -> list[str]:
-    """What each group was started with, its seeds in one command."""
-    return [_command(group) for group in study.groups]
+    """What each group was started with; seeds that differ in nothing else in one command."""
+    return [command for group in study.groups for command in _commands(group)]
 
 
 def configs(study: Study) -> list[tuple[str, str]]:
@@ -153,14 +153,21 @@ def report_command(folders: Sequence[Path], threshold: float | None) -> str:
     return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked]))
 
 
-def _command(group: Group) -> str:
-    overrides = group.runs[0].facts.get("overrides")
-    if not isinstance(overrides, list):
-        return f"# {group.label}: the command was not recorded"
+def _commands(group: Group) -> list[str]:
     own = ("seed=", "seeds=", "hydra.", "+sweep=", "progress=")
-    words = [_anywhere(str(word)[:200]) for word in overrides if not str(word).startswith(own)]
-    seeds = f"seed={','.join(map(str, group.seeds))}"
-    return " ".join(["bin/train -m", *map(shlex.quote, words), seeds])
+    seeds: dict[tuple[str, ...], list[int]] = {}
+    for run in group.runs:
+        overrides = run.facts.get("overrides")
+        if not isinstance(overrides, list):
+            return [f"# {group.label}: the command was not recorded"]
+        words = [_anywhere(str(word)[:200]) for word in overrides if not str(word).startswith(own)]
+        seeds.setdefault(tuple(words), []).append(run.seed)
+    return [
+        " ".join(
+            ["bin/train -m", *map(shlex.quote, words), f"seed={','.join(map(str, with_them))}"]
+        )
+        for words, with_them in seeds.items()
+    ]
 
 
 def _anywhere(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,9 @@ from proposer_rl.report.runs import Run, UnreadableRun, read_run
 from proposer_rl.report.statistics import Waiting, common_horizon
 
 LONGEST_LABEL = 40  # characters of the settings in a label
+
+# A folder's seed, alone or at the end of its name as in those of sweeps.
+_SEED_OF_A_FOLDER = re.compile(r"(?:(?<=seed_)|(?<![^/]))[0-9]+(?![^/])")
 
 
 @dataclass(frozen=True)
@@ -160,6 +164,8 @@ def _variant(run: Run) -> dict[str, Any]:
     ignored = {"seed", "seeds", "evaluation", "schedule", "hand_made_until", "precision"}
     ignored |= set() if run.cycles else {"proposer"}  # it had none
     kept = {key: value for key, value in run.config.items() if key not in ignored}
+    # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
+    kept["checkpoint"] = _SEED_OF_A_FOLDER.sub("*", str(run.config.get("checkpoint")))
     kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
     kept["lifetime"] = run.lifetime
     kept["precision"] = run.config.get("precision", "fp32")
@@ -181,7 +187,8 @@ def _without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     best: dict[str, Run] = {}
     notes = []
     for run in runs:
-        key = _key({**_setting(run), **_variant(run), "seed": run.seed})
+        alone = {"seed": run.seed, "checkpoint": run.config.get("checkpoint")}
+        key = _key({**_setting(run), **_variant(run), **alone})
         kept = best.setdefault(key, run)
         if kept is run:
             continue

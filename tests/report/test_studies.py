@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
+from proposer_rl.report.page import commands
 from proposer_rl.report.runs import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import config, cycle, write_run
@@ -57,6 +59,37 @@ def test_settings_of_a_proposer_do_not_part_runs_without_one(tmp_path: Path) -> 
     write_run(tmp_path / "b", "target", [1], proposer={"rollouts": 9})
     (study,), _ = read(tmp_path)
     assert labels(study) == {"target": [0, 1]}
+
+
+def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> None:
+    """As Solvers do; one of another life, or of another experiment, is something else."""
+    for place, checkpoint, seed in [
+        ("a", "lives/seed_0/lifetime_1", 5),
+        ("b", "lives/seed_12/lifetime_1", 6),
+        ("c", "lives/seed_12/lifetime_1", 5),  # two Proposers on the same Solver both count
+        ("d", "lives/seed_0/lifetime_2", 5),
+        ("e", "3/0", 5),
+        ("f", "/other/4/15", 5),
+        ("g", "4/16", 5),
+    ]:
+        write_run(tmp_path / place, "frozen_proposer", [seed], checkpoint=checkpoint)
+    (study,), notes = read(tmp_path)
+    members = [sorted(run.folder.name for run in group.runs) for group in study.groups]
+    assert sorted(members) == [["a", "b", "c"], ["d"], ["e", "g"], ["f"]] and not notes
+
+
+def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> None:
+    for seed, override in [(0, "cores=1"), (1, "cores=1"), (2, "cores=2")]:
+        run = write_run(tmp_path / str(seed), "target", [seed])
+        facts = json.loads((run / "summary.json").read_text())
+        facts["overrides"].append(override)
+        for name in ("run.json", "summary.json"):
+            (run / name).write_text(json.dumps({**facts, "planned_updates": facts["updates"]}))
+    (study,), _ = read(tmp_path)
+    assert commands(study) == [
+        "bin/train -m +method=target cores=1 seed=0,1",
+        "bin/train -m +method=target cores=2 seed=2",
+    ]
 
 
 def test_other_levels_make_another_study(tmp_path: Path) -> None:
