@@ -163,14 +163,27 @@ def _variant(run: Run) -> dict[str, Any]:
     """All that the outcome of a run depends on, but for the seed."""
     ignored = {"seed", "seeds", "evaluation", "schedule", "hand_made_until", "precision"}
     ignored |= set() if run.cycles else {"proposer"}  # it had none
+    ignored |= {"checkpoint"}  # the curriculum has it
     kept = {key: value for key, value in run.config.items() if key not in ignored}
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
-    kept["checkpoint"] = _SEED_OF_A_FOLDER.sub("*", str(run.config.get("checkpoint")))
+    kept = _without_seeds(kept)
     kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
     kept["lifetime"] = run.lifetime
     kept["precision"] = run.config.get("precision", "fp32")
     kept["reward"] = run.config["evaluation"].get("reward") if run.cycles else None
     return kept
+
+
+def _without_seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with ``*`` for the seeds in the folders of checkpoints."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            value = _without_seeds(value)
+        elif key == "checkpoint" and isinstance(value, str):
+            value = _SEED_OF_A_FOLDER.sub("*", value)
+        found[key] = value
+    return found
 
 
 def _key(value: Mapping[str, Any]) -> str:

@@ -72,7 +72,8 @@ def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> Non
         ("f", "/other/4/15", 5),
         ("g", "4/16", 5),
     ]:
-        write_run(tmp_path / place, "frozen_proposer", [seed], checkpoint=checkpoint)
+        named = {"checkpoint": checkpoint, "curriculum": {"checkpoint": checkpoint}}
+        write_run(tmp_path / place, "frozen_proposer", [seed], **named)
     (study,), notes = read(tmp_path)
     members = [sorted(run.folder.name for run in group.runs) for group in study.groups]
     assert sorted(members) == [["a", "b", "c"], ["d"], ["e", "g"], ["f"]] and not notes
