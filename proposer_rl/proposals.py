@@ -5,6 +5,7 @@ A choice is a number, whatever it stands for; the task turns choices into levels
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +19,7 @@ from proposer_rl.streams import Streams
 Generate = Callable[[Tensor, list[torch.Generator]], Any]
 
 
-class Proposals:
+class Proposals(ABC):
     """The levels that actions of K copies stand for; a subclass defines the actions.
 
     Args:
@@ -35,13 +36,13 @@ class Proposals:
         self.choices = choices
         self._generate = generate
 
+    @abstractmethod
     def action_spec(self, copies: int, problems: int, device: torch.device) -> TensorSpec:
         """The specification of actions, batch [K]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
         """Choices int64 [K, P]; what chance decides, copy k draws from the k-th generator."""
-        raise NotImplementedError
 
     def levels(
         self, action: Tensor, problems: int, streams: Sequence[Streams]

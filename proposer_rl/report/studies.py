@@ -162,11 +162,10 @@ def _setting(run: Run) -> dict[str, Any]:
 def _variant(run: Run) -> dict[str, Any]:
     """All that the outcome of a run depends on, but for the seed."""
     ignored = {"seed", "seeds", "evaluation", "schedule", "hand_made_until", "precision"}
-    ignored |= set() if run.cycles else {"proposer"}  # it had none
     ignored |= {"checkpoint"}  # the curriculum has it
-    kept = {key: value for key, value in run.config.items() if key not in ignored}
+    ignored |= set() if run.cycles else {"proposer"}  # it had none
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
-    kept = _without_seeds(kept)
+    kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
     kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
     kept["lifetime"] = run.lifetime
     kept["precision"] = run.config.get("precision", "fp32")
