@@ -23,8 +23,8 @@ from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl import PPO, Curriculum, SamplingCurriculum, Streams
 from proposer_rl.mazes import Level
+from proposer_rl.meta.rewards import first_episode_success
 from proposer_rl.methods import Parts
-from proposer_rl.rewards import first_episode_success
 
 
 class Again(Curriculum):

@@ -18,8 +18,8 @@ import sys
 from small_mazes import proposer_settings, report, small_task, train
 from torch import Tensor
 
+from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.methods import Parts, proposer
-from proposer_rl.rewards import TrainingStep
 
 
 def learnability(step: TrainingStep) -> Tensor:

@@ -10,15 +10,15 @@ from typing import Any
 from torch import nn
 
 from proposer_rl import PPO, Curriculum, Experiment, MazeTask, PPOSettings, Schedule, Streams
-from proposer_rl.methods import ProposerSettings
-from proposer_rl.run_folder import RunFolder, read_csv
-from proposer_rl.task import (
+from proposer_rl.mazes.task import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
     SolverSettings,
     SpaceSettings,
 )
+from proposer_rl.methods import ProposerSettings
+from proposer_rl.runs.folder import RunFolder, read_csv
 
 CYCLE = 10  # updates between two improvements of a curriculum
 

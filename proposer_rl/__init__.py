@@ -1,6 +1,5 @@
 """proposer_rl: learn to propose the problems that make a TorchRL agent improve fastest."""
 
-from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import (
     Curriculum,
     FrozenProposer,
@@ -8,10 +7,16 @@ from proposer_rl.curricula import (
     SamplingCurriculum,
     ScheduleCurriculum,
 )
-from proposer_rl.evaluation import ExactEvaluator, RolloutEvaluator
 from proposer_rl.experiment import Experiment, Schedule
+from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
-from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.meta.actions import Mixture, ProblemChoices, Proposals
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.rewards import performance_gain, task_difficulty
+from proposer_rl.meta.view import SolverView
 from proposer_rl.models import (
     ActorCritic,
     MapEncoder,
@@ -21,12 +26,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.ppo import PPO, PPOSettings
-from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
-from proposer_rl.rewards import performance_gain, task_difficulty
-from proposer_rl.solver_view import SolverView
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
 
 __all__ = [
     "PPO",

@@ -12,14 +12,14 @@ from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from proposer_rl.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.curricula import Curriculum
-from proposer_rl.finite import located
+from proposer_rl.learning.divergence import located
+from proposer_rl.learning.ppo import PPO, Update
 from proposer_rl.models import ActorCritic
-from proposer_rl.ppo import PPO, Update
-from proposer_rl.run_folder import RunFolder, read_csv
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
+from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import settings
-from proposer_rl.signals import StopSignals
 from proposer_rl.streams import Streams
 
 Evaluate = Callable[[ActorCritic], TensorDictBase]

@@ -13,8 +13,6 @@ from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Distribution
 
-from proposer_rl.advantages import CopiesBaseline
-from proposer_rl.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.curricula import (
     Curriculum,
     FrozenProposer,
@@ -23,7 +21,14 @@ from proposer_rl.curricula import (
     ScheduleCurriculum,
     load_agent,
 )
-from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.ppo import PPO, MakeLoss, PPOSettings
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.meta.actions import Mixture, ProblemChoices, Proposals
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.rewards import Reward
+from proposer_rl.meta.view import SolverView, episode_return, log_success
+from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import (
     ActorCritic,
     MapEncoder,
@@ -36,14 +41,9 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.ppo import PPO, MakeLoss, PPOSettings
-from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
-from proposer_rl.rewards import Reward
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.settings import settings
-from proposer_rl.solver_view import SolverView, episode_return, log_success
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
-from proposer_rl.workers import CopiesInWorkers, WorkerSettings
 
 
 @settings
@@ -149,7 +149,7 @@ def proposer(parts: Parts, reward: Reward, loss: MakeLoss | None = None) -> Curr
     Args:
         parts: the task, and the Proposer's settings.
         reward: what an update is worth.
-        loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.ppo.PPO`.
+        loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.ppo.PPO`.
 
     Raises:
         TypeError: if the reward is no function.

@@ -84,7 +84,7 @@ class Tape(TorchDispatchMode):
 
 
 class Tapes:
-    """A :class:`proposer_rl.capture.Recorder` for the CPU."""
+    """A :class:`proposer_rl.learning.cuda_graphs.Recorder` for the CPU."""
 
     def __init__(self) -> None:
         self.recorded = 0

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from proposer_rl.checkpoint import load_latest
-from proposer_rl.run_folder import read_csv
+from proposer_rl.runs.checkpoint import load_latest
+from proposer_rl.runs.folder import read_csv
 
 
 def tables(folder: Path) -> dict[str, Any]:

@@ -16,11 +16,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.meta_env import SolverTrainingEnv
-from proposer_rl.ppo import Update
-from proposer_rl.proposals import Proposals
-from proposer_rl.rewards import TrainingStep, performance_gain
-from proposer_rl.solver_view import SolverView
+from proposer_rl.learning.ppo import Update
+from proposer_rl.meta.actions import Proposals
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.rewards import TrainingStep, performance_gain
+from proposer_rl.meta.view import SolverView
 
 RATE = 0.5
 

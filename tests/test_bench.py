@@ -14,17 +14,17 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.bench.__main__ import main
-from proposer_rl.bench.ceiling import convolutions
-from proposer_rl.bench.environment import bare_dynamics, draw_actions, through_torchrl
-from proposer_rl.bench.plain import PlainPPO, PlainUNet
-from proposer_rl.bench.plain_env import PlainMaze
-from proposer_rl.bench.profiling import kind_of
-from proposer_rl.bench.registry import BENCHMARKS, selected
-from proposer_rl.bench.report import summary
-from proposer_rl.bench.results import Options, Result, Row, Spread
-from proposer_rl.bench.scales import PAPER, QUICK, TINY, Scale, Solvers
-from proposer_rl.bench.timing import interleave, ratio
+from benchmarks.__main__ import main
+from benchmarks.ceiling import convolutions
+from benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
+from benchmarks.plain import PlainPPO, PlainUNet
+from benchmarks.plain_env import PlainMaze
+from benchmarks.profiling import kind_of
+from benchmarks.registry import BENCHMARKS, selected
+from benchmarks.report import summary
+from benchmarks.results import Options, Result, Row, Spread
+from benchmarks.scales import PAPER, QUICK, TINY, Scale, Solvers
+from benchmarks.timing import interleave, ratio
 from proposer_rl.cli.config import CONFIG_FOLDER, read_config
 from proposer_rl.mazes import MazeEnv, generate_levels
 from proposer_rl.streams import Streams
@@ -87,7 +87,7 @@ def test_a_benchmark_that_fails_does_not_stop_the_others(
     bench, capsys, monkeypatch, tmp_path: Path
 ) -> None:
     # In the worker's own process nothing but the arguments can be changed from here.
-    monkeypatch.setattr("proposer_rl.bench.__main__.selected", lambda *_: ["absent", "levels"])
+    monkeypatch.setattr("benchmarks.__main__.selected", lambda *_: ["absent", "levels"])
     monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
     assert bench("--tiny", "--repeats", "1", "--threads", "1") == 1
     assert "KeyError: 'absent'" in capsys.readouterr().err

@@ -13,13 +13,13 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.checkpoint import load_latest
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, methods, read_config
 from proposer_rl.experiment import Schedule
-from proposer_rl.ppo import PPOSettings
-from proposer_rl.run_folder import RunFolder, read_csv, read_jsonl
-from proposer_rl.task import EvaluationSettings, MazeSettings
+from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.mazes.task import EvaluationSettings, MazeSettings
+from proposer_rl.runs.checkpoint import load_latest
+from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from tests.runs import assert_same_run, tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")

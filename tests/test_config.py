@@ -17,14 +17,14 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from proposer_rl.checkpoint import load_latest, save_checkpoint
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
 from proposer_rl.cli.errors import FORESEEN
 from proposer_rl.cli.same_run import check_same_run
-from proposer_rl.finite import DivergedError
-from proposer_rl.run_folder import RunFolder
-from proposer_rl.signals import Interrupted, StopSignals
+from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.signals import Interrupted, StopSignals
 from tests.runs import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -256,7 +256,7 @@ def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, 
 def test_a_checkpoint_of_another_format_is_refused(
     step: int, finished: Path, train, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from proposer_rl import checkpoint
+    from proposer_rl.runs import checkpoint
 
     folder = copy_of(finished)
     number, state = load_latest(finished / "checkpoints")

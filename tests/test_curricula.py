@@ -5,7 +5,6 @@ import pytest
 import torch
 from torch import nn
 
-from proposer_rl.advantages import CopiesBaseline
 from proposer_rl.curricula import (
     Curriculum,
     FrozenProposer,
@@ -16,6 +15,8 @@ from proposer_rl.curricula import (
     load_agent,
 )
 from proposer_rl.curricula.proposer import explained_share
+from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.models import (
     MapEncoder,
     MixtureHead,
@@ -25,9 +26,8 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.ppo import PPO, PPOSettings
 from proposer_rl.streams import Streams
-from tests.test_meta_env import SPACE, K, L, P, meta_env, mixture, solvers
+from tests.meta.test_env import SPACE, K, L, P, meta_env, mixture, solvers
 
 
 def sample(count: int, generator: torch.Generator):

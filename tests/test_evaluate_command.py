@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.checkpoint import load_latest, save_checkpoint
 from proposer_rl.cli.evaluate import SHOWN, main
 from proposer_rl.cli.train import main as train
-from proposer_rl.level_sets import shipped_levels
-from proposer_rl.run_folder import read_csv
+from proposer_rl.mazes.level_files import shipped_levels
+from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
+from proposer_rl.runs.folder import read_csv
 
 KEYS = ["success", "return", "greedy_success", "greedy_return"]
 

@@ -18,8 +18,8 @@ from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.curricula import SamplingCurriculum
 from proposer_rl.mazes import Level
-from proposer_rl.rewards import TrainingStep
-from proposer_rl.run_folder import read_csv
+from proposer_rl.meta.rewards import TrainingStep
+from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 
 ROOT = Path(__file__).parents[1]

@@ -10,10 +10,8 @@ import torch
 
 from proposer_rl.curricula import Curriculum, SamplingCurriculum
 from proposer_rl.experiment import Experiment, Schedule
-from proposer_rl.ppo import PPOSettings
-from proposer_rl.run_folder import RunFolder, read_csv, read_jsonl
-from proposer_rl.streams import Streams
-from proposer_rl.task import (
+from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.mazes.task import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
@@ -21,6 +19,8 @@ from proposer_rl.task import (
     SolverSettings,
     SpaceSettings,
 )
+from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
+from proposer_rl.streams import Streams
 
 SCHEDULE = Schedule(updates=5, cycle_length=2, evaluate_every=2, checkpoint_every=3, threshold=0.1)
 

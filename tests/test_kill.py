@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from proposer_rl.checkpoint import load_latest
 from proposer_rl.cli.config import methods
+from proposer_rl.runs.checkpoint import load_latest
 from tests.processes import Ended, Processes
 from tests.runs import assert_same_run
 

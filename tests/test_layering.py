@@ -160,10 +160,10 @@ def test_finds(tmp_path: Path, file: str, source: str, expected: str) -> None:
     [
         ("__init__.py", "from proposer_rl.mazes import MazeEnv\nfrom proposer_rl.methods import x"),
         ("cli/train.py", "import hydra, pydantic\nfrom proposer_rl.methods import x"),
-        ("checkpoint.py", "from proposer_rl.run_folder import write_atomically"),
+        ("checkpoint.py", "from proposer_rl.runs.folder import write_atomically"),
         ("mazes/env.py", "from .levels import Level\nfrom proposer_rl.mazes import distance"),
         ("meta_env.py", "import torch\nfrom .ppo import PPO\nfrom proposer_rl import models"),
-        ("rewards.py", "from proposer_rl.evaluation import evaluate"),
+        ("rewards.py", "from proposer_rl.mazes.evaluation import evaluate"),
     ],
 )
 def test_allows(tmp_path: Path, file: str, source: str) -> None:

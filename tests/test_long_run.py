@@ -15,7 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, read_config
-from proposer_rl.run_folder import RunFolder
+from proposer_rl.runs.folder import RunFolder
 
 UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "200"))
 CYCLES = 20

@@ -10,8 +10,8 @@ from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1, SIGUSR2
 
 import pytest
 
-from proposer_rl.checkpoint import load_latest, save_checkpoint
-from proposer_rl.lock import locked
+from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
+from proposer_rl.runs.lock import locked
 from tests.processes import Ended, Processes
 from tests.runs import assert_same_run
 

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
-from proposer_rl.run_folder import read_csv, read_jsonl
+from proposer_rl.runs.folder import read_csv, read_jsonl
 
 SMOKE = ["+scale=smoke", "progress=false"]
 ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]

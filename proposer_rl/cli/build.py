@@ -9,7 +9,6 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from tqdm import tqdm
 
-from proposer_rl.capture import use
 from proposer_rl.cli.config import ConfigError, RunConfig
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import make_log, require_logger
@@ -17,12 +16,13 @@ from proposer_rl.cli.outcome import run_name
 from proposer_rl.cli.workers import workers
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
+from proposer_rl.learning.cuda_graphs import use
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.mazes.task import MazeTask, faster_precision
 from proposer_rl.methods import Parts
-from proposer_rl.ppo import PPO
-from proposer_rl.run_folder import RunFolder
-from proposer_rl.signals import StopSignals
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask, faster_precision
 
 
 def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:

@@ -13,15 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from proposer_rl.experiment import Schedule
 from proposer_rl.mazes import LevelDistribution, SpecificationSpace
-from proposer_rl.methods import ProposerSettings
-from proposer_rl.run_folder import storage
-from proposer_rl.task import (
+from proposer_rl.mazes.task import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
     SolverSettings,
     SpaceSettings,
 )
+from proposer_rl.methods import ProposerSettings
+from proposer_rl.runs.folder import storage
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # In a wheel the configuration lies in the package, in a checkout beside it.

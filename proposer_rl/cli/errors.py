@@ -8,11 +8,11 @@ from typing import NoReturn
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf.errors import OmegaConfBaseException
 
-from proposer_rl.checkpoint import CheckpointError
 from proposer_rl.cli.config import ConfigError
-from proposer_rl.finite import DivergedError
-from proposer_rl.lock import InUseError
-from proposer_rl.workers import WorkersError
+from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.meta.workers import WorkersError
+from proposer_rl.runs.checkpoint import CheckpointError
+from proposer_rl.runs.lock import InUseError
 
 # docs/reliability.md lists them; 1 is Python's own, for an error that nobody foresaw.
 BAD_INPUT = 2

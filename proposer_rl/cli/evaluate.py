@@ -17,24 +17,18 @@ from rich.table import Table
 from rich.text import Text
 from tensordict import TensorDict
 
-from proposer_rl.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.cli.errors import FORESEEN, refuse
-from proposer_rl.level_sets import (
-    SUFFIXES,
-    Score,
-    draw_paths,
-    read_levels,
-    score_levels,
-    shipped_levels,
-    shipped_sets,
-)
 from proposer_rl.mazes import Level
+from proposer_rl.mazes.level_files import SUFFIXES, read_levels, shipped_levels, shipped_sets
+from proposer_rl.mazes.level_pictures import draw_paths
+from proposer_rl.mazes.level_scores import Score, score_levels
+from proposer_rl.mazes.task import MazeTask
 from proposer_rl.models import ActorCritic
-from proposer_rl.run_folder import write_atomically
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
 
 SHOWN = 36  # levels in the table and on the sheet of pictures
 SLACK = 2  # of a named level: steps allowed for each move of its shortest path

@@ -13,16 +13,16 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.checkpoint import CheckpointError, load_checkpoint
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.snr import checkpoints, refuse
 from proposer_rl.curricula import FrozenProposer
+from proposer_rl.mazes.task import MazeTask
 from proposer_rl.methods import Parts, frozen_proposer
 from proposer_rl.models import draw, uniform_noise
-from proposer_rl.run_folder import write_atomically
+from proposer_rl.runs.checkpoint import CheckpointError, load_checkpoint
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
 
 SAMPLES = 64  # batches drawn from a policy to know its mean composition
 

@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from proposer_rl.cli.config import RunConfig
 from proposer_rl.experiment import Experiment
-from proposer_rl.machine import processor
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.terminal import screen
-from proposer_rl.run_folder import RunFolder
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.machine import processor
 
 
 def run_name(config: RunConfig) -> str:

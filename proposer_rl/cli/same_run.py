@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
-from proposer_rl.run_folder import RunFolder
+from proposer_rl.runs.folder import RunFolder
 
 # What may differ: where and how it is computed, saved and shown, and a longer schedule.
 FREE = {"device", "graphs", "threads", "cores", "progress", "logger"}

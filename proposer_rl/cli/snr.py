@@ -19,19 +19,19 @@ from torch import Tensor
 from torch.distributions import Dirichlet
 from tqdm import tqdm
 
-from proposer_rl.checkpoint import CheckpointError, load_checkpoint
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.cli.errors import BAD_INPUT, SIGNALLED
-from proposer_rl.meta_env import SolverTrainingEnv
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.meta.actions import Mixture, ProblemChoices, Proposals
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.rewards import performance_gain
+from proposer_rl.meta.signal import by_validation_size, total_gains
+from proposer_rl.meta.view import SolverView
 from proposer_rl.methods import MEASURES
-from proposer_rl.proposals import Mixture, ProblemChoices, Proposals
-from proposer_rl.rewards import performance_gain
-from proposer_rl.run_folder import write_atomically
-from proposer_rl.snr import by_validation_size, total_gains
-from proposer_rl.solver_view import SolverView
+from proposer_rl.runs.checkpoint import CheckpointError, load_checkpoint
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
 
 UNEVEN = 0.15  # concentration of the Dirichlet distribution of uneven mixtures
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from proposer_rl.report.progress import FAILURE, find_progress
 from proposer_rl.report.terminal import overview
-from proposer_rl.run_folder import write_atomically
+from proposer_rl.runs.folder import write_atomically
 
 
 class SweepSummary(Callback):

@@ -17,7 +17,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from proposer_rl.checkpoint import CheckpointError, load_latest
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, refuse
@@ -26,14 +25,15 @@ from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
-from proposer_rl.finite import DivergedError
-from proposer_rl.lock import locked
-from proposer_rl.ppo import PPO
+from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.mazes.task import MazeTask
 from proposer_rl.report.levels import draw_run
-from proposer_rl.run_folder import RunFolder
-from proposer_rl.signals import Interrupted, StopSignals
+from proposer_rl.runs.checkpoint import CheckpointError, load_latest
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.lock import locked
+from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.task import MazeTask
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 import torch
 
 from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models.population import available_cores
-from proposer_rl.workers import WorkerSettings
 
 
 def workers(

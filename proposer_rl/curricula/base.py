@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 
-from proposer_rl.ppo import PPO, Update
+from proposer_rl.learning.ppo import PPO, Update
 from proposer_rl.streams import Streams
 
 
@@ -45,7 +45,7 @@ class Improvement:
 class Curriculum:
     """The interface of curricula; each method does nothing unless a curriculum has use for it.
 
-    A Solver is a :class:`~proposer_rl.ppo.PPO` of a population of K; ``streams`` has the K copies'
+    A Solver is a :class:`~proposer_rl.learning.ppo.PPO` of a population of K; ``streams`` has the K copies'
     random streams for the present update or cycle.
 
     Attributes:

@@ -10,10 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.base import Curriculum, Improvement
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.meta.actions import Proposals
+from proposer_rl.meta.view import SolverView
 from proposer_rl.models import ActorCritic, draw
-from proposer_rl.ppo import PPO
-from proposer_rl.proposals import Proposals
-from proposer_rl.solver_view import SolverView
 from proposer_rl.streams import Streams
 
 OWN_ACTIONS = ("sample", "mode")
@@ -109,7 +109,7 @@ class FrozenProposer(Curriculum):
 
 
 def load_agent(agent: ActorCritic, snapshot: TensorDictBase) -> None:
-    """Put the weights of a :meth:`~proposer_rl.ppo.PPO.snapshot` into an agent (in place).
+    """Put the weights of a :meth:`~proposer_rl.learning.ppo.PPO.snapshot` into an agent (in place).
 
     Raises:
         ValueError: if they belong to another network.

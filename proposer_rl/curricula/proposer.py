@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.copies import Copies, CopiesHere
 from proposer_rl.curricula.base import Advance, Improvement
 from proposer_rl.curricula.frozen_proposer import FrozenProposer
-from proposer_rl.finite import located
-from proposer_rl.meta_env import SolverTrainingEnv
-from proposer_rl.ppo import PPO
+from proposer_rl.learning.divergence import located
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.meta.copies import Copies, CopiesHere
+from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.streams import Streams
 
 ADVANCES = ("train", "best", "random")
@@ -27,7 +27,7 @@ class ProposerCurriculum(FrozenProposer):
     Proposer's PPO learns from them; then the Solver itself trains on the Proposer's proposals.
 
     Args:
-        proposer: PPO whose environment is a :class:`~proposer_rl.meta_env.SolverTrainingEnv` and
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` and
             whose horizon is the number of steps of that environment's episodes.
         own_action: what is proposed to the Solver itself; see :class:`FrozenProposer`.
         copies: where the copies are rolled out; None for the Proposer's own environment, in this
@@ -163,7 +163,7 @@ def explained_share(action: Tensor, gains: Tensor) -> float | None:
 
     A hint, for nothing, of how much of the reward a Proposer can learn from: with adjustment for
     the number of coefficients it is 0 on average where the actions do not matter, and at most 1.
-    ``proposer_rl.snr`` measures the same without supposing linearity.
+    ``proposer_rl.meta.signal`` measures the same without supposing linearity.
 
     Args:
         action: [K, T, D]; the mean over the T steps counts.

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from proposer_rl.curricula.base import Curriculum
-from proposer_rl.ppo import PPO
-from proposer_rl.solver_view import SampleLevels
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.meta.view import SampleLevels
 from proposer_rl.streams import Streams
 
 

@@ -33,6 +33,6 @@ __all__ = [
 # By name, so that Gymnasium's environments are imported when one is made.
 register(
     "proposer_rl/Maze-v0",
-    entry_point="proposer_rl.mazes.gymnasium_env:MazeGymnasiumEnv",
-    vector_entry_point="proposer_rl.mazes.gymnasium_env:MazeVectorEnv",
+    entry_point="proposer_rl.mazes.gymnasium.env:MazeGymnasiumEnv",
+    vector_entry_point="proposer_rl.mazes.gymnasium.env:MazeVectorEnv",
 )

@@ -8,6 +8,7 @@ from proposer_rl.models.actor_critic import (
     normal,
     uniform_noise,
 )
+from proposer_rl.models.maps import cell_logits, map_actor_critic, read_maps
 from proposer_rl.models.population import Population
 from proposer_rl.models.proposer import (
     MapEncoder,
@@ -18,7 +19,6 @@ from proposer_rl.models.proposer import (
     fourier_encoding,
     proposer_actor_critic,
 )
-from proposer_rl.models.solver import cell_logits, map_actor_critic, read_maps
 from proposer_rl.models.unet import UNet, orthogonal_
 
 __all__ = [

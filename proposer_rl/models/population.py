@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from proposer_rl.capture import Recorder
+from proposer_rl.learning.cuda_graphs import Recorder
 from proposer_rl.models.stacked import (
     WAYS,
     Call,

@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
-from proposer_rl.capture import WARM_UPS, Captured, Recorder
+from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, Recorder
 
 
 class Call(NamedTuple):

@@ -16,7 +16,7 @@ from proposer_rl.report.runs import find_runs
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, save
 from proposer_rl.report.tables import escape_markdown, to_csv
-from proposer_rl.run_folder import write_atomically
+from proposer_rl.runs.folder import write_atomically
 
 PAGE = "report.html"
 FIGURES, TABLES = "figures", "tables"

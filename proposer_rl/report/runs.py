@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proposer_rl.report.statistics import Waiting
-from proposer_rl.run_folder import read_csv, read_jsonl
+from proposer_rl.runs.folder import read_csv, read_jsonl
 
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes less than one MiB
 DEEPEST = 4  # folders between the one that was named and a run's

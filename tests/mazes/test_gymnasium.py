@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from proposer_rl.mazes import Level, MazeEnv
-from proposer_rl.mazes.gymnasium_batch import AHEAD
+from proposer_rl.mazes.gymnasium.vector import AHEAD
 from tests.mazes.oracles import path_length, play
 
 ID = "proposer_rl/Maze-v0"

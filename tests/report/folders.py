@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.run_folder import RunFolder
+from proposer_rl.runs.folder import RunFolder
 
 EVERY = 10  # updates between two evaluations
 LEVEL = {"level": ["..#.", "S..G"], "path": [[1, 0], [1, 1], [1, 2], [1, 3]]}

@@ -1,0 +1,64 @@
+"""Exact evaluation of K Solvers on the validation levels."""
+
+from __future__ import annotations
+
+import torch
+
+from benchmarks.results import Options, Result, Row
+from benchmarks.scales import PAPER, TINY, Solvers
+from benchmarks.timing import interleave, ratio
+from proposer_rl.mazes import planes
+from proposer_rl.mazes.evaluation import ExactEvaluator
+from proposer_rl.models import cell_logits
+from proposer_rl.streams import Streams
+
+PAPERS_LEVELS = 75  # of the paper's validation batch, which is evaluated after every update
+
+
+def exact_evaluation(options: Options) -> Result:
+    """The evaluation of a meta-environment step against one update of one Solver."""
+    scale = TINY if options.tiny else PAPER
+    task = scale.task(options)
+    copies, count = scale.proposer.rollouts, PAPERS_LEVELS
+    generator = Streams(0, "validation").generator()
+    validation = task.sample_target(count, generator)
+    solver, population = Solvers(task), Solvers(task, copies, batches=1)
+    agent = population.ppo.agent
+    levels = validation.expand(copies, count)
+    logits = cell_logits(agent, planes(levels))
+    evaluator = ExactEvaluator(scale.maze.max_steps, scale.maze.step_penalty)
+
+    @torch.no_grad()
+    def whole() -> None:
+        task.evaluate(agent, validation, generator)
+
+    candidates = {
+        "update": solver.update,
+        "evaluation": lambda: evaluator(levels, logits),
+        "with the network": whole,
+    }
+    seconds = interleave(candidates, options.repeats, options.device)
+    size = f"K = {copies}, E = {count}"
+    rows = [
+        Row(
+            f"exact evaluation, {size}",
+            f"a Solver update, {scale.precision(options)}",
+            ratio(seconds["evaluation"], seconds["update"]),
+            "%",
+            target=None if options.tiny else 0.03,
+            at_most=True,
+            samples=seconds,
+        ),
+        Row(
+            "... with the forward passes for its policies",
+            f"{copies} x a Solver update, {scale.precision(options)}",
+            ratio(seconds["with the network"], seconds["update"], 1 / copies),
+            "%",
+            samples=seconds,
+        ),
+    ]
+    note = (
+        f"The second row is the evaluation's part in a meta-environment step: {copies} Solvers are "
+        f"updated for each evaluation. Its forward passes alone cover {copies * count:,} levels."
+    )
+    return Result(rows, notes=[note])

@@ -1,0 +1,58 @@
+"""The benchmarks by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from benchmarks.ceiling import against_convolutions
+from benchmarks.environment import environment_steps
+from benchmarks.evaluation import exact_evaluation
+from benchmarks.gpu import gpu_targets
+from benchmarks.learning import learning_curves
+from benchmarks.levels import generation, shortest_paths
+from benchmarks.meta import memory, meta_step
+from benchmarks.placement import throughput
+from benchmarks.results import Options, Result
+from benchmarks.solver import against_plain, overhead, population, precisions
+
+
+class Benchmark(NamedTuple):
+    """A benchmark: what it is about, what runs it, and when it runs without being named.
+
+    Attributes:
+        about: one line for a list.
+        run: the measurement.
+        on: ``"default"``, ``"full"`` (only with the full sizes), ``"cuda"`` (only on a GPU) or
+            ``"request"``.
+    """
+
+    about: str
+    run: Callable[[Options], Result]
+    on: str = "default"
+
+
+BENCHMARKS = {
+    "levels": Benchmark("levels generated per second", generation),
+    "shortest_paths": Benchmark("shortest paths against networkx and scipy", shortest_paths),
+    "environment": Benchmark("environment steps against Gymnasium", environment_steps),
+    "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),
+    "overhead": Benchmark("what of a Solver update is not the network", overhead),
+    "precision": Benchmark("a Solver update in bf16 against fp32", precisions),
+    "ceiling": Benchmark(
+        "a Solver update against its convolutions alone, and a profile", against_convolutions
+    ),
+    "meta": Benchmark("a meta-environment step against its parts", meta_step),
+    "population": Benchmark("K Solvers in one update against one after another", population),
+    "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
+    "workers": Benchmark("rollouts of the copies in one worker and in two", throughput),
+    "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
+    "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
+    "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),
+}
+
+
+def selected(names: list[str], full: bool, cuda: bool = False) -> list[str]:
+    """The names given, or without any those that run by default."""
+    allowed = {"default"} | ({"full"} if full else set()) | ({"cuda"} if cuda else set())
+    return names or [name for name, benchmark in BENCHMARKS.items() if benchmark.on in allowed]

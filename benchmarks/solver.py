@@ -1,0 +1,221 @@
+"""One Solver update: against the plain way, in both precisions, and what of it is the network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from statistics import median
+
+import torch
+
+from benchmarks.plain import PlainPPO, PlainUNet
+from benchmarks.results import Options, Result, Row, Spread, Table
+from benchmarks.scales import NARROW, PAPER, TINY, Scale, Solvers, bf16_in_hardware
+from benchmarks.timing import interleave, ratio, threads, total
+from proposer_rl.mazes import MazeEnv
+
+SMALL_BATCH = 16
+
+
+def against_plain(options: Options) -> Result:
+    """The library's update and the plain TorchRL one, on the same mazes and network."""
+    if options.tiny:
+        return _complete(TINY, options)
+    if options.size == "full":
+        return _complete(PAPER, options)
+    small = _complete(PAPER.with_solver(problems=SMALL_BATCH), options)
+    paper = _from_parts(PAPER, options)
+    return Result(paper.rows + small.rows, paper.tables, paper.notes)
+
+
+def _complete(scale: Scale, options: Options) -> Result:
+    """Both updates from beginning to end."""
+    plain = _plain(scale, options)
+    candidates = {**_updates(scale, options), "plain": plain.update}
+    seconds = interleave(candidates, options.few, options.device)
+    rows = [
+        _row(scale, name, seconds["plain"], seconds[name], "plain TorchRL way")
+        for name in candidates
+        if name != "plain"
+    ]
+    return Result(rows)
+
+
+def _from_parts(scale: Scale, options: Options) -> Result:
+    """The plain update, put together from one collection and one epoch, since it takes a minute."""
+    plain, epochs = _plain(scale, options), scale.solver.ppo.epochs
+    rollout = plain.collect()
+    candidates: dict[str, Callable[[], object]] = {
+        **_updates(scale, options),
+        "plain: collection": plain.collect,
+        "plain: advantages": lambda: plain.advantages(rollout),
+        "plain: epoch": lambda: plain.epoch(rollout),
+    }
+    seconds = interleave(candidates, options.few, options.device)
+    parts = {"plain: collection": 1, "plain: advantages": 1, "plain: epoch": epochs}
+    whole = total(seconds, parts)
+    rows = [
+        _row(scale, name, whole, seconds[name], "plain TorchRL way, from its parts")
+        for name in candidates
+        if name not in parts
+    ]
+    table = Table(
+        "Seconds behind the comparison with plain TorchRL, at the paper's values",
+        ["what", "median", "from", "to"],
+        [[name, *_cells(Spread.of(seconds[name]))] for name in candidates]
+        + [["plain: whole update, computed", *_cells(Spread.of(whole))]],
+    )
+    note = (
+        f"The plain update at the paper's values is {epochs} times one of its epochs plus its "
+        f"collection and advantages; every epoch does the same work. With P = {SMALL_BATCH}, and "
+        "everywhere with --full, it is run from beginning to end."
+    )
+    return Result(rows, [table], [note])
+
+
+def precisions(options: Options) -> Result:
+    """The same update with bf16 autocast and without."""
+    if not bf16_in_hardware(options.device):
+        return Result([], notes=["This machine has no bf16 instructions; fp32 it is."])
+    rows = []
+    scales = [TINY] if options.tiny else [PAPER, PAPER.with_solver(channels=NARROW)]
+    for scale in scales:
+        updates = _updates(scale, options)
+        seconds = interleave(updates, options.repeats, options.device)
+        rows.append(
+            Row(
+                f"speed of a Solver update, {_size(scale)}, bf16",
+                "the same in fp32",
+                ratio(seconds["fp32"], seconds["bf16"]),
+                "x",
+                samples=seconds,
+            )
+        )
+    return Result(rows, notes=["Whether bf16 learns as well is what `learning` measures."])
+
+
+def population(options: Options) -> Result:
+    """K Solvers in one update against K updates of one."""
+    limit = 0.35 if options.device.startswith("cuda") else 1.0
+    if options.tiny:
+        scales = [TINY]
+    else:
+        scales = [PAPER.with_solver(channels=NARROW)]
+        if options.size == "full":
+            scales.append(PAPER)
+    rows = []
+    for scale in scales:
+        copies, task = scale.proposer.rollouts, scale.task(options)
+        alone, together = Solvers(task), Solvers(task, copies)
+
+        def in_turn(count: int | None = None, solver: Solvers = alone, times: int = copies) -> None:
+            with threads(count):
+                for _ in range(times):
+                    solver.update()
+
+        # An operation on small maps may be slower on several threads: the faster way counts.
+        ways: dict[str, Callable[[], object]] = {
+            "in turn": in_turn,
+            "in turn, one thread": partial(in_turn, 1),
+        }
+        repeats = options.few if scale is PAPER else options.repeats
+        seconds = interleave({"together": together.update, **ways}, repeats, options.device)
+        best = min((seconds[way] for way in ways), key=median)
+        rows.append(
+            Row(
+                f"one update of K = {copies}, {_size(scale)}, {scale.precision(options)}",
+                f"{copies} updates of K = 1",
+                ratio(seconds["together"], best),
+                "x",
+                target=None if options.tiny else limit,
+                at_most=True,
+                samples=seconds,
+            )
+        )
+    return Result(rows)
+
+
+def overhead(options: Options) -> Result:
+    """What of an update is not the network: environment, GAE, loss, collector, optimiser."""
+    scale = TINY if options.tiny else PAPER
+    rows = []
+    for precision in _precisions(options):
+        # Both called as they are: on a GPU the network alone would not be replayed.
+        solvers = Solvers(scale.task(options, precision, graphs=False))
+        agent = solvers.ppo.agent
+        level = solvers.ppo.env.reset().select(*agent.level_keys)
+        with torch.no_grad():
+            maps = agent.encode(level)
+        slopes = [torch.randn_like(maps[key]) for key in agent.context_keys]
+
+        def network_alone(agent=agent, level=level, slopes=slopes) -> None:  # type: ignore[no-untyped-def]
+            with torch.no_grad():
+                agent.encode(level)
+            for _ in range(scale.solver.ppo.epochs):
+                context = agent.encode(level)
+                agent.zero_grad()
+                torch.autograd.backward([context[key] for key in agent.context_keys], slopes)
+
+        seconds = interleave(
+            {"update": solvers.update, "network": network_alone}, options.repeats, options.device
+        )
+        shares = [1 - n / u for n, u in zip(seconds["network"], seconds["update"], strict=True)]
+        rows.append(
+            Row(
+                f"all but the network, {_size(scale)}, {precision}",
+                "a Solver update",
+                Spread.of(shares),
+                "%",
+                target=None if options.tiny else 0.10,
+                at_most=True,
+                samples=seconds,
+            )
+        )
+    note = (
+        "The network's share is one forward pass and as many forward and backward passes as there "
+        "are epochs, called alone. Adam and the clipping of gradients count as not the network."
+    )
+    return Result(rows, notes=[note])
+
+
+def _precisions(options: Options) -> list[str]:
+    return ["fp32", "bf16"] if bf16_in_hardware(options.device) else ["fp32"]
+
+
+def _updates(scale: Scale, options: Options) -> dict[str, Callable[[], object]]:
+    return {
+        precision: Solvers(scale.task(options, precision)).update
+        for precision in _precisions(options)
+    }
+
+
+def _plain(scale: Scale, options: Options) -> PlainPPO:
+    solvers = Solvers(scale.task(options, "fp32"))
+    solvers.next_levels()
+    solvers.ppo.env.reset()
+    env = MazeEnv(solvers.ppo.env.levels[0], max_steps=scale.maze.max_steps)
+    return PlainPPO(env, PlainUNet(scale.solver.channels), scale.solver.ppo)
+
+
+def _row(scale: Scale, precision: str, plain: list[float], ours: list[float], against: str) -> Row:
+    at_paper_values = scale == PAPER
+    return Row(
+        f"speed of a Solver update, {_size(scale)}, {precision}",
+        against,
+        ratio(plain, ours),
+        "x",
+        target=20 if at_paper_values else None,
+        samples={"plain": plain, "update": ours},
+    )
+
+
+def _size(scale: Scale) -> str:
+    if scale == PAPER:
+        return "paper values"
+    solver = scale.solver
+    channels = "→".join(str(width) for width in solver.channels)
+    return f"P = {solver.problems}, {channels}"
+
+
+def _cells(seconds: Spread) -> list[str]:
+    return [f"{value:.3g}" for value in (seconds.median, seconds.low, seconds.high)]

@@ -1,0 +1,1 @@
+"""PPO of one agent, or of K copies of it at once."""

@@ -1,0 +1,207 @@
+"""Named levels as text and as JSON. docs/levels.md describes both formats."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from proposer_rl.mazes import Level, shortest_path_length
+from proposer_rl.runs.folder import storage, write_atomically
+
+SUFFIXES = (".txt", ".json")
+LARGEST_FILE = 10**7  # bytes; files may come from anybody
+LONGEST_NAME = 80
+
+_HERE = Path(__file__).parent
+_HEADER = re.compile(r"\[(.*)\]")
+_RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
+
+
+def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
+    """Reads a file of levels.
+
+    Args:
+        path: A file whose name ends in ``.txt`` or ``.json``.
+
+    Returns:
+        Levels of batch shape ``[]`` by their names, in the file's order.
+
+    Raises:
+        ValueError: If the file holds something else; the message names the file and the level.
+        StorageError: If it cannot be read.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    with storage(path, "read"), open(path, "rb") as file:
+        content = file.read(LARGEST_FILE + 1)
+    if len(content) > LARGEST_FILE:
+        raise ValueError(f"{path}: is larger than {LARGEST_FILE:,} bytes")
+    try:
+        text = content.decode()
+        if path.suffix == ".json":
+            return levels_from_json(text)
+        return levels_from_text(text, path.stem)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> None:
+    """Writes a file of levels; one that exists is replaced.
+
+    Args:
+        path: A file whose name ends in ``.txt`` or ``.json``.
+        levels: Levels of batch shape ``[]`` by their names.
+
+    Raises:
+        ValueError: If the name of the file or of a level cannot be used, or a goal is out of reach.
+        StorageError: If the disk cannot take it.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    text = levels_to_json(levels) if path.suffix == ".json" else levels_to_text(levels)
+    write_atomically(path, text.encode())
+
+
+def shipped_sets() -> list[str]:
+    """Names of the sets that come with the package."""
+    return sorted(file.stem for file in _HERE.glob("*.txt"))
+
+
+def shipped_levels(name: str) -> dict[str, Level]:
+    """The levels of a set that comes with the package.
+
+    Raises:
+        ValueError: If there is no such set.
+    """
+    if name not in shipped_sets():
+        raise ValueError(f"{name}: there is no such set of levels; there are {shipped_sets()}")
+    return read_levels(_HERE / f"{name}.txt")
+
+
+def levels_from_text(text: str, unnamed: str = "level") -> dict[str, Level]:
+    """Reads levels drawn with one character per cell.
+
+    Args:
+        text: For each level a line ``[name]``, perhaps a line ``path_length: 12``, and the rows of
+            its drawing as :meth:`Level.from_text` reads them. Blank lines, and lines that begin
+            with a semicolon, are ignored.
+        unnamed: Name of a level drawn before the first name.
+
+    Raises:
+        ValueError: If a line or level is not like that, a name occurs twice, there is no level, or
+            a path length is not that of the level.
+    """
+    drawn: list[tuple[str, list[str], int | None]] = []
+    for line in map(str.strip, text.splitlines()):
+        header, record = _HEADER.fullmatch(line), _RECORD.fullmatch(line)
+        if not line or line.startswith(";"):
+            continue
+        if header or not drawn:
+            drawn.append((header[1].strip() if header else unnamed, [], None))
+        name, rows, _ = drawn[-1]
+        if record:
+            drawn[-1] = (name, rows, int(record[1]))
+        elif not header:
+            rows.append(line)
+    return _named(drawn)
+
+
+def levels_from_json(text: str) -> dict[str, Level]:
+    """Reads levels from JSON.
+
+    Args:
+        text: ``{"levels": [{"name": "hall", "level": ["S..", "..G"], "path_length": 3}]}``; the
+            path length may be missing.
+
+    Raises:
+        ValueError: As :func:`levels_from_text`.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError("is no JSON") from None
+    items = content.get("levels") if isinstance(content, dict) else None
+    if not isinstance(items, list):
+        raise ValueError('must be an object with a list "levels"')
+    return _named([_from_item(number, item) for number, item in enumerate(items, 1)])
+
+
+def levels_to_text(levels: Mapping[str, Level]) -> str:
+    """Draws levels; the inverse of :func:`levels_from_text`, with their path lengths."""
+    return "\n".join(
+        f"[{name}]\npath_length: {length}\n{level.to_text()}\n"
+        for name, level, length in _checked(levels)
+    )
+
+
+def levels_to_json(levels: Mapping[str, Level]) -> str:
+    """Writes levels as JSON; the inverse of :func:`levels_from_json`, with their path lengths."""
+    items = [
+        {"name": name, "path_length": length, "level": level.to_text().splitlines()}
+        for name, level, length in _checked(levels)
+    ]
+    return json.dumps({"levels": items}, indent=1) + "\n"
+
+
+def _from_item(number: int, item: Any) -> tuple[str, list[str], int | None]:
+    if not isinstance(item, dict) or not {"name", "level"} <= item.keys():
+        raise ValueError(f'level {number}: must be an object with a "name" and a "level"')
+    unknown = sorted(item.keys() - {"name", "level", "path_length"})
+    if unknown:
+        raise ValueError(f"level {number}: there is no such key as {unknown[0]!r}")
+    name, rows, length = item["name"], item["level"], item.get("path_length")
+    if not isinstance(name, str):
+        raise ValueError(f"level {number}: its name must be text, got {name!r:.80}")
+    if not isinstance(rows, list) or not all(isinstance(row, str) for row in rows):
+        raise ValueError(f"level {name!r:.80}: must be a list of rows, each of them text")
+    if length is not None and type(length) is not int:
+        raise ValueError(f"level {name!r:.80}: path_length must be whole, got {length!r:.80}")
+    return name, rows, length
+
+
+def _named(drawn: list[tuple[str, list[str], int | None]]) -> dict[str, Level]:
+    levels: dict[str, Level] = {}
+    for name, rows, recorded in drawn:
+        if name in levels:
+            raise ValueError(f"level {name!r:.80}: the name occurs twice")
+        try:
+            levels[name] = Level.from_text("\n".join(rows))
+        except ValueError as error:
+            reason = str(error).partition(", got")[0]
+            raise ValueError(f"level {name!r:.80}: {reason}") from error
+        _check_length(name, levels[name], recorded)
+    if not levels:
+        raise ValueError("holds no levels")
+    return levels
+
+
+def _checked(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
+    if not levels:
+        raise ValueError("there must be at least one level to write")
+    return [(name, level, _check_length(name, level)) for name, level in levels.items()]
+
+
+def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
+    """The length of the level's shortest path, if it is the one recorded."""
+    usable = name.strip() == name and name.isprintable() and not set(name) & set("[]")
+    if not usable or not 0 < len(name) <= LONGEST_NAME:
+        raise ValueError(
+            f"level {name!r:.80}: a name has 1 to {LONGEST_NAME} printable characters, no brackets"
+        )
+    length = int(shortest_path_length(level))
+    if length < 0:
+        raise ValueError(f"level {name!r}: the goal cannot be reached")
+    if recorded not in (None, length):
+        raise ValueError(
+            f"level {name!r}: path_length is {recorded}, but the shortest path has {length} moves"
+        )
+    return length
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{path}: must end in one of {', '.join(SUFFIXES)}")

@@ -1,0 +1,181 @@
+"""The main process's side: orders to the workers, and what comes back put together."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from copy import deepcopy
+from functools import partial
+from itertools import cycle
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import BaseCollector
+
+from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.meta.copies import Pause, Trained
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.workers.engines import (
+    Order,
+    WorkersError,
+    WorkerSettings,
+    collect,
+    lost,
+    start,
+    stop,
+)
+from proposer_rl.meta.workers.remote import MakeEnv, Report, WorkerPolicy, make_worker_env
+from proposer_rl.streams import Streams
+
+ATTEMPTS = 3
+
+
+class CopiesInWorkers:
+    """Copies that are trained by workers, each of which computes a share of them.
+
+    An episode goes on only as a whole: there is no saving within it. Where a worker is lost, all
+    are started anew and the episode is repeated, with the same numbers.
+
+    Args:
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` like
+            those of the workers; it is used for all but the copies' training.
+        make_env: makes a worker's environment.
+        settings: how many workers there are, and where.
+
+    Raises:
+        ValueError: for more workers than copies.
+    """
+
+    def __init__(self, proposer: PPO, make_env: MakeEnv, settings: WorkerSettings) -> None:
+        self._proposer = proposer
+        self._env: SolverTrainingEnv = proposer.env
+        self._make_env = make_env
+        self._settings = settings
+        self._shares = shares(self._env.batch_size[0], settings.workers)
+        self._collector: BaseCollector | None = None
+
+    def roll_out(
+        self,
+        solver: TensorDictBase,
+        streams: Streams,
+        pause: Pause | None = None,
+        begun: dict[str, Any] | None = None,
+    ) -> TensorDictBase:
+        """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`; an episode always begins anew.
+
+        Raises:
+            DivergedError: if a copy diverges, as in one process.
+            WorkersError: if workers are lost again and again.
+        """
+        self._env.view.draw_levels(streams)
+        for attempt in range(ATTEMPTS):
+            try:
+                rollout, diverged = self._roll_out(solver, streams)
+                break
+            except WorkersError:
+                raise
+            except lost(self._settings) as error:
+                self.close()
+                reason = _last_line(error)
+                if attempt == ATTEMPTS - 1:
+                    raise WorkersError(
+                        f"workers were lost {ATTEMPTS} times in one cycle, last: {reason}; the "
+                        "same command goes on from the last checkpoint"
+                    ) from error
+                # It may have been the signal that ends this run, too.
+                (pause or (lambda: None))()
+                warnings.warn(
+                    f"a worker was lost ({reason}); it is replaced and the episode repeated",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+        for message in filter(None, diverged):
+            raise DivergedError(message)
+        return self._proposer.complete(self._together(rollout))
+
+    def episode(self) -> None:
+        """Nothing: an episode begins anew."""
+
+    def trained(self, copy: int) -> Trained:
+        """See :meth:`~proposer_rl.meta.copies.Copies.trained`.
+
+        Of the update's metrics, those that TorchRL's loss gives as one number for all copies (the
+        entropy, for one) are not known here, and nan.
+        """
+        assert self._collector is not None, "there has been no episode"
+        orders = [(copy, share) for share in self._shares]
+        reports: list[Report] = self._collector.map_fn("env.report", orders)
+        (own,) = [report for report in reports if report.copy]
+        steps: Any = torch.cat([report.steps for report in reports], 1)  # [S, K]
+        metrics = TensorDict({key: entry.mean() for key, entry in steps.items()})
+        solver, levels, rollout = (entry.to(self._env.device) for entry in own.copy)
+        return Trained(solver, levels, Update(rollout, metrics))
+
+    def close(self) -> None:
+        """End the workers; the next episode starts others."""
+        collector, self._collector = self._collector, None
+        if collector is not None:
+            stop(collector)
+
+    def _roll_out(
+        self, solver: TensorDictBase, streams: Streams
+    ) -> tuple[TensorDictBase, Sequence[str | None]]:
+        """The batch of all workers, [W, K, T], and what diverged in each."""
+        if self._collector is None:
+            self._collector = start(self._settings, self._order())
+        collector, every = self._collector, len(self._shares)
+        # One block of memory each: across processes, every tensor costs a file descriptor.
+        origin = solver.cpu().consolidate()
+        named = self._proposer.agent.named_parameters()
+        weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
+        shape = self._env.full_action_spec[self._proposer.agent.action_key].shape
+        collector.map_fn("env.fork", [(origin, streams)] * every)
+        collector.map_fn("policy.start", [(weights, streams, shape)] * every)
+        rollouts = collect(collector)
+        return rollouts, collector.get_distant_attr("env.diverged")
+
+    def _order(self) -> Order:
+        """What the workers are to be."""
+        settings, proposer = self._settings, self._proposer
+        horizon, threads = proposer.settings.horizon, torch.get_num_threads()
+        devices = [device for _, device in zip(self._shares, cycle(settings.devices), strict=False)]
+        agent = deepcopy(proposer.agent).cpu()
+        return Order(
+            [
+                partial(make_worker_env, self._make_env, share, device, threads)
+                for share, device in zip(self._shares, devices, strict=True)
+            ],
+            [partial(WorkerPolicy, agent, horizon, device) for device in devices],
+            frames=self._env.batch_size[0] * horizon,
+            threads=threads,
+        )
+
+    def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
+        """The rollout [K, T] of all copies, each from the worker that computes it."""
+        own: list[Any] = [
+            rollout[share.start : share.stop]
+            for rollout, share in zip(rollouts, self._shares, strict=True)
+        ]
+        rollout: Any = torch.cat(own)
+        rollout = rollout.exclude("collector").to(self._env.device)
+        rollout.names = [None, "time"]
+        return rollout
+
+
+def shares(copies: int, workers: int) -> list[range]:
+    """The numbers of K copies in as many ranges as there are workers, of nearly equal length.
+
+    Raises:
+        ValueError: for more workers than copies, or none.
+    """
+    if not 1 <= workers <= copies:
+        raise ValueError(f"workers must be at least 1 and at most the {copies} copies: {workers}")
+    ends = [copies * worker // workers for worker in range(workers + 1)]
+    return [range(*ends[worker : worker + 2]) for worker in range(workers)]
+
+
+def _last_line(error: Exception) -> str:
+    """What an error says in the end: a worker's comes with its traceback before."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1]

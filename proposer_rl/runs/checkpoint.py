@@ -1,0 +1,207 @@
+"""Checkpoints that survive a crash at any moment, and that cannot run code when they are read.
+
+A checkpoint is one file, ``step_000000123.pt``: a line with the SHA-256 of all that follows, a line
+of JSON with the format's number and the step, then what ``torch.save`` writes. It appears under its
+name only when it is complete and on the disk.
+
+``torchrl.checkpoint`` (0.14) writes atomically and rotates too, but it neither waits for the disk
+nor keeps a checksum, so that a damaged newest checkpoint is found late or never, and it does not
+fall back to the one before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from proposer_rl.runs.folder import storage, write_atomically
+
+FORMAT = 2
+
+_LOG = logging.getLogger(__name__)
+_FILE_NAME = re.compile(r"step_(\d+)\.pt")
+_PLAIN = (bool, int, float, str, type(None))
+
+State = dict[str, Any]
+
+
+class CheckpointError(ValueError):
+    """A checkpoint is not what it should be; the message is one line that names the file."""
+
+
+class _DamagedError(CheckpointError):
+    """The file is not what was written; an older one may be intact."""
+
+
+def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, keep: int = 2) -> Path:
+    """Writes a checkpoint and removes those that are no longer needed.
+
+    Args:
+        folder: where checkpoints lie; created if it does not exist.
+        step: the run's step, not negative. A checkpoint of the same step is replaced.
+        state: nested dicts, lists and tuples of tensors, numbers, text and None. Tensors are
+            written detached and from the CPU, so that a run can go on on another device.
+        keep: how many of the newest checkpoints stay.
+
+    Returns:
+        The checkpoint's file.
+
+    Raises:
+        CheckpointError: if the state holds anything else, or the folder already holds an intact
+            checkpoint of a later step: then it is another run's folder, or this run was not resumed
+            from it.
+        StorageError: if the disk cannot take it. In either case the checkpoints that were there
+            stay as they were.
+    """
+    if step < 0 or keep < 1:
+        raise CheckpointError(f"step must be at least 0 and keep at least 1, got {step} and {keep}")
+    folder = Path(folder)
+    path = folder / f"step_{step:09d}.pt"
+    content = _encode(step, state)
+    later = _later_damaged(folder, step)
+    with storage(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for leftover in folder.glob(".step_*.pt.tmp"):
+            leftover.unlink()
+    write_atomically(path, content)
+    with storage(folder):
+        for damaged in later:
+            damaged.unlink()
+        for old in _files(folder)[:-keep]:
+            old.unlink()
+    return path
+
+
+def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
+    """Reads the newest intact checkpoint; logs a warning for each damaged one that it passes over.
+
+    Args:
+        folder: where checkpoints lie.
+
+    Returns:
+        Its step and its state, tensors on the CPU; None if there is no checkpoint.
+
+    Raises:
+        CheckpointError: if there are checkpoints and all are damaged, or if the newest intact one
+            was written by another version or holds more than plain data.
+        StorageError: if one cannot be read.
+    """
+    files = _files(Path(folder))
+    for path in reversed(files):
+        try:
+            return load_checkpoint(path)
+        except _DamagedError as error:
+            _LOG.warning("%s; trying the one before", error)
+    if files:
+        raise CheckpointError(f"none of the {len(files)} checkpoints in {folder} is intact")
+    return None
+
+
+def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
+    """Reads one checkpoint.
+
+    Args:
+        path: its file.
+
+    Returns:
+        Its step and its state, tensors on the CPU.
+
+    Raises:
+        CheckpointError: if the file is damaged, was written by a version with another format, or
+            holds more than plain data (reading it would then run code).
+        StorageError: if the file cannot be read.
+    """
+    version, step, payload = _verified(Path(path))
+    if version != FORMAT:
+        age = "a newer" if version > FORMAT else "an older"
+        raise CheckpointError(
+            f"the checkpoint {path} has format {version}, this version of proposer_rl reads only "
+            f"format {FORMAT}: go on with {age} version, or start in another folder"
+        )
+    try:
+        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever torch raises, what it read is not a state that we wrote
+        reason = str(error).partition("\n")[0]
+        raise CheckpointError(
+            f"the checkpoint {path} is refused by torch.load: {reason}"
+        ) from error
+    return step, state
+
+
+def _encode(step: int, state: State) -> bytes:
+    payload = io.BytesIO()
+    torch.save(_plain(state, "state"), payload)
+    header = json.dumps({"format": FORMAT, "step": step})
+    body = header.encode() + b"\n" + payload.getvalue()
+    return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+def _plain(value: object, where: str) -> object:
+    """Copies a state, and refuses what could be saved but not be loaded with ``weights_only``."""
+    if isinstance(value, torch.Tensor):
+        # A clone: of a view, torch.save would write all the memory that it looks into.
+        return value.detach().cpu().clone()
+    if isinstance(value, dict):
+        return {
+            _plain(k, f"a key of {where}"): _plain(v, f"{where}[{k!r}]") for k, v in value.items()
+        }
+    if type(value) is list or type(value) is tuple:
+        items = [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+        return items if type(value) is list else tuple(items)
+    if type(value) in _PLAIN:
+        return value
+    raise CheckpointError(
+        f"{where} is a {type(value).__name__}; a checkpoint holds dicts, lists, tuples, tensors, "
+        "numbers, text and None"
+    )
+
+
+def _verified(path: Path) -> tuple[int, int, bytes]:
+    """Returns format, step and payload of a file, none of them looked at before the checksum."""
+    with storage(path, "read"):
+        content = path.read_bytes()
+    digest, _, body = content.partition(b"\n")
+    if digest != hashlib.sha256(body).hexdigest().encode():
+        raise _DamagedError(
+            f"the checkpoint {path} is damaged ({len(content)} bytes, wrong checksum)"
+        )
+    line, _, payload = body.partition(b"\n")
+    try:
+        header = json.loads(line)
+        return int(header["format"]), int(header["step"]), payload
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise CheckpointError(f"{path} is not a checkpoint of proposer_rl") from None
+
+
+def _files(folder: Path) -> list[Path]:
+    """Returns the checkpoints in a folder, oldest step first."""
+    found = [path for path in folder.glob("step_*.pt") if _FILE_NAME.fullmatch(path.name)]
+    return sorted(found, key=_step_of)
+
+
+def _step_of(path: Path) -> int:
+    match = _FILE_NAME.fullmatch(path.name)
+    assert match is not None
+    return int(match[1])
+
+
+def _later_damaged(folder: Path, step: int) -> list[Path]:
+    """Returns the checkpoints of later steps, all damaged: a resumed run passed over them."""
+    later = [path for path in _files(folder) if _step_of(path) > step]
+    for path in later:
+        try:
+            _verified(path)
+        except _DamagedError:
+            continue
+        raise CheckpointError(
+            f"{path} is later than step {step}: resume from it, or use another folder"
+        )
+    return later

@@ -1,0 +1,103 @@
+"""A number that goes wrong is named, and does no harm to other copies."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tests.learning.test_ppo import generators, learner
+
+from proposer_rl.learning.divergence import DivergedError, located, require_finite
+
+K, S = 3, 2
+BAD = [float("nan"), float("inf"), float("-inf")]
+
+
+def healthy() -> tuple[torch.Tensor, TensorDict, dict[str, torch.Tensor]]:
+    scalars = ("loss_objective", "loss_entropy", "loss_critic", "grad_norm")
+    steps = TensorDict({name: torch.randn(S, K) for name in scalars}, [S])
+    steps["kl_approx"] = torch.full((S,), float("inf"))  # a diagnostic, of no effect
+    return torch.randn(K, 4, 5, 1), steps, {"a": torch.randn(K, 2), "b": torch.randn(K, 3, 3)}
+
+
+def test_finite_numbers_pass_however_large() -> None:
+    reward, steps, weights = healthy()
+    require_finite(reward, steps, weights, K)
+    # The sum of these overflows, they do not.
+    require_finite(reward, steps, {"a": torch.full((K, 100), 3e38)}, K)
+
+
+def test_every_term_of_a_loss_counts_whatever_its_name() -> None:
+    reward, steps, weights = healthy()
+    steps["loss_value"] = torch.zeros(S, K)
+    require_finite(reward, steps, weights, K)
+    steps["loss_value"][0, 2] = torch.nan
+    with pytest.raises(DivergedError, match=r"^copy 2: loss_value of gradient step 0"):
+        require_finite(reward, steps, weights, K)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("copy", range(K))
+def test_names_the_copy_and_the_tensor(bad: float, copy: int) -> None:
+    reward, steps, weights = healthy()
+    weights["b"][copy, 1, 2] = bad
+    with pytest.raises(DivergedError, match=rf"^copy {copy}: weight b is not finite \({bad}\)$"):
+        require_finite(reward, steps, weights, K)
+    steps["grad_norm"][1, copy] = bad
+    with pytest.raises(DivergedError, match=f"^copy {copy}: grad_norm of gradient step 1 is"):
+        require_finite(reward, steps, weights, K)
+    steps["loss_critic"][1, copy] = bad
+    with pytest.raises(DivergedError, match=f"^copy {copy}: loss_critic of gradient step 1 is"):
+        require_finite(reward, steps, weights, K)
+    steps["grad_norm"][0, copy] = bad
+    with pytest.raises(DivergedError, match=f"^copy {copy}: grad_norm of gradient step 0 is"):
+        require_finite(reward, steps, weights, K)
+    reward[copy, 2, 3] = bad
+    with pytest.raises(DivergedError, match=f"^copy {copy}: reward is not finite"):
+        require_finite(reward, steps, weights, K)
+
+
+def test_names_all_copies_that_it_happened_in() -> None:
+    reward, steps, weights = healthy()
+    steps["loss_critic"][0, [0, 2]] = torch.nan
+    with pytest.raises(DivergedError, match=r"^copy 0, 2: loss_critic"):
+        require_finite(reward, steps, weights, K)
+
+
+def test_a_single_network_has_no_copies() -> None:
+    reward, steps, weights = healthy()
+    weights["b"][1, 1, 1] = torch.nan
+    with pytest.raises(DivergedError, match=r"^weight b is not finite"):
+        require_finite(reward, steps[:, None][..., 0], weights, None)
+
+
+def test_says_where_from_the_outside_in() -> None:
+    with (
+        pytest.raises(DivergedError, match=r"^cycle 3: step 2: reward$"),
+        located("cycle 3"),
+        located("step 2"),
+    ):
+        raise DivergedError("reward")
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("what", ["weight", "reward"])
+def test_a_copy_that_diverges_is_caught_in_its_update_and_leaves_the_others_alone(
+    bad: float, what: str
+) -> None:
+    clean, poisoned = learner(copies=3), learner(copies=3)
+    rollouts = [ppo.collect(generators(0, 1, 2)) for ppo in (clean, poisoned)]
+    if what == "reward":
+        rollouts[1]["next", "reward"][1, 0, 4] = bad
+    else:
+        next(poisoned.agent.parameters()).data[1].view(-1)[0] = bad
+    clean.optimise(rollouts[0])
+    clean.check()
+    with pytest.raises(
+        DivergedError, match=r"^copy 1: " + ("reward" if what == "reward" else "loss")
+    ):
+        poisoned.optimise(rollouts[1])
+        poisoned.check()
+    others = clean.snapshot()[[0, 2]], poisoned.snapshot()[[0, 2]]
+    assert (others[0] == others[1]).all()
+    assert not poisoned.snapshot()[1].isfinite().all()

@@ -1,0 +1,514 @@
+"""PPO against plain formulas: advantages, losses, gradients, copies together and apart."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+import hypothesis
+import pytest
+import torch
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torch.distributions import Categorical
+from torch.nn.functional import smooth_l1_loss
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs import RenameTransform, TransformedEnv
+from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
+
+from proposer_rl.learning.cuda_graphs import Recorder
+from proposer_rl.learning.ppo import PPO, MakeLoss, PPOSettings, clip_gradients_
+from proposer_rl.mazes import Level, MazeEnv, generate_levels
+from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
+from proposer_rl.models.maps import read_maps
+from tests.graphs import NoHostReads, Tapes
+
+P, T = 6, 12
+SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
+
+
+def levels(copies: int, seed: int = 0) -> Level:
+    generator = torch.Generator().manual_seed(seed)
+    return generate_levels(torch.full((copies, P), 0.2), 2, 5, 5, generator=generator)
+
+
+def learner(
+    copies: int = 1,
+    settings: PPOSettings = SETTINGS,
+    observe_agent: bool = False,
+    *,
+    per_step: bool | None = None,
+    way: str | None = None,
+    recorder: Recorder | None = None,
+    loss: MakeLoss | None = None,
+) -> PPO:
+    torch.manual_seed(3)
+
+    def make() -> UNet:
+        return UNet(in_channels=4 if observe_agent else 3, channels=(8, 16), groups=4)
+
+    per_step = observe_agent if per_step is None else per_step
+    agent = map_actor_critic(Population(make, copies, way=way), per_step=per_step)
+    env = MazeEnv(levels(copies), max_steps=5, observe_agent=observe_agent)
+    return PPO(env, agent, settings, recorder, loss=loss)
+
+
+def train(ppo: PPO, updates: int) -> list[TensorDict]:
+    """Updates on new levels each; their rollouts and metrics."""
+    copies, history = ppo.env.batch_size[0], []
+    for update in range(updates):
+        ppo.env.set_levels(levels(copies, seed=update))
+        rollout, metrics = ppo.update(generators(*(10 * update + k for k in range(copies))))
+        history.append(TensorDict({"rollout": rollout, "metrics": metrics}))
+    return history
+
+
+def generators(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+def hand_gae(rollout: TensorDict, gamma: float, lmbda: float) -> Tensor:
+    """Advantages by the recursion from the last step to the first, one environment at a time."""
+    value, following = rollout["state_value"], rollout["next", "state_value"]
+    reward, terminated = rollout["next", "reward"], rollout["next", "terminated"]
+    done = rollout["next", "done"]
+    advantage = torch.zeros_like(value)
+    for k in range(value.shape[0]):
+        for p in range(value.shape[1]):
+            after = 0.0
+            for t in reversed(range(value.shape[2])):
+                at = (k, p, t, 0)
+                bootstrap = 0.0 if terminated[at] else float(following[at])
+                delta = float(reward[at]) + gamma * bootstrap - float(value[at])
+                after = delta + (0.0 if done[at] else gamma * lmbda * after)
+                advantage[at] = after
+    return advantage
+
+
+def test_advantages_equal_a_hand_recursion_with_both_kinds_of_end() -> None:
+    ppo = learner(copies=2)
+    rollout = ppo.collect(generators(0, 1))
+    ends = rollout["next"]
+    assert ends["terminated"][:, :, :-1].any() and ends["truncated"][:, :, :-1].any()
+    ppo.optimise(rollout)
+    expected = hand_gae(rollout, SETTINGS.gamma, SETTINGS.lmbda)
+    torch.testing.assert_close(rollout["advantage"], expected, rtol=1e-4, atol=1e-5)
+    target = expected + rollout["state_value"]
+    torch.testing.assert_close(rollout["value_target"], target, rtol=1e-4, atol=1e-5)
+
+
+def test_values_are_those_of_the_states_before_and_after_each_step() -> None:
+    ppo = learner()
+    rollout = ppo.collect(generators(0))
+    for part, inputs in ((rollout, rollout), (rollout["next"], rollout["next"])):
+        state = TensorDict({"planes": rollout["planes"], "agent": inputs["agent"]}, rollout.shape)
+        expected = ppo.agent(state)["state_value"].detach()
+        torch.testing.assert_close(part["state_value"], expected, rtol=1e-4, atol=1e-5)
+
+
+def plain_loss(ppo: PPO, batch: TensorDict, k: int, settings: PPOSettings) -> Tensor:
+    """PPO's clipped loss of one copy, one forward pass per transition, from the formulas."""
+    state = batch.select("planes", "agent")
+    output = ppo.agent(state)
+    distribution = Categorical(logits=output["logits"][k])
+    ratio = (distribution.log_prob(batch["action"][k]) - batch["action_log_prob"][k]).exp()
+    advantage = batch["advantage"][k].squeeze(-1)
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    low, high = 1 - settings.clip_epsilon, 1 + settings.clip_epsilon
+    surrogate = torch.min(ratio * advantage, ratio.clamp(low, high) * advantage).mean()
+    error = (output["state_value"][k] - batch["value_target"][k]).square().mean()
+    entropy = distribution.entropy().mean()
+    return -surrogate + settings.critic_coeff * error - settings.entropy_coeff * entropy
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
+def test_loss_and_gradients_equal_the_formulas_per_transition(observe_agent: bool) -> None:
+    settings = PPOSettings(horizon=T, epochs=2, max_grad_norm=1e9)
+    ppo = learner(copies=2, settings=settings, observe_agent=observe_agent)
+    rollout = ppo.collect(generators(0, 1))
+    ppo.optimise(rollout)  # the policy moves on, so that ratios differ from one
+    plain = sum(plain_loss(ppo, rollout, k, settings) for k in range(2))
+    parameters = list(ppo.agent.parameters())
+    expected = torch.autograd.grad(plain, parameters)
+    metrics = ppo._gradient_step(
+        rollout, rollout.select(*ppo.agent.level_keys)[..., 0]
+    )  # leaves its gradients on the parameters
+    parts = ("objective", "entropy", "critic")
+    total = sum(metrics[f"loss_{part}"].sum() for part in parts)
+    torch.testing.assert_close(total, plain.detach(), rtol=1e-4, atol=1e-5)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_metrics_tell_how_far_the_policy_moved() -> None:
+    """By the formulas: entropy, Schulman's first estimate of the divergence, what was clipped."""
+    ppo = learner(copies=2, settings=replace(SETTINGS, learning_rate=3e-3))
+    rollout = ppo.collect(generators(0, 1))
+    ppo.optimise(rollout)  # the policy moves on, so that ratios differ from one
+    level = rollout.select(*ppo.agent.level_keys)[..., 0]
+    with torch.no_grad():
+        steps = ppo.agent.decode(rollout.copy(), ppo.agent.encode(level))
+        policy = ppo.agent.distribution(steps)
+    moved = policy.log_prob(rollout["action"]) - rollout["action_log_prob"]
+    metrics = ppo._gradient_step(rollout, level)
+    torch.testing.assert_close(metrics["entropy"], policy.entropy().mean())
+    torch.testing.assert_close(metrics["kl_approx"], -moved.mean(), rtol=1e-4, atol=1e-7)
+    clipped = (moved.exp() - 1).abs() > ppo.settings.clip_epsilon
+    assert clipped.any() and not clipped.all()
+    torch.testing.assert_close(metrics["clip_fraction"], clipped.float().mean())
+    target = rollout["value_target"].flatten(1)
+    residual = target - steps["state_value"].flatten(1)
+    explained = [1 - residual[k].var() / target[k].var() for k in range(2)]
+    torch.testing.assert_close(metrics["explained_variance"], sum(explained) / 2)
+
+
+def test_torchrls_loss_on_the_ordinary_actor_gives_the_same_gradients() -> None:
+    """The agent as others compose it: stock ClipPPOLoss, one observation per step."""
+    settings = PPOSettings(horizon=T, epochs=1, max_grad_norm=1e9)
+    ppo = learner(settings=settings)
+    rollout = ppo.collect(generators(0))
+    start = ppo.snapshot()
+    ppo.optimise(rollout)
+    gradients = [p.grad.clone() for p in ppo.agent.parameters()]
+    ppo.restore(start)
+    loss = ClipPPOLoss(
+        ppo.agent.actor(),
+        ppo.agent,
+        clip_epsilon=settings.clip_epsilon,
+        entropy_coeff=settings.entropy_coeff,
+        critic_coeff=settings.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+        functional=False,
+    )
+    ppo.agent.zero_grad()
+    losses = loss(rollout)
+    sum(losses[f"loss_{part}"] for part in ("objective", "entropy", "critic")).backward()
+    for parameter, gradient in zip(ppo.agent.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Copies are computed by one thread each; a network alone uses as many as torch may."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_copies_together_train_as_each_alone() -> None:
+    """To the bit, so that copies may be spread over processes."""
+    copies = 3
+    together = learner(copies)
+    start = together.snapshot()
+    finals, rewards = [], []
+    for k in range(copies):
+        alone = learner(1)
+        alone.restore(start[[k]])
+        for update in range(4):
+            alone.env.set_levels(levels(copies, seed=update)[k : k + 1])
+            rollout = alone.update(generators(10 * update + k)).rollout
+        finals.append(alone.snapshot())
+        rewards.append(rollout["next", "reward"])
+    for update in range(4):
+        together.env.set_levels(levels(copies, seed=update))
+        rollout = together.update(generators(*(10 * update + k for k in range(copies)))).rollout
+    assert torch.equal(rollout["next", "reward"], torch.cat(rewards))
+    end = together.snapshot()
+    assert (end == torch.cat(finals)).all()
+    for name in end.keys():
+        assert not torch.allclose(end[name]["value"], start[name]["value"], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_gradients_are_clipped_per_copy(copies: int) -> None:
+    shapes = [(4, 3), (5,), (2, 2, 2)]
+    stacked = [torch.nn.Parameter(torch.zeros(copies, *shape)) for shape in shapes]
+    scale = torch.tensor([0.01, 1.0, 100.0])[:copies]
+    for parameter in stacked:
+        parameter.grad = torch.randn(parameter.shape) * scale.view(-1, *[1] * (parameter.ndim - 1))
+    apart = [[copy.deepcopy(p.grad[k]) for p in stacked] for k in range(copies)]
+    norms = clip_gradients_(stacked, 0.5, copies)
+    for k in range(copies):
+        own = [torch.nn.Parameter(torch.zeros_like(g)) for g in apart[k]]
+        for parameter, gradient in zip(own, apart[k], strict=True):
+            parameter.grad = gradient
+        torch.testing.assert_close(norms[k], torch.nn.utils.clip_grad_norm_(own, 0.5))
+        for parameter, alone in zip(stacked, own, strict=True):
+            torch.testing.assert_close(parameter.grad[k], alone.grad)
+
+
+def a2c(actor, critic) -> A2CLoss:
+    return A2CLoss(actor, critic, functional=False, reduction="none", critic_coeff=0.5)
+
+
+def reinforce(actor, critic) -> ReinforceLoss:
+    return ReinforceLoss(actor, critic, functional=False, reduction="none", loss_critic_type="l2")
+
+
+def plain_a2c(log_prob: Tensor, entropy: Tensor, value: Tensor, batch: TensorDict) -> Tensor:
+    """Mnih et al. 2016, section 4, with TorchRL's default coefficient and distance."""
+    critic = smooth_l1_loss(value, batch["value_target"])
+    return -(log_prob * batch["advantage"]).mean() - 0.01 * entropy.mean() + 0.5 * critic
+
+
+def plain_reinforce(log_prob: Tensor, _: Tensor, value: Tensor, batch: TensorDict) -> Tensor:
+    error = value - batch["value_target"]
+    return -(log_prob * batch["advantage"]).mean() + error.square().mean()
+
+
+@pytest.mark.parametrize(("loss", "formula"), [(a2c, plain_a2c), (reinforce, plain_reinforce)])
+def test_another_loss_gives_every_copy_its_own_gradient(loss, formula) -> None:
+    settings = replace(SETTINGS, epochs=1, max_grad_norm=1e6)
+    ppo = learner(copies=2, settings=settings, loss=loss)
+    batch, expected = ppo.collect(generators(0, 1)), []
+    before = ppo.snapshot()
+    metrics = ppo.optimise(batch)
+    gradients = [p.grad.clone() for p in ppo.agent.parameters()]
+    ppo.restore(before)
+    output = ppo.agent(batch.select("planes", "agent"))
+    distribution = Categorical(logits=output["logits"])
+    log_prob = distribution.log_prob(batch["action"]).unsqueeze(-1)
+    entropy, value = distribution.entropy(), output["state_value"]
+    expected = [formula(log_prob[k], entropy[k], value[k], batch[k]) for k in range(2)]
+    plain = torch.autograd.grad(sum(expected), list(ppo.agent.parameters()))
+    for gradient, other in zip(gradients, plain, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-3, atol=1e-6)
+    told = sum(float(metrics[key]) for key in metrics.keys() if key.startswith("loss_"))
+    assert told == pytest.approx(float(sum(expected).detach()) / 2, rel=1e-4)
+    assert "clip_fraction" not in metrics.keys()
+
+
+def test_a_loss_must_not_mix_the_copies() -> None:
+    def mean(actor, critic) -> A2CLoss:
+        return A2CLoss(actor, critic, functional=False)
+
+    with pytest.raises(ValueError, match="must be \"none\", got 'mean'"):
+        learner(loss=mean)
+
+
+def test_a_rollout_shares_the_levels_memory_and_equals_stepping_by_hand() -> None:
+    ppo = learner()
+    rollout = ppo.collect(generators(4))
+    assert rollout["planes"].shape == (1, P, T, 3, 5, 5)
+    assert rollout["planes"].stride(2) == 0
+    state = ppo.env.reset()
+    for t in range(T):
+        assert torch.equal(rollout["agent"][:, :, t], state["agent"])
+        state, after = ppo.env.step_and_maybe_reset(state.set("action", rollout["action"][:, :, t]))
+        assert torch.equal(rollout["next", "reward"][:, :, t], state["next", "reward"])
+        state = after
+
+
+def test_a_restored_snapshot_trains_on_bit_for_bit() -> None:
+    ppo = learner(copies=2)
+    ppo.update(generators(0, 1))
+    snapshot = ppo.snapshot()
+    ends = []
+    for _ in range(2):
+        ppo.restore(snapshot)
+        rollout = ppo.update(generators(2, 3)).rollout
+        ends.append((ppo.snapshot(), rollout["action"]))
+    assert torch.equal(ends[0][1], ends[1][1])
+    assert (ends[0][0] == ends[1][0]).all()
+    assert not (ends[0][0] == snapshot).all()
+
+
+def test_a_copy_can_be_forked() -> None:
+    ppo, many = learner(copies=2), learner(copies=3)
+    ppo.update(generators(0, 1))
+    many.restore(ppo.snapshot()[[1] * 3])
+    for name, entry in ppo.snapshot().items():
+        for key in ("value", "exp_avg", "exp_avg_sq", "step"):
+            for copied in many.snapshot()[name][key]:
+                assert torch.equal(copied, entry[key][1])
+
+
+@st.composite
+def choices_of_copies(draw: st.DrawFn) -> list[int]:
+    """Which of K copies stands in each of the K places afterwards."""
+    copies = draw(st.integers(2, 4))
+    return draw(st.lists(st.integers(0, copies - 1), min_size=copies, max_size=copies))
+
+
+@hypothesis.settings(max_examples=15, deadline=None)
+@hypothesis.given(chosen=choices_of_copies(), seed=st.integers(0, 9))
+def test_a_copy_trains_alike_in_whatever_place_it_stands(chosen: list[int], seed: int) -> None:
+    """Choosing copies and then training is training and then choosing, to the bit.
+
+    So copies can be moved, forked and dropped, and none of them sees which others there are.
+    """
+    there, given = torch.tensor(chosen), levels(len(chosen), seed)
+    first, second = (learner(len(chosen)) for _ in range(2))
+    second.restore(first.snapshot()[there])
+    first.env.set_levels(given)
+    second.env.set_levels(given[there])
+    seeds = range(len(chosen))
+    expected = first.update(generators(*seeds)).rollout[there]
+    rollout = second.update(generators(*chosen)).rollout
+    for key in ("action", "advantage", ("next", "reward")):
+        assert torch.equal(rollout[key], expected[key])
+    assert (second.snapshot() == first.snapshot()[there]).all()
+
+
+def test_restore_refuses_what_does_not_fit() -> None:
+    ppo = learner(copies=2)
+    with pytest.raises(ValueError, match=r"batch size \[2\], got \[3\]"):
+        ppo.restore(ppo.snapshot()[[0, 0, 0]])
+    other = ppo.snapshot()
+    name = next(iter(other.keys()))
+    with pytest.raises(ValueError, match="another network"):
+        ppo.restore(other.exclude(name))
+    other[name]["step"] += torch.tensor([0.0, 1.0])
+    with pytest.raises(ValueError, match="different numbers of Adam steps"):
+        ppo.restore(other)
+    narrow = ppo.snapshot()
+    narrow[name]["value"] = narrow[name]["value"][:, :1]
+    with pytest.raises(ValueError, match=f"{name} does not fit: another shape"):
+        ppo.restore(narrow)
+
+
+def test_refuses_an_environment_of_another_size() -> None:
+    agent = learner(copies=2).agent
+    with pytest.raises(ValueError, match=r"agent has 2 copies.*batch size is \[3, 6\]"):
+        PPO(MazeEnv(levels(3)), agent, SETTINGS)
+
+
+def test_entries_may_have_other_names() -> None:
+    """Where an environment and a network call things otherwise, the same is learnt."""
+    env = TransformedEnv(
+        MazeEnv(levels(2), max_steps=5), RenameTransform([], [], ["action"], ["move"])
+    )
+    torch.manual_seed(3)
+    usual = learner(2)
+    maps = usual.agent.encoder
+    renamed = PPO(
+        env,
+        ActorCritic(
+            TensorDictModule(read_maps, [*maps.out_keys, "agent"], ["scores", "worth"]),
+            copy.deepcopy(maps),
+            distribution_class=usual.agent.distribution_class,
+            copies=2,
+            action_key="move",
+            log_prob_key="log_prob",
+            logits_key="scores",
+            value_key="worth",
+        ),
+        SETTINGS,
+    )
+    (expected, metrics), (rollout, also) = (
+        ppo.update(generators(0, 1)) for ppo in (usual, renamed)
+    )
+    names = {"move": "action", "log_prob": "action_log_prob", "worth": "state_value"}
+    for key in (*names, "advantage", "value_target"):
+        assert torch.equal(rollout[key], expected[names.get(key, key)]), key
+    assert dict(also.items()) == dict(metrics.items())
+
+
+def test_more_updates_on_one_batch_recompute_the_advantages() -> None:
+    once, twice = learner(), learner(settings=PPOSettings(horizon=T, epochs=3, updates=2))
+    rollout = once.collect(generators(0))
+    first = rollout.clone()
+    once.optimise(first)
+    second = rollout.clone()
+    twice.restore(once.snapshot().apply(torch.clone))
+    twice.optimise(second)
+    assert (len(once.gradient_steps), len(twice.gradient_steps)) == (3, 6)
+    assert not torch.allclose(first["advantage"], second["advantage"])
+    torch.testing.assert_close(
+        second["advantage"], hand_gae(second, 0.99, 0.95), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
+    """Ten updates: the same actions throughout, and the same weights up to rounding."""
+    by_level, by_step = learner(2), learner(2, per_step=True)
+    assert by_level.agent.encoder is not None and by_step.agent.encoder is None
+    start = [parameter.detach().clone() for parameter in by_level.agent.parameters()]
+    for one, other in zip(train(by_level, 10), train(by_step, 10), strict=True):
+        assert torch.equal(one["rollout", "action"], other["rollout", "action"])
+        for key, value in one["metrics"].items():
+            torch.testing.assert_close(value, other["metrics", key], rtol=1e-3, atol=1e-4)
+    ends = (by_level.agent.parameters(), by_step.agent.parameters())
+    for one, other in zip(*ends, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+    moved = max(
+        float((end.detach() - begin).abs().max())
+        for end, begin in zip(by_level.agent.parameters(), start, strict=True)
+    )
+    assert moved > 5e-3
+
+
+@pytest.mark.parametrize(
+    ("copies", "observe_agent", "way"),
+    [(1, False, None), (1, True, None), (2, False, "batched"), (2, False, "4 streams")],
+)
+def test_replayed_updates_train_as_plain_ones(
+    copies: int, observe_agent: bool, way: str | None
+) -> None:
+    """Ten updates, of which the first are plain and the others replays: equal to the bit."""
+    tapes = Tapes()
+    plain = learner(copies, observe_agent=observe_agent, way=way)
+    replayed = learner(copies, observe_agent=observe_agent, way=way, recorder=tapes)
+    for one, other in zip(train(plain, 10), train(replayed, 10), strict=True):
+        assert (one == other).all()
+    assert (plain.snapshot() == replayed.snapshot()).all()
+    assert tapes.recorded == 2  # a rollout and the training on it
+
+
+def test_replays_follow_a_restored_snapshot_and_leave_older_rollouts_alone() -> None:
+    ppo = learner(way="in turn", recorder=Tapes())
+    *_, old = train(ppo, 4)
+    kept, snapshot = old.clone(), ppo.snapshot()
+    first = train(ppo, 2)
+    ppo.restore(snapshot)
+    assert all((a == b).all() for a, b in zip(first, train(ppo, 2), strict=True))
+    assert (old == kept).all()
+
+
+@pytest.mark.parametrize("way", ["batched", "4 streams"])
+@pytest.mark.parametrize("observe_agent", [False, True])
+def test_an_update_never_waits_for_the_device(observe_agent: bool, way: str) -> None:
+    ppo = learner(2, observe_agent=observe_agent, way=way)
+    train(ppo, 1)  # constants are made
+    with NoHostReads():
+        ppo.env.set_levels(levels_on_hand := ppo.env.levels.clone())
+        ppo.update(generators(0, 1))
+    assert (ppo.env.levels == levels_on_hand).all()
+
+
+class Crossings(TorchDispatchMode):
+    """Counts copies between devices, and tensors of Python's numbers."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name in ("_to_copy", "copy_"):
+            devices = {a.device for a in (*args, result) if isinstance(a, Tensor)}
+            self.count += len(devices) > 1
+        self.count += name == "lift_fresh"
+        return result
+
+
+def test_everything_in_an_update_stays_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the device ``meta``, which has shapes but no numbers and refuses to mix with another."""
+    # TorchRL compares bounds when it makes a spec; autocast does not know the device.
+    monkeypatch.setattr(torch, "allclose", lambda *_, **__: True)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
+    agent = map_actor_critic(Population(lambda: UNet(channels=(8, 16), groups=4), 1).to("meta"))
+    ppo = PPO(MazeEnv(levels(1).to("meta"), max_steps=5), agent, SETTINGS)
+    ppo.update()  # constants are made, and moved there
+    with Crossings() as crossings:
+        rollout, metrics = ppo.update()
+    assert crossings.count == 0
+    leaves = [*rollout.values(True, True), *metrics.values()]
+    assert {leaf.device.type for leaf in leaves} == {"meta"}

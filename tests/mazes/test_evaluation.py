@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binom, norm
+from torch import Tensor
+
+from proposer_rl.mazes import Level, generate_levels
+from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator, policy_path, worst_mean
+from tests.mazes.oracles import moved, play, random_levels
+
+UP, DOWN, LEFT, RIGHT = range(4)
+
+
+def random_logits(*shape: int, seed: int = 0, scale: float = 1.0) -> Tensor:
+    return scale * torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def constant_logits(probabilities: list[float], height: int, width: int) -> Tensor:
+    return torch.tensor(probabilities).log().view(4, 1, 1).expand(4, height, width)
+
+
+def by_dense_matrix(
+    level: Level, policy: Tensor, max_steps: int, step_penalty: float
+) -> tuple[float, float]:
+    """Return and success by repeated multiplication with the chain's whole matrix, in float64."""
+    height, width = level.walls.shape
+    goal = level.goal[0] * width + level.goal[1]
+    matrix = torch.zeros(height * width, height * width, dtype=torch.float64)
+    for cell in range(height * width):
+        for action in range(4):
+            row, column = moved(level, divmod(cell, width), action)
+            matrix[cell, row * width + column] += policy[action].flatten()[cell].double()
+    matrix[goal] = 0
+    matrix[goal, goal] = 1
+    state = torch.zeros(height * width, dtype=torch.float64)
+    state[level.start[0] * width + level.start[1]] = 1
+    total = 0.0
+    for _ in range(max_steps):
+        before, state = state, state @ matrix
+        total += (state[goal] - before[goal] - step_penalty * (1 - before[goal])).item()
+    return total, state[goal].item()
+
+
+@settings(max_examples=30)
+@given(
+    size=st.tuples(st.integers(1, 6), st.integers(2, 6)),
+    seed=st.integers(0, 10_000),
+    max_steps=st.integers(0, 40),
+    greedy=st.booleans(),
+    scale=st.sampled_from([0.0, 1.0, 30.0]),
+)
+def test_exact_values_agree_with_the_dense_chain(
+    size: tuple[int, int], seed: int, max_steps: int, greedy: bool, scale: float
+) -> None:
+    levels = random_levels(4, *size, 0.3, seed)
+    logits = random_logits(4, 4, *size, seed=seed, scale=scale)
+    result = ExactEvaluator(max_steps, 0.05, greedy)(
+        levels.reshape(2, 2), logits.unflatten(0, (2, 2))
+    )
+    assert result.batch_size == (2, 2)
+    policy = logits.softmax(1)
+    if greedy:
+        policy = torch.zeros_like(logits).scatter(1, logits.argmax(1, keepdim=True), 1.0)
+    for i, level in enumerate(levels):
+        expected = by_dense_matrix(level, policy[i], max_steps, 0.05)
+        found = result["return"].flatten()[i].item(), result["success"].flatten()[i].item()
+        assert found == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize("length", [1, 4, 9])
+def test_corridor_has_a_closed_form(length: int) -> None:
+    """Right with probability p, else up, which does not move: a negative binomial waiting time."""
+    p, limit, penalty = 0.6, 12, 0.03
+    level = Level.from_text("." * 2 + "S" + "." * (length - 1) + "G" + "...")
+    logits = constant_logits([1 - p, 1e-30, 1e-30, p], 1, level.walls.shape[1])
+    result = ExactEvaluator(limit, penalty)(level, logits)
+    arrived = [1 - binom.cdf(length - 1, steps, p) for steps in range(limit + 1)]
+    assert result["success"].item() == pytest.approx(arrived[limit], abs=1e-6)
+    steps = sum(1 - arrived[step] for step in range(limit))
+    assert result["return"].item() == pytest.approx(arrived[limit] - penalty * steps, abs=1e-6)
+
+
+def test_exact_agrees_with_episodes_of_the_environment() -> None:
+    levels = generate_levels([0.2] * 12, 3, 5, 5, generator=torch.Generator().manual_seed(0))
+    logits = random_logits(12, 4, 5, 5, scale=0.5)
+    episodes = 4000
+    exact = ExactEvaluator()(levels, logits)
+    played = RolloutEvaluator(episodes=episodes, generator=torch.Generator().manual_seed(1))(
+        levels, logits
+    )
+    bound = norm.isf(1e-4)  # two-sided, so 1 in 200 for the 24 comparisons together
+    success = exact["success"]
+    assert success.min() > 0.02 and success.max() < 0.98
+    error = (success * (1 - success) / episodes).sqrt()
+    assert ((played["success"] - success).abs() < bound * error).all()
+    # A return is a success minus at most 25 steps of 0.01, so its deviation is at most this much.
+    error = error + 0.125 / episodes**0.5
+    assert ((played["return"] - exact["return"]).abs() < bound * error).all()
+
+
+def test_rollout_means_are_over_first_episodes_only() -> None:
+    """A policy that walks straight to the goal earns one success, though the horizon goes on."""
+    levels = Level.from_text(["S.G", "SG."])
+    logits = constant_logits([1e-30, 1e-30, 1e-30, 1.0], 1, 3).expand(2, 4, 1, 3)
+    for greedy in (False, True):
+        result = RolloutEvaluator(10, 0.125, episodes=3, greedy=greedy)(levels, logits)
+        assert result["success"].tolist() == [1.0, 1.0]
+        assert result["return"].tolist() == [0.75, 0.875]
+
+
+@pytest.mark.parametrize("source", ["call", "evaluator"])
+def test_generator_determines_the_rollouts(source: str) -> None:
+    levels, logits = random_levels(20, 4, 4, 0.2, 0), random_logits(20, 4, 4, 4)
+
+    def success(seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        torch.rand(seed)  # the global state does not matter
+        if source == "call":
+            return RolloutEvaluator(episodes=3)(levels, logits, generator)["success"]
+        return RolloutEvaluator(episodes=3, generator=generator)(levels, logits)["success"]
+
+    assert torch.equal(success(1), success(1))
+    assert not torch.equal(success(1), success(2))
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10_000), greedy=st.booleans())
+def test_success_is_a_probability_that_grows_with_the_step_limit(seed: int, greedy: bool) -> None:
+    levels = random_levels(8, 5, 5, 0.3, seed)
+    logits = random_logits(8, 4, 5, 5, seed=seed)
+    limits = [0, 1, 2, 5, 10, 25, 60]
+    success = torch.stack(
+        [ExactEvaluator(limit, greedy=greedy)(levels, logits)["success"] for limit in limits]
+    )
+    assert (success[0] == 0).all() and (success <= 1 + 1e-6).all()
+    assert (success.diff(dim=0) >= -1e-6).all()
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000))
+def test_greedy_policies_agree_with_a_simulator(seed: int) -> None:
+    """Both evaluators and the path; equal logits, of which the first counts, are common here."""
+    levels = random_levels(6, 3, 4, 0.2, seed)
+    logits = random_logits(6, 4, 3, 4, seed=seed).round()
+    exact = ExactEvaluator(9, 0.25, greedy=True)(levels, logits)
+    played = RolloutEvaluator(9, 0.25, greedy=True)(levels, logits)
+    paths = policy_path(levels, logits, max_steps=9)
+    assert (paths.shape, paths.dtype) == ((6, 10, 2), torch.int64)
+    for i, level in enumerate(levels):
+        cell, path, rewards = tuple(level.start.tolist()), [level.start.tolist()], []
+        for _ in range(9):
+            scores = logits[i, :, cell[0], cell[1]].tolist()
+            one_step = Level(level.walls, torch.tensor(cell), level.goal, batch_size=[])
+            cell, reward, terminated, _ = next(play(one_step, [scores.index(max(scores))], 9, 0.25))
+            path.append(list(cell))
+            rewards.append(reward)
+            if terminated:
+                break
+        success = float(path[-1] == level.goal.tolist())
+        for result in (exact[i], played[i]):
+            assert result["success"].item() == pytest.approx(success)
+            assert result["return"].item() == pytest.approx(sum(rewards))
+        assert paths[i].tolist() == path + path[-1:] * (10 - len(path))
+
+
+def test_single_levels_are_evaluated_as_they_are_in_a_batch() -> None:
+    levels, logits = random_levels(3, 4, 4, 0.2, 0), random_logits(3, 4, 4, 4)
+    together = ExactEvaluator()(levels, logits)
+    for i in range(3):
+        alone = ExactEvaluator()(levels[i], logits[i])
+        assert alone.batch_size == ()
+        assert alone["return"].item() == pytest.approx(together["return"][i].item())
+        assert torch.equal(policy_path(levels[i], logits[i]), policy_path(levels, logits)[i])
+
+
+def test_logits_of_an_expanded_batch_are_left_as_they_were() -> None:
+    levels = random_levels(3, 4, 4, 0.2, 0).expand(5, 3)
+    logits = random_logits(5, 3, 4, 4, 4).requires_grad_()
+    before = logits.detach().clone()
+    assert not ExactEvaluator()(levels, logits)["return"].requires_grad
+    assert torch.equal(logits, before)
+
+
+def test_no_episodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        RolloutEvaluator(episodes=0)
+
+
+@given(
+    values=st.lists(st.floats(0, 1, width=32), min_size=1, max_size=12),
+    tenths=st.integers(1, 10),
+)
+def test_the_worst_mean_counts_the_last_value_in_part(values: list[float], tenths: int) -> None:
+    # Ten of every value make the part a whole number.
+    tenfold = sorted(values * 10)[: len(values) * tenths]
+    expected = sum(tenfold) / len(tenfold)
+    found = worst_mean(torch.tensor([values, values[::-1]]), tenths / 10)
+    assert found.tolist() == pytest.approx([expected] * 2, abs=1e-5)
+
+
+def test_the_worst_mean_of_one_row_is_that_of_the_row_in_a_batch() -> None:
+    values = torch.tensor([[0.5, 0.1, 0.9], [0.3, 0.2, 0.0]])
+    alone = torch.stack([worst_mean(row, 0.5) for row in values])
+    torch.testing.assert_close(alone, worst_mean(values, 0.5))

@@ -1,0 +1,117 @@
+"""The unchanged Proposer, collector and loss on a Solver whose best curriculum is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+import torch
+from torch import nn
+from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
+
+from proposer_rl.curricula import total_gain
+from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.meta.actions import Mixture, ProblemChoices
+from proposer_rl.models import (
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    normal,
+    proposer_actor_critic,
+)
+from proposer_rl.streams import Streams
+from tests.skill_ladder import best_constant, best_sequence, even, ladder_env
+
+SKILLS, UPDATES, COPIES, PROBLEMS = 3, 6, 16, 16
+
+
+def problem_choices(*, shuffled: bool = False) -> PPO:
+    """The paper's Proposer: every problem's choice is an action, a critic tells the advantage."""
+    env = ladder_env(
+        lambda generate: ProblemChoices(SKILLS, generate),
+        copies=COPIES,
+        problems=PROBLEMS,
+        shuffled=shuffled,
+        episode_length=UPDATES,
+    )
+    head = ProblemHead(33, PROBLEMS, SKILLS, hidden=32)
+    return _ppo(env, head, categorical, None)
+
+
+def mixtures(
+    *, idle: int = 0, updates_per_step: int = 1, shuffled: bool = False, **learning
+) -> PPO:
+    """Mixtures as actions; the other copies tell the advantage."""
+    choices = SKILLS + idle
+    env = ladder_env(
+        lambda generate: Mixture(torch.eye(choices), generate),
+        copies=COPIES,
+        problems=PROBLEMS,
+        shuffled=shuffled,
+        episode_length=UPDATES,
+        updates_per_step=updates_per_step,
+    )
+    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, CopiesBaseline(1.0), **learning)
+
+
+def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:
+    """Mixtures, and a loss that takes one gradient step on every rollout."""
+
+    def loss(actor, critic) -> LossModule:
+        return kind(actor, critic, functional=False, reduction="none")
+
+    return partial(mixtures, loss=loss, epochs=1, learning_rate=2e-2)
+
+
+def _ppo(env, head, distribution, advantage, *, loss=None, **numbers) -> PPO:
+    network = ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
+    agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
+    numbers = {"epochs": 8, "learning_rate": 3e-3, **numbers}
+    settings = PPOSettings(horizon=env.steps, gamma=1.0, **numbers)
+    return PPO(env, agent, settings, advantage=advantage, loss=loss)
+
+
+def learnt_gain(make: Callable[..., PPO], seed: int, cycles: int = 60, **options) -> float:
+    """Mean total gain of the last ten cycles, each from a beginner."""
+    streams = Streams(seed)
+    with streams.as_default("weights"):
+        proposer = make(**options)
+    beginner, gains = proposer.env.solvers.snapshot()[0], []
+    for cycle in range(cycles):
+        proposer.env.fork(beginner, streams.within(cycle))
+        generators = [streams.generator(cycle, "proposals", k) for k in range(COPIES)]
+        gains.append(total_gain(proposer.update(generators).rollout).mean())
+    return float(torch.stack(gains[-10:]).mean())
+
+
+def test_the_even_mixture_is_far_from_the_best() -> None:
+    assert even(SKILLS, UPDATES, SKILLS) < 0.2 * best_sequence(SKILLS, UPDATES)
+    assert even(SKILLS, UPDATES, 2 * SKILLS) < 0.2 * best_constant(SKILLS, UPDATES, PROBLEMS)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("make", [problem_choices, mixtures])
+def test_it_finds_the_best_curriculum(make: Callable[..., PPO], seed: int) -> None:
+    assert learnt_gain(make, seed) > 0.9 * best_sequence(SKILLS, UPDATES)
+
+
+@pytest.mark.parametrize("kind", [A2CLoss, ReinforceLoss])
+def test_it_finds_the_best_curriculum_by_another_loss(kind: type[LossModule]) -> None:
+    assert learnt_gain(other_loss(kind), 0, cycles=80) > 0.9 * best_sequence(SKILLS, UPDATES)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_it_finds_the_best_mixture_where_one_action_holds_for_an_episode(seed: int) -> None:
+    best = best_constant(SKILLS, UPDATES, PROBLEMS)
+    held = {"idle": SKILLS, "updates_per_step": UPDATES}
+    assert learnt_gain(mixtures, seed, cycles=160, **held) > 0.9 * best
+
+
+@pytest.mark.parametrize("make", [problem_choices, mixtures])
+def test_it_does_not_when_the_rewards_are_shuffled_between_copies(
+    make: Callable[..., PPO],
+) -> None:
+    assert learnt_gain(make, 0, shuffled=True) < 0.4 * best_sequence(SKILLS, UPDATES)

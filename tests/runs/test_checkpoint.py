@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import pickle
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from proposer_rl.runs.checkpoint import (
+    FORMAT,
+    CheckpointError,
+    load_checkpoint,
+    load_latest,
+    save_checkpoint,
+)
+from proposer_rl.runs.folder import StorageError
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_training_state_comes_back_and_goes_on(tmp_path: Path) -> None:
+    def step() -> torch.Tensor:
+        optimizer.zero_grad()
+        loss = net(torch.rand(3, 4)).square().mean()
+        loss.backward()
+        optimizer.step()
+        return loss.detach()
+
+    net = torch.nn.Linear(4, 2)
+    optimizer = torch.optim.Adam(net.parameters(), lr=0.1)
+    step()
+    state = {
+        "net": net.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": torch.get_rng_state(),
+        "lengths": {"metrics.csv": 3},
+        "misc": [1, 0.1, True, None, "text", ("a", float("inf"))],
+    }
+    save_checkpoint(tmp_path, 7, state)
+    expected = [step() for _ in range(3)]
+
+    loaded = load_latest(tmp_path)
+    assert loaded is not None
+    number, state = loaded
+    assert number == 7
+    assert state["misc"] == [1, 0.1, True, None, "text", ("a", float("inf"))]
+    assert state["lengths"] == {"metrics.csv": 3}
+    net.load_state_dict(state["net"])
+    optimizer.load_state_dict(state["optimizer"])
+    torch.set_rng_state(state["rng"])
+    assert [step() for _ in range(3)] == expected
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.int64, torch.bool])
+def test_tensors_keep_bits_dtype_and_layout(tmp_path: Path, dtype: torch.dtype) -> None:
+    tensor = torch.randn(2, 3, 4, 4).to(dtype).to(memory_format=torch.channels_last)
+    _, state = load_checkpoint(save_checkpoint(tmp_path, 0, {"x": tensor}))
+    assert state["x"].dtype == dtype
+    assert state["x"].stride() == tensor.stride()
+    assert torch.equal(state["x"], tensor)
+
+
+def test_a_view_does_not_drag_its_whole_memory_along(tmp_path: Path) -> None:
+    stacked = torch.nn.Parameter(torch.zeros(1000, 1000))
+    path = save_checkpoint(tmp_path, 0, {"one": stacked[0]})
+    assert path.stat().st_size < 10_000
+    assert not load_checkpoint(path)[1]["one"].requires_grad
+
+
+def test_plain_torch_can_read_what_follows_the_two_lines(tmp_path: Path) -> None:
+    with open(save_checkpoint(tmp_path, 5, {"x": 1.5}), "rb") as file:
+        digest = file.readline().strip().decode()
+        assert digest == hashlib.sha256(file.read()).hexdigest()
+        file.seek(len(digest) + 1)
+        assert json.loads(file.readline()) == {"format": FORMAT, "step": 5}
+        assert torch.load(file, weights_only=True) == {"x": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("value", "where"),
+    [
+        ({"a": [object()]}, r"state\['a'\]\[0\] is a object"),
+        ({"a": np.float64(1)}, r"state\['a'\] is a float64"),
+        ({"a": {np.int64(1): 2}}, r"a key of state\['a'\] is a int64"),
+        ({"a": Path("x")}, r"state\['a'\] is a PosixPath"),
+    ],
+)
+def test_refuses_to_save_what_could_not_be_loaded(
+    tmp_path: Path, value: dict[str, object], where: str
+) -> None:
+    with pytest.raises(CheckpointError, match=where):
+        save_checkpoint(tmp_path, 1, value)
+    assert _names(tmp_path) == []
+
+
+def test_keeps_the_newest(tmp_path: Path) -> None:
+    folder = tmp_path / "run" / "checkpoints"
+    for step in (
+        1,
+        2,
+        10,
+        1_000_000_000,
+    ):  # the last one has more digits than the name is padded to
+        save_checkpoint(folder, step, {"step": step}, keep=2)
+    assert _names(folder) == ["step_000000010.pt", "step_1000000000.pt"]
+    assert load_latest(folder) == (1_000_000_000, {"step": 1_000_000_000})
+
+
+def test_the_same_step_is_replaced(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, {"x": 1})
+    save_checkpoint(tmp_path, 1, {"x": 2})
+    assert load_latest(tmp_path) == (1, {"x": 2})
+
+
+@pytest.mark.parametrize(("step", "keep"), [(-1, 1), (0, 0)])
+def test_refuses_step_and_keep(tmp_path: Path, step: int, keep: int) -> None:
+    with pytest.raises(CheckpointError, match="at least"):
+        save_checkpoint(tmp_path, step, {}, keep)
+
+
+def test_nothing_to_load(tmp_path: Path) -> None:
+    (tmp_path / "step_x.pt").touch()
+    assert load_latest(tmp_path) is None
+    assert load_latest(tmp_path / "missing") is None
+    with pytest.raises(StorageError, match=r"cannot read .*none\.pt: No such file"):
+        load_checkpoint(tmp_path / "none.pt")
+
+
+def _damage(path: Path, how: str) -> None:
+    content = bytearray(path.read_bytes())
+    if how == "empty":
+        content.clear()
+    elif how == "truncated":
+        del content[-1]
+    elif how == "half":
+        del content[len(content) // 2 :]
+    elif how == "longer":
+        content += b"\0"
+    elif how == "foreign":
+        content[:] = b"something else\n"
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("how", ["empty", "truncated", "half", "longer", "foreign"])
+def test_falls_back_to_the_one_before(
+    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    save_checkpoint(tmp_path, 1, {"x": 1})
+    _damage(save_checkpoint(tmp_path, 2, {"x": 2}), how)
+    with caplog.at_level(logging.WARNING):
+        assert load_latest(tmp_path) == (1, {"x": 1})
+    assert len(caplog.messages) == 1
+    assert "step_000000002.pt is damaged" in caplog.messages[0]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_flipped_bit_is_found(tmp_path: Path, data: st.DataObject) -> None:
+    path = save_checkpoint(tmp_path, 1, {"x": torch.arange(4.0)})
+    content = bytearray(path.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="is damaged"):
+        load_checkpoint(path)
+
+
+def test_all_damaged_is_an_error_and_not_a_fresh_start(tmp_path: Path) -> None:
+    for step in (1, 2):
+        save_checkpoint(tmp_path, step, {})
+    for path in tmp_path.iterdir():
+        _damage(path, "half")
+    with pytest.raises(CheckpointError, match="none of the 2 checkpoints"):
+        load_latest(tmp_path)
+
+
+def test_a_run_goes_on_past_a_damaged_checkpoint(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 10, {})
+    _damage(save_checkpoint(tmp_path, 20, {}), "half")
+    save_checkpoint(tmp_path, 15, {"x": 1}, keep=1)
+    assert _names(tmp_path) == ["step_000000015.pt"]
+
+
+def test_does_not_write_into_the_folder_of_a_run_that_is_further(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 20, {})
+    with pytest.raises(CheckpointError, match=r"step_000000020\.pt is later than step 10"):
+        save_checkpoint(tmp_path, 10, {})
+    assert _names(tmp_path) == ["step_000000020.pt"]
+
+
+def _envelope(header: object, payload: bytes) -> bytes:
+    body = json.dumps(header).encode() + b"\n" + payload
+    return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+@pytest.mark.parametrize(("step", "age"), [(1, "a newer"), (-1, "an older")])
+def test_another_format_is_named(tmp_path: Path, step: int, age: str) -> None:
+    save_checkpoint(tmp_path, 1, {})
+    other = _envelope({"format": FORMAT + step, "step": 2}, b"whatever")
+    (tmp_path / "step_000000002.pt").write_bytes(other)
+    message = f"has format {FORMAT + step}.*reads only format {FORMAT}: go on with {age} version"
+    with pytest.raises(CheckpointError, match=message):
+        load_latest(tmp_path)
+
+
+def test_a_foreign_header_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "step_000000002.pt"
+    path.write_bytes(_envelope(["format"], b""))
+    with pytest.raises(CheckpointError, match="is not a checkpoint of proposer_rl"):
+        load_checkpoint(path)
+
+
+class _Malicious:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("saver", ["torch", "pickle"])
+def test_code_in_a_checkpoint_is_not_run(tmp_path: Path, saver: str) -> None:
+    target, payload = tmp_path / "executed", tmp_path / "payload"
+    if saver == "torch":
+        torch.save({"x": _Malicious(target)}, payload)
+    else:
+        payload.write_bytes(pickle.dumps(_Malicious(target)))
+    content = _envelope({"format": FORMAT, "step": 2}, payload.read_bytes())
+    path = tmp_path / "step_000000002.pt"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"refused by torch\.load") as caught:
+        load_latest(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not target.exists()
+
+
+def test_a_crash_before_the_rename_costs_nothing(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, {"x": 1})
+    _run(
+        f"""
+        import os
+        from proposer_rl.runs.checkpoint import save_checkpoint
+        os.replace = lambda *_: os._exit(9)
+        save_checkpoint({str(tmp_path)!r}, 2, {{"x": 2}})
+        """,
+        status=9,
+    )
+    assert _names(tmp_path) == [".step_000000002.pt.tmp", "step_000000001.pt"]
+    assert load_latest(tmp_path) == (1, {"x": 1})
+    save_checkpoint(tmp_path, 3, {"x": 3})
+    assert _names(tmp_path) == ["step_000000001.pt", "step_000000003.pt"]
+
+
+def test_a_full_disk_leaves_the_one_before(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, {"x": 1})
+    output = _run(
+        f"""
+        import resource, torch
+        from proposer_rl.runs.checkpoint import save_checkpoint
+        from proposer_rl.runs.folder import StorageError
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        try:
+            save_checkpoint({str(tmp_path)!r}, 2, {{"x": torch.zeros(10_000)}}, keep=1)
+        except StorageError as error:
+            print(error)
+        """
+    )
+    assert output.startswith(f"cannot write {tmp_path / 'step_000000002.pt'}: File too large")
+    assert _names(tmp_path) == ["step_000000001.pt"]
+    assert load_latest(tmp_path) == (1, {"x": 1})
+
+
+def _run(source: str, status: int = 0) -> str:
+    root = str(Path(__file__).resolve().parents[1])
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(source)],
+        env=os.environ | {"PYTHONPATH": root},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == status, result.stderr
+    return result.stdout

@@ -1,0 +1,244 @@
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from proposer_rl.runs import folder as run_folder
+from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl, write_atomically
+
+TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\n\r"), max_size=12)
+CELLS = st.one_of(st.floats(), st.integers())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return RunFolder(tmp_path / "a" / "run")
+
+
+def _bits(value: object) -> object:
+    """Tells apart what == does not: 1 and 1.0, 0.0 and -0.0; and equates nan with nan."""
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else struct.pack("<d", value)
+    return type(value), value
+
+
+@given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=5))
+def test_csv_reads_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[object, ...]]
+) -> None:
+    folder = RunFolder(tmp_path_factory.mktemp("run"))
+    for row in rows:
+        folder.append("metrics.csv", dict(zip("abc", row, strict=True)))
+    read = read_csv(folder.path / "metrics.csv")
+    assert [[_bits(cell) for cell in row.values()] for row in read] == [
+        [_bits(cell) for cell in row] for row in rows
+    ]
+
+
+@given(st.lists(st.dictionaries(TEXT, st.lists(st.floats(allow_nan=False))), min_size=1))
+def test_jsonl_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[dict[str, list[float]]]
+) -> None:
+    folder = RunFolder(tmp_path_factory.mktemp("run"))
+    for row in rows:
+        folder.append("proposer.jsonl", row)
+    assert read_jsonl(folder.path / "proposer.jsonl") == rows
+
+
+def test_csv_is_what_other_programs_read(folder: RunFolder) -> None:
+    folder.append("metrics.csv", {"update": 1, "success/id": 0.1})
+    folder.append("metrics.csv", {"success/id": math.nan, "update": 2})
+    assert (folder.path / "metrics.csv").read_text() == "update,success/id\n1,0.1\n2,nan\n"
+
+
+def test_float64_of_numpy_is_a_float(folder: RunFolder) -> None:
+    folder.append("metrics.csv", {"x": np.float64(0.1)})
+    assert read_csv(folder.path / "metrics.csv") == [{"x": 0.1}]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"update": 2}, r"missing \['loss'\], unknown \[\]"),
+        ({"update": 2, "loss": 0.1, "extra": 1}, r"missing \[\], unknown \['extra'\]"),
+        ({"update": 2, "loss": None}, "'loss' takes int or float, not None"),
+        ({"update": 2, "loss": np.float32(1)}, r"\(float32\)"),
+        ({"update": True, "loss": 1.0}, r"\(bool\)"),
+        ({"update": 2, "loss": "0.5"}, r"\(str\)"),
+    ],
+)
+def test_refuses_a_row_and_leaves_the_table(
+    folder: RunFolder, row: dict[str, object], message: str
+) -> None:
+    folder.append("metrics.csv", {"update": 1, "loss": 0.5})
+    with pytest.raises(ValueError, match=message):
+        folder.append("metrics.csv", row)
+    assert read_csv(folder.path / "metrics.csv") == [{"update": 1, "loss": 0.5}]
+
+
+@pytest.mark.parametrize("row", [{}, {"a,b": 1}, {'"a"': 1}, {"": 1}])
+def test_refuses_a_header_and_makes_no_table(folder: RunFolder, row: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"metrics\.csv"):
+        folder.append("metrics.csv", row)
+    assert folder.lengths() == {}
+
+
+@pytest.mark.parametrize("name", ["metrics", "../metrics.csv", "sub/metrics.csv", "x.json"])
+def test_refuses_a_name(folder: RunFolder, name: str) -> None:
+    with pytest.raises(ValueError, match="a table is a file name"):
+        folder.append(name, {"a": 1})
+
+
+def test_refuses_what_json_cannot_hold(folder: RunFolder) -> None:
+    with pytest.raises(ValueError, match=r"p\.jsonl: .*not JSON serializable"):
+        folder.append("p.jsonl", {"a": {1, 2}})
+    with pytest.raises(ValueError, match=r"s\.json: .*not JSON serializable"):
+        folder.write_json("s.json", {"a": object()})
+    assert list(folder.path.iterdir()) == []
+
+
+def _filled(folder: RunFolder, rows: int) -> None:
+    for i in range(rows):
+        folder.append("metrics.csv", {"update": i, "loss": i / 7})
+        folder.append("proposer.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
+
+
+def test_a_resumed_run_looks_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    straight, resumed = RunFolder(tmp_path / "straight"), RunFolder(tmp_path / "resumed")
+    _filled(straight, 5)
+    _filled(resumed, 3)
+    lengths = resumed.lengths()
+    assert lengths == {"metrics.csv": 3, "proposer.jsonl": 3}
+    resumed.append("metrics.csv", {"update": 3, "loss": 9.0})
+    resumed.append("late.csv", {"a": 1})
+    resumed.cut_back(json.loads(json.dumps(lengths)))
+
+    assert resumed.lengths() == lengths
+    for i in (3, 4):
+        resumed.append("metrics.csv", {"update": i, "loss": i / 7})
+        resumed.append("proposer.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
+    assert _contents(resumed) == _contents(straight)
+
+
+def _contents(folder: RunFolder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.path.iterdir()}
+
+
+@given(rows=st.integers(1, 4), torn=st.integers(0, 200))
+def test_after_a_crash_at_any_byte(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, torn: int
+) -> None:
+    folder = RunFolder(tmp_path_factory.mktemp("run"))
+    _filled(folder, rows)
+    whole = _contents(folder)
+    lengths = folder.lengths()
+    _filled(folder, 3)
+    for name, content in _contents(folder).items():
+        (folder.path / name).write_bytes(content[: len(whole[name]) + torn])
+    folder.cut_back(lengths)
+    assert _contents(folder) == whole
+
+
+@pytest.mark.parametrize(("name", "read"), [("t.csv", read_csv), ("t.jsonl", read_jsonl)])
+def test_half_a_row_is_not_read_nor_added_to(folder: RunFolder, name: str, read: object) -> None:
+    assert callable(read)
+    folder.append(name, {"a": 1})
+    with open(folder.path / name, "ab") as file:
+        file.write(b"2")
+    assert read(folder.path / name) == [{"a": 1}]
+    assert folder.lengths() == {name: 1}
+    with pytest.raises(ValueError, match="ends in the middle of a row"):
+        folder.append(name, {"a": 2})
+    folder.cut_back({name: 1})
+    folder.append(name, {"a": 2})
+    assert read(folder.path / name) == [{"a": 1}, {"a": 2}]
+
+
+def test_half_a_header_is_no_row(folder: RunFolder) -> None:
+    (folder.path / "t.csv").write_text("upd")
+    assert folder.lengths() == {"t.csv": 0}
+    assert read_csv(folder.path / "t.csv") == []
+    folder.cut_back({"t.csv": 0})
+    assert folder.lengths() == {}
+
+
+def test_cut_back_checks_all_before_it_changes_anything(folder: RunFolder) -> None:
+    _filled(folder, 3)
+    before = _contents(folder)
+    with pytest.raises(ValueError, match=r"proposer\.jsonl has 3 rows, fewer than the 4"):
+        folder.cut_back({"metrics.csv": 1, "proposer.jsonl": 4})
+    with pytest.raises(ValueError, match=r"gone\.csv has 0 rows"):
+        folder.cut_back({"gone.csv": 1})
+    assert _contents(folder) == before
+
+
+def test_cut_back_leaves_other_files_alone(folder: RunFolder) -> None:
+    _filled(folder, 1)
+    folder.write_json("summary.json", {"seconds": 1.5})
+    (folder.path / "checkpoints").mkdir()
+    folder.cut_back({})
+    assert sorted(path.name for path in folder.path.iterdir()) == ["checkpoints", "summary.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("a,b\n1\n", "line 2: 1 cells under 2 columns"),
+        ("a,b\n1,2\n1,2,3\n", "line 3: 3 cells under 2 columns"),
+        ("a\nx\n", "line 2: 'x' is not a number"),
+        ("a\n\n", "line 2: '' is not a number"),
+    ],
+)
+def test_read_csv_names_the_line(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [('{"a": 1}\n{"a"\n', "line 2: not JSON"), ("[1]\n", "line 1: not a JSON object")],
+)
+def test_read_jsonl_names_the_line(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "t.jsonl"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_jsonl(path)
+
+
+def test_reading_no_table(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no table"):
+        read_csv(tmp_path / "t.csv")
+    with pytest.raises(FileNotFoundError, match="there is no table"):
+        read_jsonl(tmp_path / "t.jsonl")
+
+
+def test_write_json_replaces(folder: RunFolder) -> None:
+    folder.write_json("summary.json", {"a": [1, 0.1]})
+    folder.write_json("summary.json", {"b": None})
+    assert json.loads((folder.path / "summary.json").read_text()) == {"b": None}
+    assert [path.name for path in folder.path.iterdir()] == ["summary.json"]
+
+
+def test_an_error_leaves_the_old_file_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x"
+    write_atomically(path, b"old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run_folder.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,83 @@
+"""Handlers of stop signals; runs that get them are in test_reliability.py."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from proposer_rl.runs.signals import STOP_SIGNALS, Interrupted, StopSignals
+
+
+def send(signum: int) -> None:
+    os.kill(os.getpid(), signum)
+
+
+@pytest.fixture(autouse=True)
+def _as_before():
+    before = {signum: signal.getsignal(signum) for signum in STOP_SIGNALS}
+    yield
+    assert {signum: signal.getsignal(signum) for signum in STOP_SIGNALS} == before
+
+
+@pytest.mark.parametrize("signum", STOP_SIGNALS)
+def test_a_signal_is_kept_until_it_is_delivered(signum: int, capfd) -> None:
+    with StopSignals() as signals:
+        signals.deliver()
+        assert not signals.pending
+        send(signum)
+        assert signals.pending
+        assert f"{signum.name}: saving at the next safe point" in capfd.readouterr().err
+        with pytest.raises(Interrupted, match=f"stopped by {signum.name}") as caught:
+            signals.deliver()
+        assert caught.value.signum == signum
+        assert not signals.pending
+
+
+def test_a_second_sigint_is_not_kept() -> None:
+    with StopSignals() as signals:
+        send(signal.SIGTERM)
+        send(signal.SIGTERM)
+        send(signal.SIGINT)
+        assert signals.pending
+        with pytest.raises(KeyboardInterrupt):
+            send(signal.SIGINT)
+
+
+def test_a_handler_from_before_acts_after_the_checkpoint_and_may_let_the_run_go_on() -> None:
+    """As submitit's does: it queues the job again and exits, or ignores SIGTERM."""
+    acted = []
+    before = signal.signal(signal.SIGUSR2, lambda signum, _: acted.append(signum))
+    try:
+        with StopSignals() as signals:
+            send(signal.SIGUSR2)
+            assert signals.pending and acted == []
+            signals.deliver()
+            assert not signals.pending and acted == [signal.SIGUSR2]
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignals() as signals:
+            send(signal.SIGHUP)
+            assert not signals.pending
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_other_threads_change_nothing() -> None:
+    handlers = []
+
+    def enter() -> None:
+        with StopSignals():
+            handlers.append([signal.getsignal(signum) for signum in STOP_SIGNALS])
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert handlers == [[signal.getsignal(signum) for signum in STOP_SIGNALS]]
