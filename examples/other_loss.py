@@ -1,8 +1,8 @@
 """The Proposer trained with other losses of TorchRL's: A2CLoss and ReinforceLoss.
 
-``PPO`` takes a factory of the loss, called with actor and critic. These two hold only for the
+A method takes a factory of the loss, called with actor and critic. These two hold only for the
 policy that collected the rollout, so each gets one gradient step on it, and a larger one than
-PPO's. All else is as in own_environment.py, also the advantages against the other copies.
+PPO's. All else is as with PPO, also the advantages against the other copies.
 
     python examples/other_loss.py [cycles]
 
@@ -17,11 +17,15 @@ from __future__ import annotations
 import sys
 
 import torch
-from own_environment import COPIES, proposer, solvers
+from mountain_car import MountainCarTask
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.objectives import A2CLoss, ReinforceLoss
 
-from proposer_rl import PPOSettings, Streams
+from proposer_rl import Place, PPOSettings, SolverSettings, Streams, performance_gain
+from proposer_rl.methods import Parts, proposer
+from proposer_rl.settings import LearningSettings, ProposerSettings
+
+UPDATES = 20
 
 
 def a2c(actor: TensorDictModuleBase, critic: TensorDictModule) -> A2CLoss:
@@ -37,15 +41,26 @@ def reinforce(actor: TensorDictModuleBase, critic: TensorDictModule) -> Reinforc
 
 
 def main(cycles: int = 20) -> None:
-    """Train a Proposer for mountain cars with each."""
+    """Train a Proposer for mountain cars with each; every cycle begins with a fresh Solver."""
     torch.set_num_threads(1)
-    numbers = PPOSettings(horizon=2, epochs=1, gamma=1.0, learning_rate=0.02)
+    ppo = PPOSettings(horizon=40, learning_rate=4e-3)
+    task = MountainCarTask(
+        levels=64, solver=SolverSettings(batch_size=16, ppo=ppo), place=Place()
+    )
+    settings = ProposerSettings(
+        meta_episode_length=UPDATES,
+        action_repeat=UPDATES // 2,
+        validation_levels=64,
+        context=32,
+        hidden=32,
+        ppo=LearningSettings(epochs=1, gamma=1.0, learning_rate=0.02),
+    )
     for loss in (a2c, reinforce):
-        curriculum = proposer(Streams(0), numbers, loss)
+        curriculum = proposer(Parts(task, settings, seeds=[0]), performance_gain, loss)
         for cycle in range(cycles):
             stream = Streams(0, cycle)
-            outcome = curriculum.improve(solvers(1, stream), [stream]).metrics
-            gain = sum(outcome["total_gain"]) / COPIES
+            outcome = curriculum.improve(task.learner([stream]), 0, [stream]).metrics
+            gain = sum(outcome["return_gain"]) / len(outcome["return_gain"])
             print(f"{loss.__name__}, cycle {cycle}: mean gain of the copies {gain:.2f}")
 
 

@@ -19,11 +19,11 @@ from typing import Any
 
 import torch
 from small_mazes import report, small_task, train
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
-from proposer_rl import PPO, Curriculum, SamplingCurriculum, Streams
+from proposer_rl import PPO, Curriculum, Proposal, SamplingCurriculum, Streams
+from proposer_rl.learning import Update, first_episode_success
 from proposer_rl.mazes import Level
-from proposer_rl.meta.rewards import first_episode_success
 from proposer_rl.methods import Parts
 
 
@@ -46,20 +46,21 @@ class Again(Curriculum):
         """A fresh Solver has not failed on anything."""
         self._last: dict[str, Any] = {}
 
-    def propose(self, solver: PPO, streams: Sequence[Streams]) -> Level:
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
         """Levels [K, P]; copy k's draws come from its own streams."""
-        levels = self._fresh.propose(solver, streams)
+        proposal = self._fresh.propose(learner, updates, streams)
+        levels = proposal.levels
         if not self._last:
-            return levels
+            return proposal
         problems = levels.batch_size[1]
         draws = torch.stack([torch.rand(problems, generator=s.generator("again")) for s in streams])
         again = self._last["failed"] & (draws < self._probability).to(self._last["failed"].device)
         last = TensorDict(self._last["levels"], levels.batch_size)
-        return Level.from_tensordict(last).where(again, levels)
+        return proposal._replace(levels=Level.from_tensordict(last).where(again, levels))
 
-    def observe(self, levels: Level, rollout: TensorDictBase) -> None:
+    def observe(self, learner: PPO, levels: Level, update: Update) -> None:
         """Remember the levels and on which of them the first episode failed."""
-        failed = ~first_episode_success(rollout)
+        failed = ~first_episode_success(update.rollout)
         self._last = {"levels": levels.to_tensordict().to_dict(), "failed": failed}
 
     def state_dict(self) -> dict[str, Any]:
@@ -73,13 +74,13 @@ class Again(Curriculum):
 
 def again(parts: Parts, probability: float) -> Curriculum:
     """The factory that the configuration names: from a run's parts to its curriculum."""
-    return Again(SamplingCurriculum(parts.task.sample_target), probability)
+    return Again(SamplingCurriculum(parts.task.target), probability)
 
 
 def main(updates: int = 60) -> None:
     """Train a Solver on the target, half of the failed levels once more."""
     task = small_task()
-    report(train(task, Again(SamplingCurriculum(task.sample_target), 0.5), updates))
+    report(train(task, Again(SamplingCurriculum(task.target), 0.5), updates))
 
 
 if __name__ == "__main__":

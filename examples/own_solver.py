@@ -50,11 +50,11 @@ class Iterated(nn.Module):
 def main(updates: int = 100) -> None:
     """Train it on 5x5 mazes, and measure it on 8x8 ones."""
     task = small_task(Iterated)
-    solver = task.solvers([Streams(0, "solver")])
-    report(train(task, SamplingCurriculum(task.sample_target), updates, solver))
+    learner = task.learner([Streams(0, "solver")])
+    report(train(task, SamplingCurriculum(task.target), updates, learner))
     levels = generate_levels([0.2] * 128, 4, 8, 8, generator=Streams(1).generator())
     larger = levels.unsqueeze(0)
-    outcome = ExactEvaluator(max_steps=10)(larger, cell_logits(solver.agent, planes(larger)))
+    outcome = ExactEvaluator(max_steps=10)(larger, cell_logits(learner.agent, planes(larger)))
     print(f"on 8x8 mazes: success {outcome['success'].mean():.3f}")
 
 

@@ -9,16 +9,26 @@ from typing import Any
 
 from torch import nn
 
-from proposer_rl import PPO, Curriculum, Experiment, MazeTask, PPOSettings, Schedule, Streams
-from proposer_rl.mazes.task import (
+from proposer_rl import (
+    PPO,
+    Curriculum,
+    Experiment,
+    Place,
+    PPOSettings,
+    Schedule,
+    SolverSettings,
+    Streams,
+)
+from proposer_rl.mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
-    SolverSettings,
+    NetworkSettings,
     SpaceSettings,
 )
-from proposer_rl.methods import ProposerSettings
+from proposer_rl.mazes.task import MazeTask
 from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.settings import LearningSettings, ProposerSettings
 
 CYCLE = 10  # updates between two improvements of a curriculum
 
@@ -31,9 +41,12 @@ def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
         distributions={"id": DistributionSettings(specifications=[(0.2, 4)])},
         target="id",
         space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4], path_lengths=[1, 2, 4, 6]),
-        solver=SolverSettings(channels=[16, 32], problems=32, ppo=ppo),
+        network=NetworkSettings(channels=[16, 32]),
+        encoder_channels=[8, 16],
         evaluation=EvaluationSettings(distributions=["id"], levels=128),
-        network=network,
+        solver=SolverSettings(batch_size=32, ppo=ppo),
+        place=Place(),
+        make_network=network,
     )
 
 
@@ -41,29 +54,26 @@ def proposer_settings() -> ProposerSettings:
     """A Proposer that learns from four copies of the Solver, trained for a cycle."""
     return ProposerSettings(
         rollouts=4,
-        lookahead=CYCLE,
-        updates_per_step=CYCLE,
+        meta_episode_length=CYCLE,
+        action_repeat=CYCLE,
         validation_levels=64,
         probe_levels=4,
-        channels=[8, 16],
-        ppo=PPOSettings(horizon=CYCLE, gamma=1.0, learning_rate=1e-3),
+        ppo=LearningSettings(gamma=1.0, learning_rate=1e-3),
     )
 
 
 def train(
-    task: MazeTask, curriculum: Curriculum, updates: int, solver: PPO | None = None
+    task: MazeTask, curriculum: Curriculum, updates: int, learner: PPO | None = None
 ) -> list[dict[str, Any]]:
     """Train a Solver, a fresh one unless given; a row of measurements for every ten updates."""
     with TemporaryDirectory() as folder:
         experiment = Experiment(
-            solver or task.solvers([Streams(0, "solver")]),
+            task,
+            learner or task.learner([Streams(0, "solver")]),
             curriculum,
             schedule=Schedule(updates=updates, cycle_length=CYCLE, evaluate_every=CYCLE),
             seeds=[0],
             folder=RunFolder(Path(folder)),
-            evaluate=task.measure,
-            statistics=task.statistics,
-            records=task.records,
             progress=False,
         )
         experiment.run()

@@ -6,99 +6,70 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from proposer_rl.curricula import Curriculum
-from proposer_rl.learning.divergence import located
-from proposer_rl.learning.ppo import PPO, Update
-from proposer_rl.models import ActorCritic
+from proposer_rl.learning import PPO, Update, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.runs.signals import StopSignals
-from proposer_rl.settings import settings
+from proposer_rl.runs.signals import StopRequested, StopSignals
+from proposer_rl.settings import Schedule
 from proposer_rl.streams import Streams
+from proposer_rl.task import Task
 
-Evaluate = Callable[[ActorCritic], TensorDictBase]
-Statistics = Callable[[Any, TensorDictBase], TensorDictBase]
-Records = Callable[[Any, TensorDictBase], list[list[dict[str, Any]]]]
 Log = Callable[[str, Mapping[str, Any], int], None]
 
-
-@settings
-class Schedule:
-    """How long a run is, and what happens how often; all in Solver updates.
-
-    Attributes:
-        updates: length of the run.
-        cycle_length: updates between two improvements of the curriculum.
-        evaluate_every: updates between two rows of metrics.
-        checkpoint_every: updates between two checkpoints; one more follows every improvement.
-        checkpoint_seconds: time after which a checkpoint is due, also in the middle of an
-            improvement; None for no such limit.
-        keep_checkpoints: how many of the newest checkpoints stay.
-        headline: the measurement that the run is summed up by.
-        threshold: sample efficiency is the first update at which the headline reaches this.
-    """
-
-    updates: Annotated[int, Ge(1)] = 750
-    cycle_length: Annotated[int, Ge(1)] = 50
-    evaluate_every: Annotated[int, Ge(1)] = 10
-    checkpoint_every: Annotated[int, Ge(1)] = 50
-    checkpoint_seconds: Annotated[float, Gt(0)] | None = 600.0
-    keep_checkpoints: Annotated[int, Ge(1)] = 2
-    headline: str = "id_success"
-    threshold: Annotated[float, Interval(gt=0, le=1)] = 0.8
+RECORDED_LEVELS = 8
 
 
 class Experiment:
     """The loop over cycles of improving the curriculum and training the Solver on it.
 
     Args:
-        solver: a population of K Solvers, one per seed.
+        task: which measures and records.
+        learner: PPO of a population of K Solvers, one per seed.
         curriculum: what they train on.
         schedule: lengths and intervals.
         seeds: the K seeds; every draw of copy k is a function of the k-th.
         folder: where the files go; a checkpoint in it is resumed.
-        evaluate: measurements of the Solvers, each [K].
-        statistics: of levels [K, P] and the rollout on them, each [K].
-        records: of levels and the rollout on them: for each copy a list for JSON.
         log: receives each row of the first copy: its table, its values and its update.
         progress: whether to draw a progress bar.
-        signals: which may ask the run to stop; None where nothing does.
+        signals: which may ask the run to stop; None where nothing does. A curriculum whose
+            improvement takes long lets them interrupt it: see :meth:`StopSignals.check`.
         scope: put before the address of every random draw; tells several lives of one seed apart.
+
+    Raises:
+        ValueError: if the headline is none of the task's measurements.
     """
 
     def __init__(
         self,
-        solver: PPO,
+        task: Task,
+        learner: PPO,
         curriculum: Curriculum,
         *,
         schedule: Schedule,
         seeds: Sequence[int],
         folder: RunFolder,
-        evaluate: Evaluate,
-        statistics: Statistics,
-        records: Records,
         log: Log | None = None,
         progress: bool = True,
         signals: StopSignals | None = None,
         scope: Sequence[str | int] = (),
     ) -> None:
-        self.solver = solver
+        check_headline(task, schedule)
+        self.task = task
+        self.learner = learner
         self.curriculum = curriculum
         self.schedule = schedule
         self.seeds = list(seeds)
         self.folder = folder
         self.updates = 0
         self.cycles = 0
-        self.meta_frames = 0
-        self._evaluate = evaluate
-        self._statistics = statistics
-        self._records = records
+        self.curriculum_frames = 0
+        self.evaluations = 0
         self._log = log
         self._progress = progress
         self._signals = signals or StopSignals()
@@ -116,8 +87,22 @@ class Experiment:
     @property
     def frames(self) -> int:
         """Environment steps of one Solver's own training."""
-        problems = self.solver.env.batch_size[1:].numel()
-        return self.updates * problems * self.solver.settings.horizon
+        return self.updates * self.task.batch_size * self.learner.settings.horizon
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """What each Solver has cost so far.
+
+        ``frames``: environment steps of its own training; ``curriculum_frames`` and
+        ``evaluations``: steps, and evaluations of a policy on a level, that the curriculum asked
+        for; ``seconds`` of the process.
+        """
+        return {
+            "frames": self.frames,
+            "curriculum_frames": self.curriculum_frames,
+            "evaluations": self.evaluations,
+            "seconds": round(self.seconds, 3),
+        }
 
     def run(self) -> dict[str, Any]:
         """Train to the end of the schedule, from the folder's newest checkpoint if it has one.
@@ -173,9 +158,7 @@ class Experiment:
         }
         return {
             "updates": self.updates,
-            "frames": self.frames,
-            "meta_frames": self.meta_frames,
-            "seconds": self.seconds,
+            **self.costs,
             "headline": headline,
             "threshold": threshold,
             # null: censored, the threshold was not reached within ``updates``
@@ -185,12 +168,23 @@ class Experiment:
 
     def _improve(self) -> None:
         streams = self._streams("cycle", self.cycles)
-        outcome = self.curriculum.improve(self.solver, streams, self._pause)
-        self.meta_frames += outcome.meta_frames
+        while True:
+            before = self._state()
+            try:
+                outcome = self.curriculum.improve(self.learner, self.updates, streams)
+                break
+            except StopRequested:
+                self._save(before)
+                self._signals.deliver()
+                # A handler has returned, so the run goes on.
+                self._restore(before)
+        self.curriculum_frames += outcome.frames
+        self.evaluations += outcome.evaluations
         if outcome.metrics:
-            place = {"cycle": self.cycles, "updates": self.updates, "meta_frames": self.meta_frames}
-            self.folder.append("proposer.jsonl", {**place, **outcome.metrics})
-            self._tell("proposer", outcome.metrics)
+            costs = {k: self.costs[k] for k in ("curriculum_frames", "evaluations")}
+            place = {"cycle": self.cycles, "updates": self.updates, **costs}
+            self.folder.append("cycles.jsonl", {**place, **outcome.metrics})
+            self._tell("cycles", outcome.metrics)
         self.cycles += 1
         if outcome.advance is not None:
             self.updates = min(self.updates + outcome.advance.updates, self.schedule.updates)
@@ -201,14 +195,16 @@ class Experiment:
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
-        levels = self.curriculum.propose(self.solver, streams)
-        self.solver.env.set_levels(levels)
-        device = self.solver.env.device
-        update = self.solver.update(
+        levels, frames, evaluations = self.curriculum.propose(self.learner, self.updates, streams)
+        self.curriculum_frames += frames
+        self.evaluations += evaluations
+        self.learner.env.set_levels(levels)
+        device = self.learner.env.device
+        update = self.learner.update(
             [stream.generator("actions", device=device) for stream in streams]
         )
-        self.solver.check()
-        self.curriculum.observe(levels, update.rollout)
+        self.learner.check()
+        self.curriculum.observe(self.learner, levels, update)
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
@@ -218,26 +214,23 @@ class Experiment:
 
     def _measure(self) -> None:
         """Append a row of measurements for every copy."""
-        measured = self._evaluate(self.solver.agent)
-        cost = {
-            "frames": self.frames,
-            "meta_frames": self.meta_frames,
-            "seconds": round(self.seconds, 3),
-        }
+        measured = self.task.measure(self.learner.agent)
         self._headline = measured[self.schedule.headline].tolist()
         for seed, values in self._per_copy(measured):
-            self._append("metrics.csv", seed, {**cost, **values})
+            self._append("metrics.csv", seed, {**self.costs, **values})
 
     def _record(self, levels: Any, update: Update) -> None:
         """Append how the training went and samples of its levels, for every copy."""
         training = {key: float(value) for key, value in update.metrics.items()}
-        for seed, values in self._per_copy(self._statistics(levels, update.rollout)):
+        for seed, values in self._per_copy(self.task.statistics(levels, update.rollout)):
             self._append("training.csv", seed, {**values, **training})
-        records = self._records(levels, update.rollout)
-        for seed, sample in zip(self.seeds, records, strict=True):
+        some = slice(RECORDED_LEVELS)
+        for copy, seed in enumerate(self.seeds):
+            sample = self.task.record(levels[copy, some], update.rollout[copy, some])
             row = {"updates": self.updates, "seed": seed, "levels": sample}
             self.folder.append("curriculum.jsonl", row)
-        self._tell("curriculum", {"levels": records[0]})
+            if copy == 0:
+                self._tell("curriculum", row)
 
     def _append(self, table: str, seed: int, values: Mapping[str, float]) -> None:
         self.folder.append(table, {"seed": seed, "updates": self.updates, **values})
@@ -264,15 +257,15 @@ class Experiment:
         limit = self.schedule.checkpoint_seconds
         late = limit is not None and time.monotonic() - self._saved >= limit
         if due or late or self._signals.pending:
-            self._save()
+            self._save(self._state())
         self._signals.deliver()
 
-    def _save(self) -> None:
+    def _save(self, state: State) -> None:
         self._checkpoints += 1
         save_checkpoint(
             self.folder.path / "checkpoints",
             self._checkpoints,
-            self._state(),
+            state,
             self.schedule.keep_checkpoints,
         )
         self._saved = time.monotonic()
@@ -281,11 +274,12 @@ class Experiment:
         return {
             "updates": self.updates,
             "cycles": self.cycles,
-            "meta_frames": self.meta_frames,
+            "curriculum_frames": self.curriculum_frames,
+            "evaluations": self.evaluations,
             "seconds": self.seconds,
             "headline": self._headline,
             "rows": self.folder.lengths(),
-            "solver": self.solver.snapshot().to_dict(),
+            "solver": self.learner.snapshot().to_dict(),
             "curriculum": self.curriculum.state_dict(),
         }
 
@@ -297,7 +291,8 @@ class Experiment:
             return False
         self._checkpoints, state = latest
         try:
-            self._set_state(state)
+            self._restore(state)
+            self.folder.cut_back(state["rows"])
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())
             raise CheckpointError(
@@ -305,11 +300,22 @@ class Experiment:
             ) from error
         return True
 
-    def _set_state(self, state: State) -> None:
-        self.solver.restore(TensorDict(state["solver"], [len(self.seeds)]))
+    def _restore(self, state: State) -> None:
+        self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
         self.curriculum.load_state_dict(state["curriculum"])
         self.updates, self.cycles = state["updates"], state["cycles"]
-        self.meta_frames = state["meta_frames"]
+        self.curriculum_frames, self.evaluations = state["curriculum_frames"], state["evaluations"]
         self._seconds_before = state["seconds"]
+        self._started = time.monotonic()
         self._headline = state["headline"]
-        self.folder.cut_back(state["rows"])
+
+
+def check_headline(task: Task, schedule: Schedule) -> None:
+    """Refuse to sum runs up by what is not measured.
+
+    Raises:
+        ValueError: if the headline is none of the task's measurements.
+    """
+    known = list(task.measurements)
+    if schedule.headline not in known:
+        raise ValueError(f"schedule.headline={schedule.headline!r}: must be one of {known}")

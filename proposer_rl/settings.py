@@ -1,10 +1,15 @@
-"""Groups of numbers that a configuration sets: plain frozen dataclasses with checked ranges."""
+"""Every setting that is not a task's: plain frozen dataclasses, their defaults and their ranges.
+
+``conf/train.yaml`` lists the same values (a test compares them) and says in a line what each does.
+A rule that joins several settings stands where the object is built that needs it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, TypeVar
 
+from annotated_types import Ge, Gt, Interval, Le, Len
 from typing_extensions import dataclass_transform
 
 T = TypeVar("T")
@@ -21,3 +26,171 @@ def settings(cls: type[T]) -> type[T]:
     decorated = dataclass(frozen=True, kw_only=True)(cls)
     decorated.__pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # type: ignore[attr-defined]
     return decorated
+
+
+@settings
+class LearningSettings:
+    """PPO's numbers but for the horizon; the defaults are the paper's for the Solver.
+
+    Attributes:
+        updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
+        epochs: gradient steps of an update, each on the full batch.
+        learning_rate, adam_eps: Adam's step size and denominator offset.
+        gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
+        clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
+        entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
+        max_grad_norm: largest gradient norm of one copy.
+        normalize_advantage: standardise advantages over each copy's batch.
+    """
+
+    updates: Annotated[int, Ge(1)] = 1
+    epochs: Annotated[int, Ge(1)] = 8
+    learning_rate: Annotated[float, Gt(0)] = 2.5e-4
+    adam_eps: Annotated[float, Gt(0)] = 1e-5
+    gamma: Annotated[float, Interval(ge=0, le=1)] = 0.99
+    lmbda: Annotated[float, Interval(ge=0, le=1)] = 0.95
+    clip_epsilon: Annotated[float, Interval(gt=0, lt=1)] = 0.2
+    entropy_coeff: Annotated[float, Ge(0)] = 0.01
+    critic_coeff: Annotated[float, Ge(0)] = 0.5
+    max_grad_norm: Annotated[float, Gt(0)] = 1.0
+    normalize_advantage: bool = True
+
+
+@settings
+class PPOSettings(LearningSettings):
+    """PPO's numbers.
+
+    Attributes:
+        horizon: steps T collected from every environment before an update.
+    """
+
+    horizon: Annotated[int, Ge(1)] = 25
+
+
+@settings
+class SolverSettings:
+    """How the Solver is trained.
+
+    Attributes:
+        batch_size: levels P of an update.
+        ppo: PPO's numbers.
+    """
+
+    batch_size: Annotated[int, Ge(1)] = 128
+    ppo: PPOSettings = PPOSettings()
+
+
+@settings
+class MixtureSettings:
+    """An action is a mixture of bins, from which the whole batch is drawn.
+
+    Attributes:
+        spread: standard deviation of the first policy.
+    """
+
+    kind: Literal["mixture"] = "mixture"
+    spread: Annotated[float, Gt(0)] = 1.5
+
+
+@settings
+class ProblemSettings:
+    """An action is the bin of every level, each drawn by itself (the paper's Proposer).
+
+    Attributes:
+        ratio: PPO's ratio over the P draws together, or for each draw.
+        bands: frequencies of the problem index's Fourier encoding.
+    """
+
+    kind: Literal["problems"] = "problems"
+    ratio: Literal["joint", "per_problem"] = "per_problem"
+    bands: Annotated[int, Ge(1)] = 16
+
+
+@settings
+class ProposerSettings:
+    """The Proposer and its meta-environment; not the paper's, but what was measured to learn.
+
+    Attributes:
+        rollouts: copies K of the Solver that are trained side by side.
+        meta_episode_length: updates L of a meta-episode.
+        action_repeat: updates for which an action holds; divides L.
+        validation_levels: size E of the batch that the gain is measured on.
+        probe_levels: number C of target levels through which the Solver is seen; at most E.
+        observes: what is seen beside the probes.
+        action: what an action means.
+        own_action: what the Solver itself trains on: a sample of the policy or its mode.
+        advance: what becomes of the Solver after a meta-episode: it trains by itself, or becomes
+            the best copy, or a random one.
+        advantage: against the mean of the other copies, or by a critic.
+        context, hidden: widths of the network.
+        ppo: PPO's numbers; the horizon is the number of actions of a meta-episode.
+    """
+
+    rollouts: Annotated[int, Ge(1)] = 16
+    meta_episode_length: Annotated[int, Ge(1)] = 50
+    action_repeat: Annotated[int, Ge(1)] = 50
+    validation_levels: Annotated[int, Ge(1)] = 512
+    probe_levels: Annotated[int, Ge(0)] = 16
+    observes: list[Literal["return", "log_success", "progress"]] = field(
+        default_factory=lambda: ["log_success", "progress"]
+    )
+    action: MixtureSettings | ProblemSettings = MixtureSettings()
+    own_action: Literal["sample", "mode"] = "mode"
+    advance: Literal["train", "best", "random"] = "train"
+    advantage: Literal["leave_one_out", "gae"] = "leave_one_out"
+    context: Annotated[int, Ge(1)] = 128
+    hidden: Annotated[int, Ge(1)] = 128
+    ppo: LearningSettings = LearningSettings(updates=3, epochs=16, gamma=1.0)
+
+
+@settings
+class Schedule:
+    """How long a run is, and what happens how often; all in Solver updates.
+
+    Attributes:
+        updates: length of the run.
+        cycle_length: updates between two improvements of the curriculum.
+        evaluate_every: updates between two rows of metrics.
+        checkpoint_every: updates between two checkpoints; one more follows every improvement.
+        checkpoint_seconds: time after which a checkpoint is due at the next update; None for no
+            such limit.
+        keep_checkpoints: how many of the newest checkpoints stay.
+        headline: the measurement that the run is summed up by.
+        threshold: sample efficiency is the first update at which the headline reaches this.
+    """
+
+    updates: Annotated[int, Ge(1)] = 750
+    cycle_length: Annotated[int, Ge(1)] = 50
+    evaluate_every: Annotated[int, Ge(1)] = 10
+    checkpoint_every: Annotated[int, Ge(1)] = 50
+    checkpoint_seconds: Annotated[float, Gt(0)] | None = 600.0
+    keep_checkpoints: Annotated[int, Ge(1)] = 2
+    headline: str = "id_success"
+    threshold: Annotated[float, Interval(gt=0, le=1)] = 0.8
+
+
+@settings
+class ComputeSettings:
+    """Where and how a run is computed, which changes no numbers beyond rounding.
+
+    Attributes:
+        device: ``auto``: cuda where there is one, else cpu.
+        graphs: replay updates and evaluations as CUDA graphs on a GPU.
+        threads: CPU threads of one operation; None leaves torch's choice.
+        cores: copies of the Solver computed at once on a CPU; None for all cores.
+        collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
+        workers: processes for them; None for one for each GPU, or core, at most one for each copy.
+        worker_devices: of the workers, in turn; None for all GPUs, or the CPU.
+        ray_address: of a Ray cluster, such as auto or 10.0.0.1:6379; None for one on this machine.
+        progress: draw progress bars.
+    """
+
+    device: str = "auto"
+    graphs: bool = True
+    threads: Annotated[int, Ge(1), Le(1024)] | None = None
+    cores: Annotated[int, Ge(1), Le(1024)] | None = None
+    collector: Literal["single", "multiprocess", "ray"] = "single"
+    workers: Annotated[int, Ge(1)] | None = None
+    worker_devices: Annotated[list[str], Len(1)] | None = None
+    ray_address: str | None = None
+    progress: bool = True

@@ -15,7 +15,7 @@ from proposer_rl.curricula import (
     load_agent,
 )
 from proposer_rl.curricula.proposer import explained_share
-from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.advantages import LeaveOneOutBaseline
 from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.models import (
     MapEncoder,
@@ -47,7 +47,7 @@ def proposer(
     head = MixtureHead(8, SPACE.size, hidden=8) if mix else ProblemHead(8, P, SPACE.size, hidden=8)
     settings = PPOSettings(horizon=env.steps, gamma=1.0, epochs=2)
     agent = proposer_actor_critic(network(head), normal if mix else categorical)
-    ppo = PPO(env, agent, settings, advantage=CopiesBaseline(1.0) if mix else None)
+    ppo = PPO(env, agent, settings, advantage=LeaveOneOutBaseline(1.0) if mix else None)
     return ProposerCurriculum(ppo, advance=advance, own_action=own_action)
 
 

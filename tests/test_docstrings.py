@@ -28,7 +28,7 @@ SHOWN = [
     proposer_rl.PPO,
     proposer_rl.ExactEvaluator,
     proposer_rl.performance_gain,
-    proposer_rl.CopiesBaseline,
+    proposer_rl.LeaveOneOutBaseline,
     proposer_rl.Mixture,
     proposer_rl.ProblemChoices,
     proposer_rl.Streams,

@@ -3,30 +3,48 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from tqdm import tqdm
 
-from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.cli.config import ConfigError, RunConfig, TaskMaker, task_maker
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.outcome import run_name
-from proposer_rl.cli.workers import workers
 from proposer_rl.curricula import Curriculum
-from proposer_rl.experiment import Experiment
-from proposer_rl.learning.cuda_graphs import use
-from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes.task import MazeTask, faster_precision
-from proposer_rl.methods import Parts
+from proposer_rl.experiment import Experiment, check_headline
+from proposer_rl.learning import PPO
+from proposer_rl.learning.cuda_graphs import recorded, use
+from proposer_rl.meta.workers import WorkerSettings, shares
+from proposer_rl.methods import Parts, Workers
+from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
+from proposer_rl.settings import ComputeSettings, SolverSettings
 from proposer_rl.streams import Streams
+from proposer_rl.task import Place, Task
 
 
-def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
-    """Task, Solver and curriculum of an experiment; nothing is written yet.
+class Made(NamedTuple):
+    """What an experiment is made of."""
+
+    task: Task
+    learner: PPO
+    curriculum: Curriculum
+
+
+def parts(config: RunConfig, signals: StopSignals) -> Made:
+    """Task, Solvers and curriculum of an experiment; nothing is written yet.
+
+    Args:
+        config: the run's settings.
+        signals: which may interrupt a curriculum's long work.
 
     Raises:
         ConfigError: if settings that are each valid do not go together.
@@ -34,10 +52,13 @@ def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
     require_logger(config.logger)
     try:
         task = make_task(config)
-        solver = task.solvers([Streams(seed, "solver") for seed in config.seeds])
-        return task, solver, _curriculum(config, task)
+        learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
+        check_headline(task, config.schedule)
+        return Made(task, learner, _curriculum(config, task, signals))
+    except ConfigError:
+        raise
     except ValueError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(one_line(error)) from error
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "allocate" not in str(error):
             raise
@@ -46,9 +67,7 @@ def parts(config: RunConfig) -> tuple[MazeTask, PPO, Curriculum]:
 
 def build(
     config: RunConfig,
-    task: MazeTask,
-    solver: PPO,
-    curriculum: Curriculum,
+    made: Made,
     folder: RunFolder,
     signals: StopSignals | None = None,
     scope: tuple[str | int, ...] = (),
@@ -57,112 +76,165 @@ def build(
 
     Args:
         config: the run's settings.
-        task: as :func:`parts` makes it.
-        solver: as :func:`parts` makes it.
-        curriculum: as :func:`parts` makes it.
+        made: as :func:`parts` makes it.
         folder: the run's.
         signals: which may ask the run to stop.
         scope: of its random draws; empty, or the lifetime.
     """
     return Experiment(
-        solver,
-        curriculum,
+        *made,
         schedule=config.schedule,
         seeds=config.seeds,
         folder=folder,
-        evaluate=task.measure,
-        statistics=task.statistics,
-        records=task.records,
         log=make_log(config.logger, folder.path, run_name(config)),
-        progress=config.progress,
+        progress=config.compute.progress,
         signals=signals,
         scope=scope,
     )
 
 
-def make_task(config: RunConfig) -> MazeTask:
+def make_task(config: RunConfig) -> Task:
     """The task of a run, on its device and with its number of threads.
 
     Raises:
-        ConfigError: if the device cannot be used.
-        ValueError: if settings that are each valid do not make a task.
+        ConfigError: if the device cannot be used, or settings do not make a task.
     """
-    device = _device(config.device)
+    compute = config.compute
+    device = _device(compute.device)
     use(device)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
-    automatic = config.precision == "auto"
-    return MazeTask(
-        maze=config.maze,
-        distributions=config.distributions,
-        target=config.target,
-        space=config.space,
-        solver=config.solver,
-        evaluation=config.evaluation,
-        device=device,
-        precision=(
-            faster_precision(config.solver.channels, device) if automatic else config.precision
-        ),
-        cores=config.cores,
-        graphs=config.graphs,
-    )
+    if compute.threads is not None:
+        torch.set_num_threads(compute.threads)
+    place = Place(device, config.precision, compute.cores)
+    try:
+        task = make_in_place(task_maker(config), config.solver, place)
+    except ValueError as error:
+        raise ConfigError(f"task.{one_line(error)}") from error
+    return recorded(task) if compute.graphs and device.type == "cuda" else task
+
+
+def make_in_place(maker: TaskMaker, solver: SolverSettings, place: Place) -> Any:
+    """Make the task of some settings somewhere."""
+    return maker.make(**maker.settings, solver=solver, place=place)
+
+
+def _make_in_worker(
+    maker: TaskMaker, solver: SolverSettings, place: Place, graphs: bool, device: str
+) -> Any:
+    task = make_in_place(maker, solver, place._replace(device=torch.device(device)))
+    return recorded(task) if graphs and task.device.type == "cuda" else task
 
 
 class EpisodeBar:
-    """A progress bar for the steps of a meta-episode, redrawn for every episode.
+    """A progress bar for the updates of a meta-episode, redrawn for every episode.
 
     Args:
-        steps: of an episode.
+        updates: of an episode.
         enabled: whether to draw it; it is drawn on a terminal only.
     """
 
-    def __init__(self, steps: int, enabled: bool) -> None:
-        self._steps = steps
+    def __init__(self, updates: int, enabled: bool) -> None:
+        self._updates = updates
         self._enabled = enabled and sys.stderr.isatty()
         self._bar: tqdm | None = None
 
     def __call__(self) -> None:
-        """Count one step."""
+        """Count one update."""
         if not self._enabled:
             return
         if self._bar is None:
             self._bar = tqdm(
-                total=self._steps,
+                total=self._updates,
                 desc="  rollouts of the copies",
                 leave=False,
                 position=1,
                 dynamic_ncols=True,
             )
         self._bar.update()
-        if self._bar.n >= self._steps:
+        if self._bar.n >= self._updates:
             self._bar.close()
             self._bar = None
 
 
-def _curriculum(config: RunConfig, task: MazeTask) -> Curriculum:
-    bar = EpisodeBar(config.proposer.lookahead, config.progress)
-    elsewhere = workers(config, task.device, _device)
-    parts = Parts(task, config.proposer, config.seeds[0], bar, elsewhere)
+def _curriculum(config: RunConfig, task: Task, signals: StopSignals) -> Curriculum:
+    bar = EpisodeBar(config.proposer.meta_episode_length, config.compute.progress)
+
+    def on_update() -> None:
+        bar()
+        signals.check()
+
+    chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task))
     try:
         factory = instantiate(config.curriculum, _partial_=True)
-        curriculum = factory(parts)
+        curriculum = factory(chosen)
     except (TypeError, ValueError, HydraException) as error:
         raise ConfigError(f"curriculum: {one_line(error)}") from error
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
-    if elsewhere is not None and not curriculum.uses_workers:
-        raise ConfigError(
-            f"collector={config.collector}: {config.method} trains no copies of the Solver, so "
-            "there is nothing for workers to do; leave collector=single"
-        )
-    most = curriculum.most_solvers
-    if most is not None and len(config.seeds) > most:
-        raise ConfigError(
-            f"seeds={config.seeds}: {config.method} trains at most {most} at a time; "
-            "give one run for each, as in -m seed=0,1,2"
-        )
+    if config.proposer.advance != "train":
+        _check_cycle(config)
     return curriculum
+
+
+def _check_cycle(config: RunConfig) -> None:
+    length, episode = config.schedule.cycle_length, config.proposer.meta_episode_length
+    if length != episode:
+        raise ConfigError(
+            f"schedule.cycle_length={length} must equal proposer.meta_episode_length={episode} "
+            f"where proposer.advance={config.proposer.advance}"
+        )
+
+
+def _workers(config: RunConfig, task: Task) -> Workers | None:
+    """Where the copies are trained; None for this process.
+
+    Raises:
+        ConfigError: for workers that there are not, that would have nothing to do, or that cannot
+            be had.
+    """
+    compute, copies = config.compute, config.proposer.rollouts
+    if compute.collector == "single":
+        for key in ("workers", "worker_devices"):
+            if getattr(compute, key) is not None:
+                raise ConfigError(
+                    f"compute.{key}={getattr(compute, key)}: there are workers only with "
+                    "compute.collector=multiprocess or ray"
+                )
+    if compute.collector != "ray" and compute.ray_address is not None:
+        raise ConfigError(
+            f"compute.ray_address={compute.ray_address}: is of use only with compute.collector=ray"
+        )
+    if compute.collector == "single":
+        return None
+    if compute.collector == "ray" and find_spec("ray") is None:
+        raise ConfigError("compute.collector=ray: needs Ray: pip install 'proposer_rl[ray]'")
+    on_gpus = task.device.type == "cuda"
+    available = torch.cuda.device_count() if on_gpus else available_cores()
+    count = compute.workers or min(copies, available)
+    shares(copies, count)
+    if compute.collector == "multiprocess":
+        for name in compute.worker_devices or []:
+            _device(name)
+    cores = compute.cores or max(1, available_cores() // count)
+    settings = WorkerSettings(
+        engine=compute.collector,
+        workers=count,
+        devices=compute.worker_devices or _devices(compute, task.device),
+        cores=cores,
+        ray_address=compute.ray_address,
+    )
+    place = Place(precision=task.precision, cores=cores)
+    make: Callable[[str], Any] = partial(
+        _make_in_worker, task_maker(config), config.solver, place, compute.graphs
+    )
+    return Workers(settings, make)
+
+
+def _devices(compute: ComputeSettings, device: torch.device) -> list[str]:
+    """All GPUs in turn where the run is on one; Ray shows a worker only those that it reserved."""
+    if device.type == "cuda" and compute.collector == "multiprocess":
+        return [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    return [device.type]
 
 
 def _device(name: str) -> torch.device:
@@ -175,5 +247,5 @@ def _device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         reason = one_line(error)[:120]
         raise ConfigError(
-            f"device={name!r}: must be auto, cpu or a usable one: {reason}"
+            f"compute.device={name!r}: must be auto, cpu or a usable one: {reason}"
         ) from error

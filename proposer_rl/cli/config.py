@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
+from hydra.errors import HydraException
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from proposer_rl.experiment import Schedule
-from proposer_rl.mazes import LevelDistribution, SpecificationSpace
-from proposer_rl.mazes.task import (
-    DistributionSettings,
-    EvaluationSettings,
-    MazeSettings,
-    SolverSettings,
-    SpaceSettings,
-)
-from proposer_rl.methods import ProposerSettings
 from proposer_rl.runs.folder import storage
+from proposer_rl.settings import ComputeSettings, ProposerSettings, Schedule, SolverSettings
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # In a wheel the configuration lies in the package, in a checkout beside it.
@@ -30,7 +24,6 @@ CONFIG_FOLDER = next(
     PACKAGE / "conf",
 )
 
-
 # ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
 OmegaConf.register_new_resolver(
     "joined", lambda items: "-".join(str(item) for item in items), replace=True
@@ -38,12 +31,24 @@ OmegaConf.register_new_resolver(
 
 # No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
 LARGEST = 10**9
-LARGEST_GRID = 10**6
 LARGEST_FILE = 10**6
+# What a task's maker is given beside the task's own settings.
+GIVEN_TO_TASKS = ("solver", "place")
 
 
 class ConfigError(ValueError):
     """The configuration is wrong; the message is one line."""
+
+    exit_code = 2
+
+
+class HandMadeSettings(BaseModel):
+    """A curriculum by hand: distributions of the task, and the updates after which each ends."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    distributions: list[str]
+    until: list[Annotated[int, Field(ge=1)]]
 
 
 class LoggerSettings(BaseModel):
@@ -57,7 +62,10 @@ class LoggerSettings(BaseModel):
 
 
 class RunConfig(BaseModel):
-    """Every setting of a run; names and meaning as in ``conf/train.yaml``."""
+    """Every setting of a run; names and meaning as in ``conf/train.yaml``.
+
+    What joins several settings is checked where the object is built that needs it.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -65,146 +73,26 @@ class RunConfig(BaseModel):
     scale: str
     ablation: str
     curriculum: dict[str, Any]
+    task: dict[str, Any]
     lifetimes: Annotated[int, Field(ge=1, le=LARGEST)]
     checkpoint: str | None
     seed: Annotated[int, Field(ge=0)]
-    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = Field(
-        default_factory=lambda known: [known["seed"]]
-    )
-    device: str
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     precision: Literal["auto", "fp32", "bf16"]
-    graphs: bool
-    threads: Annotated[int, Field(ge=1, le=1024)] | None
-    cores: Annotated[int, Field(ge=1, le=1024)] | None
-    collector: Literal["single", "multiprocess", "ray"]
-    workers: Annotated[int, Field(ge=1, le=LARGEST)] | None
-    worker_devices: Annotated[list[str], Field(min_length=1)] | None
-    ray_address: str | None
-    progress: bool
-    maze: MazeSettings
-    distributions: dict[str, DistributionSettings]
-    target: str
-    hand_made_until: list[Annotated[int, Field(ge=1)]]
-    space: SpaceSettings
+    hand_made: HandMadeSettings
     solver: SolverSettings
     proposer: ProposerSettings
     schedule: Schedule
-    evaluation: EvaluationSettings
+    compute: ComputeSettings
     logger: LoggerSettings
 
-    @model_validator(mode="after")
-    def _agree(self) -> RunConfig:
-        proposer, schedule, solver = self.proposer, self.schedule, self.solver
-        if len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds={self.seeds}: must be distinct")
-        known, measured = sorted(self.distributions), self.evaluation.distributions
-        for key, names in (("target", [self.target]), ("evaluation.distributions", measured)):
-            unknown = [name for name in names if name not in known]
-            if unknown:
-                raise ValueError(f"{key}: must be among {known}, got {unknown[0]!r}")
-        policies = ("success", "greedy_success", "return", "greedy_return")
-        headlines = [f"{name}_{policy}" for name in measured for policy in policies]
-        if schedule.headline not in headlines:
-            raise ValueError(f"schedule.headline={schedule.headline!r}: must be one of {headlines}")
-        if proposer.advance != "train" and schedule.cycle_length != proposer.lookahead:
-            raise ValueError(
-                f"schedule.cycle_length={schedule.cycle_length} must equal proposer.lookahead="
-                f"{proposer.lookahead} where proposer.advance={proposer.advance}"
-            )
-        if proposer.lookahead % proposer.updates_per_step:
-            raise ValueError(
-                f"proposer.updates_per_step={proposer.updates_per_step} must divide "
-                f"proposer.lookahead={proposer.lookahead}"
-            )
-        if proposer.advantage == "copies" and proposer.rollouts < 2:
-            raise ValueError(
-                f"proposer.rollouts={proposer.rollouts} must be at least 2 where "
-                "proposer.advantage=copies"
-            )
-        if proposer.ppo.horizon != proposer.lookahead:
-            raise ValueError(
-                f"proposer.ppo.horizon={proposer.ppo.horizon} must equal proposer.lookahead="
-                f"{proposer.lookahead}"
-            )
-        self._check_workers()
-        uneven = [width for width in solver.channels if width % solver.groups]
-        if uneven:
-            raise ValueError(
-                f"solver.channels={solver.channels} must be multiples of solver.groups="
-                f"{solver.groups}"
-            )
-        if proposer.probe_levels > proposer.validation_levels:
-            raise ValueError(
-                f"proposer.probe_levels={proposer.probe_levels} must be at most "
-                f"proposer.validation_levels={proposer.validation_levels}: the Proposer is shown "
-                "no more than it is paid for"
-            )
-        longest = max(length for _, length in self.distributions[self.target].specifications)
-        if longest > self.maze.max_steps:
-            raise ValueError(
-                f"maze.max_steps={self.maze.max_steps} must be at least {longest}, the path length "
-                f"of distributions.{self.target}, which is the target"
-            )
-        smallest = min(self.maze.height, self.maze.width) >> (len(solver.channels) - 1)
-        if smallest < 1:
-            raise ValueError(
-                f"solver.channels={solver.channels} halve a {self.maze.height}x{self.maze.width} "
-                "maze to nothing; give fewer channels or a larger maze"
-            )
-        for halvings, width in enumerate(solver.channels):
-            cells = (self.maze.height >> halvings) * (self.maze.width >> halvings)
-            if cells * width == solver.groups:
-                raise ValueError(
-                    f"solver.channels={solver.channels} leave a group of {width} channels with a "
-                    f"single number on a {self.maze.height}x{self.maze.width} maze: give more "
-                    f"channels, a larger maze or fewer than solver.groups={solver.groups}"
-                )
-        if self.maze.height * self.maze.width > LARGEST_GRID:
-            raise ValueError(
-                f"maze.height={self.maze.height}, maze.width={self.maze.width}: must be at most "
-                f"{LARGEST_GRID:,} cells together"
-            )
-        self._check_levels()
-        return self
 
-    def _check_workers(self) -> None:
-        """Refuse settings of workers that there are not, or that would have nothing to do."""
-        for key in ("workers", "worker_devices"):
-            if self.collector == "single" and getattr(self, key) is not None:
-                raise ValueError(
-                    f"{key}={getattr(self, key)}: there are workers only with "
-                    "collector=multiprocess or collector=ray"
-                )
-        if self.collector != "ray" and self.ray_address is not None:
-            raise ValueError(f"ray_address={self.ray_address}: is of use only with collector=ray")
-        if self.workers is not None and self.workers > self.proposer.rollouts:
-            raise ValueError(
-                f"workers={self.workers} must be at most proposer.rollouts="
-                f"{self.proposer.rollouts}, the copies that they share"
-            )
+@dataclass(frozen=True)
+class TaskMaker:
+    """What makes a run's task: its target, and the settings it is called with."""
 
-    def _check_levels(self) -> None:
-        """Refuse levels that cannot be made, naming the key that asks for them."""
-        grid = (self.maze.height, self.maze.width)
-        space = self.space
-        makers: dict[str, Callable[[], object]] = {
-            f"distributions.{name}": partial(
-                LevelDistribution, wanted.specifications, wanted.mechanism, *grid
-            )
-            for name, wanted in self.distributions.items()
-        }
-        makers["space"] = partial(
-            SpecificationSpace,
-            space.obstacle_fractions,
-            space.path_lengths,
-            space.mechanism,
-            *grid,
-        )
-        for key, make in makers.items():
-            try:
-                make()
-            except ValueError as error:
-                raise ValueError(f"{key}: {error}") from error
+    make: Callable[..., Any]
+    settings: Mapping[str, Any]
 
 
 def read_config(config: DictConfig) -> RunConfig:
@@ -220,46 +108,63 @@ def read_config(config: DictConfig) -> RunConfig:
     for key, value in _leaves(values):
         if isinstance(value, int | float) and abs(value) > LARGEST:
             raise ConfigError(f"{key}={value!r}: must be finite and at most {LARGEST:,} in size")
+    checked = _validated(RunConfig, values)
+    if len(set(checked.seeds)) < len(checked.seeds):
+        raise ConfigError(f"seeds={checked.seeds}: must be distinct")
+    task_maker(checked)
+    return checked
+
+
+def task_maker(config: RunConfig) -> TaskMaker:
+    """What makes the task, with its settings checked against the types that its maker asks for.
+
+    Raises:
+        ConfigError: if there is no such maker, naming the first wrong key.
+    """
+    values = dict(config.task)
+    target = values.pop("_target_", None)
+    if not isinstance(target, str):
+        raise ConfigError("task._target_: missing: the class or function that makes the task")
     try:
-        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
-        return RunConfig.model_validate_json(json.dumps(values), strict=True)
-    except ValidationError as error:
-        raise ConfigError(_first_line(error, values)) from error
-    except TypeError as error:
+        make = get_object(target)
+        parameters = inspect.signature(make).parameters
+        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+    except (HydraException, ImportError, AttributeError, TypeError, ValueError, NameError) as error:
+        raise ConfigError(f"task._target_={target}: {' '.join(str(error).split())}") from error
+    missing = [name for name in GIVEN_TO_TASKS if name not in parameters]
+    if missing:
         raise ConfigError(
-            f"a value that is neither text, number, list nor mapping: {error}"
-        ) from error
+            f"task._target_={target}: makes no task: it takes no argument {missing[0]!r}"
+        )
+    fields: dict[str, Any] = {
+        name: (
+            hints.get(name, Any),
+            ... if parameter.default is parameter.empty else parameter.default,
+        )
+        for name, parameter in parameters.items()
+        if name not in (*GIVEN_TO_TASKS, "make_network")
+    }
+    model = create_model("Task", __config__=ConfigDict(extra="forbid"), **fields)
+    checked = _validated(model, values, "task.")
+    return TaskMaker(make, {name: getattr(checked, name) for name in fields})
 
 
 def saved_config(folder: Path) -> RunConfig:
-    """The settings of the run in a folder; what may differ between its calls is left to choice.
+    """The settings of the run in a folder; where it is computed is left to choice.
 
     Raises:
         ConfigError: if the folder is no run's, or was written by another version.
     """
     file = folder / "config.json"
-    free: dict[str, Any] = {
-        "device": "auto",
-        "graphs": True,
-        "threads": 1,
-        "cores": None,
-        "collector": "single",
-        "workers": None,
-        "worker_devices": None,
-        "ray_address": None,
-        "progress": False,
-        "logger": {"type": "csv"},
-    }
     if not file.is_file():
         raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
     values = stored_config(file)
+    free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         values["schedule"]["updates"] = 1
-        return RunConfig.model_validate_json(json.dumps({**values, **free}), strict=True)
-    except ValidationError as error:
-        raise ConfigError(f"{file}: {_first_line(error, values)}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{file}: does not hold the settings of a run") from error
+        return _validated(RunConfig, {**values, **free})
+    except (ConfigError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
 
 
 def stored_config(file: Path) -> Any:
@@ -299,6 +204,18 @@ def methods() -> list[str]:
     return sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
 
 
+def _validated(model: Any, values: Any, prefix: str = "") -> Any:
+    try:
+        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
+        return model.model_validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        raise ConfigError(_first_line(error, values, prefix)) from error
+    except TypeError as error:
+        raise ConfigError(
+            f"a value that is neither text, number, list nor mapping: {error}"
+        ) from error
+
+
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Every value that is no mapping or list, with its dotted key."""
     if isinstance(value, dict | list):
@@ -308,13 +225,17 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _first_line(error: ValidationError, values: Mapping[str, Any]) -> str:
-    details = error.errors()[0]
-    *folder, last = details["loc"] or [""]
-    key = ".".join(map(str, details["loc"]))
+def _first_line(error: ValidationError, values: Any, prefix: str) -> str:
+    errors = error.errors()
+    # Of a union pydantic tells what is wrong with every member; one of another kind is not meant.
+    others = [e["loc"][:-1] for e in errors if e["loc"][-1:] == ("kind",)]
+    meant = [e for e in errors if not any(e["loc"][: len(other)] == other for other in others)]
+    details = (meant or errors)[0]
+    # A member's name is no key of the configuration.
+    loc = [part for part in details["loc"] if not str(part).endswith("Settings")]
+    *folder, last = loc or [""]
+    key = prefix + ".".join(map(str, loc))
     message = details["msg"].removeprefix("Value error, ")
-    if not key:
-        return message
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         siblings: Any = values
         for part in folder:

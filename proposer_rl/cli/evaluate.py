@@ -5,35 +5,34 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from tensordict import TensorDict
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
-from proposer_rl.cli.errors import FORESEEN, refuse
-from proposer_rl.mazes import Level
-from proposer_rl.mazes.level_files import SUFFIXES, read_levels, shipped_levels, shipped_sets
-from proposer_rl.mazes.level_pictures import draw_paths
-from proposer_rl.mazes.level_scores import Score, score_levels
-from proposer_rl.mazes.task import MazeTask
+from proposer_rl.cli.config import ConfigError, saved_config
+from proposer_rl.cli.errors import command
+from proposer_rl.cli.stored import check_output, positive, read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.pictures import pixels
 from proposer_rl.streams import Streams
+from proposer_rl.task import Score, ScoringTask, Task
 
 SHOWN = 36  # levels in the table and on the sheet of pictures
-SLACK = 2  # of a named level: steps allowed for each move of its shortest path
+COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
+DRAWN = 128  # levels of a distribution, where the task has no named ones
 MOST_STEPS = 10**5
-OUTPUTS = (".json", ".csv")
 
 
 @dataclass(frozen=True)
@@ -41,18 +40,18 @@ class Evaluation:
     """What an evaluation found.
 
     Attributes:
-        run: The run's folder.
+        run: the run's folder.
         updates: Solver updates made at the checkpoint.
-        seeds: Of the run's Solvers, in their order.
-        levels: The levels by their names.
-        scores: One for each level and Solver.
+        seeds: of the run's Solvers, in their order.
+        levels: what was evaluated on.
+        scores: one for each level and Solver.
     """
 
     run: Path
     updates: int
     seeds: list[int]
-    levels: Mapping[str, Level]
-    scores: list[Score]
+    levels: str
+    scores: Sequence[Score]
 
     def rows(self) -> list[dict[str, Any]]:
         """One mapping for each level and Solver, for JSON and CSV."""
@@ -62,144 +61,92 @@ class Evaluation:
                 "seed": self.seeds[score.solver],
                 "updates": self.updates,
                 "level": score.level,
-                "height": score.height,
-                "width": score.width,
-                "path_length": score.path_length,
-                "max_steps": score.max_steps,
-                "success": score.success,
-                "return": score.mean_return,
-                "greedy_success": score.greedy_success,
-                "greedy_return": score.greedy_return,
+                **score.about,
+                **score.results,
             }
             for score in self.scores
         ]
 
 
-class _Choice(NamedTuple):
-    """Levels, and the step limit of one of them, given the length of its shortest path."""
-
-    levels: Mapping[str, Level]
-    max_steps: Callable[[int], int]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     options = _parser().parse_args(arguments)
+    command(partial(_run, options))
+
+
+def _run(options: argparse.Namespace) -> None:
+    check_output("--output", options.output, (".json", ".csv"))
+    check_output("--pictures", options.pictures, (".png",))
     try:
-        _check_file("--output", options.output, OUTPUTS)
-        _check_file("--pictures", options.pictures, (".png",))
         found = evaluate(options.checkpoint, options.levels, options.max_steps)
-        _print(found, options.levels)
-        if options.output is not None:
-            write_atomically(options.output, _encoded(found.rows(), options.output.suffix))
-        if options.pictures is not None:
-            title = f"{found.run.name}, {found.updates} updates"
-            shown = [score for score in found.scores if score.solver == 0]
-            picture = draw_paths(found.levels, _hardest(shown), title)
-            write_atomically(options.pictures, picture)
-    except FORESEEN as error:
-        refuse(error)
     except ValueError as error:
-        refuse(ConfigError(str(error)))
+        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+    _print(found)
+    if options.output is not None and options.output.suffix == ".csv":
+        write_atomically(options.output, _csv(found.rows()))
+    else:
+        write_rows(found.rows(), options.output)
+    if options.pictures is not None:
+        write_atomically(options.pictures, _sheet(found))
 
 
-def evaluate(checkpoint: Path, name: str, max_steps: int | None = None) -> Evaluation:
-    """Evaluates the Solvers of a checkpoint, exactly.
+def evaluate(checkpoint: Path, name: str | None, max_steps: int | None = None) -> Evaluation:
+    """Evaluate the Solvers of a checkpoint.
 
     Args:
-        checkpoint: A run's folder, for its newest checkpoint, or a checkpoint in it.
-        name: A file of levels, a distribution of the run, or a set that comes along.
-        max_steps: Step limit of every level. None: on a distribution that of the run, so that
-            the means are those in its metrics; on other levels at least twice the shortest path.
+        checkpoint: a run's folder, for its newest checkpoint, or a checkpoint in it.
+        name: of levels that the run's task knows; None for what it takes by default.
+        max_steps: step limit of every level; None for the task's choice.
 
     Raises:
-        ConfigError, CheckpointError: If there is no such run, or its checkpoint cannot be used.
-        ValueError: If there are no such levels, or the Solver cannot see levels that small.
-        OSError: If a file cannot be read.
+        ConfigError, CheckpointError: if there is no such run, or its checkpoint cannot be used.
+        ValueError: if there are no such levels, or they are none for this Solver.
+        OSError: if a file cannot be read.
     """
-    run, state = _read(checkpoint)
+    run, state = read_checkpoint(checkpoint)
     config = saved_config(run)
     task = make_task(config)
-    chosen = _choose(name, task)
-    _check_sizes(chosen.levels, config)
-    scores = score_levels(
-        _solver(run, config, task, state),
-        chosen.levels,
-        chosen.max_steps if max_steps is None else lambda _: max_steps,
-        config.maze.step_penalty,
-        task.device,
-    )
-    return Evaluation(run, int(state["updates"]), config.seeds, chosen.levels, scores)
+    agent = restored(task, config, state).agent
+    if isinstance(task, ScoringTask):
+        name = name or task.levels_help.split(",")[0]
+        scores: Sequence[Score] = task.scores(agent, name, max_steps)
+    else:
+        name = name or next(iter(task.distributions))
+        scores = _on_distribution(task, agent, name, max_steps)
+    return Evaluation(run, int(state["updates"]), config.seeds, name, scores)
 
 
-def _read(checkpoint: Path) -> tuple[Path, State]:
-    """The run's folder, and the state in the checkpoint."""
-    if not checkpoint.exists():
-        raise ConfigError(f"{checkpoint}: there is no such file or folder")
-    if not checkpoint.is_dir():
-        return checkpoint.resolve().parent.parent, load_checkpoint(checkpoint)[1]
-    latest = load_latest(checkpoint / "checkpoints")
-    if latest is None:
-        raise ConfigError(
-            f"{checkpoint}: holds no checkpoints; give a run's folder or a checkpoint"
+def _on_distribution(
+    task: Task, agent: ActorCritic, name: str, max_steps: int | None
+) -> list[Score]:
+    """Scores on levels of a distribution, for a task that has no others."""
+    if name not in task.distributions:
+        raise ConfigError(f"--levels {name}: must be one of: {', '.join(task.distributions)}")
+    if max_steps is not None:
+        raise ConfigError("--max-steps: the step limit of this task's levels is fixed")
+    streams = Streams(0, "eval", name)
+    levels = task.distributions[name].sample(DRAWN, streams.generator())
+    performance = task.performance(agent, levels, streams.generator(device=task.device)).cpu()
+    copies, count = performance.batch_size
+    return [
+        Score(
+            level=f"{name}_{i:03}",
+            solver=k,
+            about={},
+            results={str(key): float(value) for key, value in performance[k, i].items()},
+            note="",
+            picture=partial(_picture, task, levels[i : i + 1]),
         )
-    return checkpoint.resolve(), latest[1]
+        for i in range(count)
+        for k in range(copies)
+    ]
 
 
-def _solver(run: Path, config: RunConfig, task: MazeTask, state: State) -> ActorCritic:
-    learner = task.solvers([Streams(seed) for seed in config.seeds])
-    try:
-        learner.restore(TensorDict(state["solver"], [len(config.seeds)]))
-        int(state["updates"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{run}: its checkpoint holds no Solver with the network of its config.json"
-        ) from error
-    return learner.agent
+def _picture(task: Task, level: Any) -> NDArray[np.uint8]:
+    return pixels(task.record(level, None)[0]["picture"])
 
 
-def _choose(name: str, task: MazeTask) -> _Choice:
-    limit = task.maze.max_steps
-    if Path(name).suffix in SUFFIXES:
-        if not Path(name).is_file():
-            raise ConfigError(f"--levels {name}: there is no such file")
-        return _Choice(read_levels(name), lambda length: max(limit, SLACK * length))
-    for distribution in task.distributions:
-        if name.casefold() == distribution.casefold():
-            levels = task.evaluation_levels(distribution).cpu()
-            named = {f"{distribution}_{i:03}": levels[i] for i in range(len(levels))}
-            return _Choice(named, lambda _: limit)
-    if name in shipped_sets():
-        return _Choice(shipped_levels(name), lambda length: max(limit, SLACK * length))
-    known = ", ".join([*task.distributions, *shipped_sets()])
-    raise ConfigError(
-        f"--levels {name}: must be a file that ends in {' or '.join(SUFFIXES)}, or one of: {known}"
-    )
-
-
-def _check_sizes(levels: Mapping[str, Level], config: RunConfig) -> None:
-    least = 2 ** (len(config.solver.channels) - 1)
-    for name, level in levels.items():
-        height, width = level.walls.shape
-        if min(height, width) < least:
-            raise ConfigError(
-                f"level {name!r}: its {height}x{width} cells are halved to nothing by this Solver; "
-                f"it sees levels of {least}x{least} cells and more"
-            )
-
-
-def _check_file(option: str, file: Path | None, suffixes: Sequence[str]) -> None:
-    if file is None:
-        return
-    if file.suffix not in suffixes:
-        raise ConfigError(f"{option} {file}: must end in {' or '.join(suffixes)}")
-    if not file.parent.is_dir():
-        raise ConfigError(f"{option} {file}: there is no folder {file.parent}")
-
-
-def _encoded(rows: list[dict[str, Any]], suffix: str) -> bytes:
-    if suffix == ".json":
-        return (json.dumps(rows, indent=1) + "\n").encode()
+def _csv(rows: list[dict[str, Any]]) -> bytes:
     file = io.StringIO(newline="")
     writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
     writer.writeheader()
@@ -207,63 +154,81 @@ def _encoded(rows: list[dict[str, Any]], suffix: str) -> bytes:
     return file.getvalue().encode()
 
 
-def _print(found: Evaluation, name: str) -> None:
+def _print(found: Evaluation) -> None:
     first = [score for score in found.scores if score.solver == 0]
     shown = _hardest(first)
     some = f", the {len(shown)} hardest of {len(first)} levels" if len(shown) < len(first) else ""
     seeds = ", ".join(map(str, found.seeds))
-    table = Table(
-        box=SIMPLE_HEAD,
-        title=Text(f"{found.run.name}, seed {seeds}, {found.updates} updates: {name}{some}"),
-        caption="Exact probability of reaching the goal within the steps, and expected return; "
-        "greedy: whether the most probable actions get there."
-        + (" Means over the seeds." if len(found.seeds) > 1 else ""),
-    )
+    title = f"{found.run.name}, seed {seeds}, {found.updates} updates: {found.levels}{some}"
+    caption = "Means over the seeds." if len(found.seeds) > 1 else ""
+    table = Table(box=SIMPLE_HEAD, title=Text(title), caption=caption)
     table.add_column("level", overflow="fold", min_width=16)
-    for column in ("size", "path", "steps", "success", "return", "greedy"):
-        table.add_column(column, justify="right")
+    for name in (*first[0].about, *first[0].results):
+        table.add_column(name.replace("_", " "), justify="right")
     for score in shown:
-        size = f"{score.height}x{score.width}"
         of_level = [other for other in found.scores if other.level == score.level]
-        table.add_row(
-            Text(score.level), size, str(score.path_length), str(score.max_steps), *_means(of_level)
-        )
+        about = [f"{value:g}" for value in score.about.values()]
+        table.add_row(Text(score.level), *about, *_means(of_level))
     table.add_section()
-    table.add_row(f"mean of {len(first)}", "", "", "", *_means(found.scores))
+    table.add_row(f"mean of {len(first)}", *[""] * len(first[0].about), *_means(found.scores))
     Console().print(table)
 
 
 def _hardest(scores: Sequence[Score]) -> list[Score]:
-    """All of a few levels; of many those with the least success, in their order."""
-    kept = {score.level for score in sorted(scores, key=lambda s: s.success)[:SHOWN]}
+    """All of a few levels; of many those with the least success, or return, in their order."""
+    ranked = sorted(scores, key=lambda s: s.results.get("success", s.results["return"]))
+    kept = {score.level for score in ranked[:SHOWN]}
     return [score for score in scores if score.level in kept]
 
 
 def _means(scores: Sequence[Score]) -> list[str]:
-    def mean(key: str) -> float:
-        return sum(float(getattr(score, key)) for score in scores) / len(scores)
+    names = scores[0].results
+    means = {name: sum(score.results[name] for score in scores) / len(scores) for name in names}
+    return [f"{m:.1%}" if "success" in name else f"{m:.3f}" for name, m in means.items()]
 
-    return [f"{mean('success'):.1%}", f"{mean('mean_return'):.3f}", f"{mean('greedy_success'):.0%}"]
+
+def _sheet(found: Evaluation) -> bytes:
+    """Pictures of the first Solver on the hardest levels side by side, a PNG file."""
+    scores = _hardest([score for score in found.scores if score.solver == 0])
+    columns = min(COLUMNS, len(scores))
+    rows = -(-len(scores) // columns)
+    figure = Figure(figsize=(max(SIDE * columns, 5), (SIDE + 0.45) * rows + 0.7), layout="tight")
+    # Names come from files: a dollar sign in one is no formula.
+    figure.suptitle(f"{found.run.name}, {found.updates} updates", fontsize=9, parse_math=False)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, score in zip(grid.flat, scores, strict=False):
+        axes.imshow(score.picture())
+        result = score.results.get("success", score.results["return"])
+        caption = f"{score.level}: {result:.3g}\n{score.note}"
+        axes.set_title(caption, fontsize=7, parse_math=False)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=110)
+    return file.getvalue()
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bin/eval",
-        description="Evaluates a trained Solver on levels of any size, one by one: success and "
-        "return of the sampled and of the greedy policy, exactly.",
-        epilog="docs/levels.md describes the files of levels and the sets that come along.",
+        description="Evaluate a trained Solver on named levels, one by one. For mazes: on levels of "
+        "any size, success and return of the sampled and of the greedy policy, exactly.",
+        epilog="docs/levels.md describes the files of mazes and the sets that come along.",
     )
     parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")
     parser.add_argument(
-        "--levels", default="shapes", metavar="FILE|NAME",
-        help=f"a file that ends in {' or '.join(SUFFIXES)}, a distribution of the run such as id "
-        f"or ood, or a set that comes along: {', '.join(shipped_sets())} (shapes)",
-    )  # fmt: skip
+        "--levels",
+        metavar="FILE|NAME",
+        help="a distribution of the run such as id or ood; for mazes also a file that ends in .txt "
+        "or .json, or a set that comes along, such as shapes, which is the default",
+    )
     parser.add_argument(
-        "--max-steps", type=_steps, metavar="N",
-        help="step limit of every level (a distribution: the run's; others: that, or "
-        f"{SLACK} for each move of the shortest path if this is more)",
-    )  # fmt: skip
+        "--max-steps",
+        type=_steps,
+        metavar="N",
+        help="step limit of every level (mazes: the run's, or on levels that are none of a "
+        "distribution 2 for each move of the shortest path if this is more)",
+    )
     parser.add_argument(
         "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"
     )
@@ -274,8 +239,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _steps(text: str) -> int:
-    number = int(text)
-    if not 1 <= number <= MOST_STEPS:
+    number = positive(text)
+    if number > MOST_STEPS:
         raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_STEPS:,}, got {number}")
     return number
 

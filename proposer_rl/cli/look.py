@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,14 +15,14 @@ from torch import Tensor
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.snr import checkpoints, refuse
-from proposer_rl.curricula import FrozenProposer
-from proposer_rl.mazes.task import MazeTask
+from proposer_rl.cli.errors import command
+from proposer_rl.cli.stored import check_output, checkpoints, write_rows
+from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Parts, frozen_proposer
 from proposer_rl.models import draw, uniform_noise
-from proposer_rl.runs.checkpoint import CheckpointError, load_checkpoint
-from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.checkpoint import load_checkpoint
 from proposer_rl.streams import Streams
+from proposer_rl.task import Space, Task
 
 SAMPLES = 64  # batches drawn from a policy to know its mean composition
 
@@ -35,15 +35,18 @@ class Stage(NamedTuple):
 
 
 def main() -> None:
-    """Entry point: exit code 0, 2 for bad input."""
-    arguments = _parser().parse_args()
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    command(partial(_run, _parser().parse_args()))
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    check_output("--output", arguments.output, (".json",))
     try:
         rows = look(arguments.proposer, arguments.solvers, arguments.seed)
-    except (ConfigError, CheckpointError, ValueError, OSError) as error:
-        refuse(str(error))
+    except ValueError as error:
+        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
     _print(rows)
-    if arguments.output is not None:
-        write_atomically(arguments.output, (json.dumps(rows, indent=1) + "\n").encode())
+    write_rows(rows, arguments.output)
 
 
 def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
@@ -51,46 +54,45 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
 
     Args:
         proposer: the folder of the run that it learnt in.
-        solvers: the folder of the run whose checkpoints hold the Solvers; same mazes.
+        solvers: the folder of the run whose checkpoints hold the Solvers; same task.
         seed: of the validation and probe levels.
 
     Returns:
         For every stage and everything that is seen of a Solver, in turn taken from the first or the
-        last stage instead: the mean obstacle fraction and path length of the proposals, and their
+        last stage instead: the mean of the proposals along each axis of the space, and their
         distance (total variation, 0 to 1) from those to the Solver as it is.
     """
     config = saved_config(proposer)
     task = make_task(config)
-    frozen = frozen_proposer(Parts(task, config.proposer, seed), str(proposer))
-    assert isinstance(frozen, FrozenProposer)
+    frozen = frozen_proposer(Parts(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
     stages = _stages(task, frozen, checkpoints(solvers))
     rows = []
     for stage in stages:
-        shares = _shares(frozen, stage.seen, task.solver.problems)
-        rows.append(_row(task, stage, "as it is", shares, shares))
+        shares = _shares(frozen, stage.seen, task.batch_size)
+        rows.append(_row(task.space, stage, "as it is", shares, shares))
         for part in ("probes", *config.proposer.observes):
             for name, other in (("first", stages[0]), ("last", stages[-1])):
                 if part == "progress" or other is stage:
                     continue
                 swapped = stage.seen.clone().set(part, other.seen[part])
-                changed = _shares(frozen, swapped, task.solver.problems)
-                rows.append(_row(task, stage, f"{part} of the {name}", changed, shares))
+                changed = _shares(frozen, swapped, task.batch_size)
+                rows.append(_row(task.space, stage, f"{part} of the {name}", changed, shares))
     return rows
 
 
-def _stages(task: MazeTask, frozen: FrozenProposer, files: list[Path]) -> list[Stage]:
-    solver = task.solvers([Streams(0)])
+def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path]) -> list[Stage]:
+    learner = task.learner([Streams(0)])
     stages = []
     for file in files:
         _, state = load_checkpoint(file)
-        solver.restore(TensorDict(state["solver"], [1]))
-        stages.append(Stage(state["updates"], frozen.view.observe(solver.agent, 0.0)))
+        learner.restore(TensorDict(state["solver"], [1]))
+        stages.append(Stage(state["updates"], frozen.view.observe(learner.agent, 0.0)))
     return stages
 
 
 @torch.no_grad()
-def _shares(frozen: FrozenProposer, seen: TensorDict, problems: int) -> Tensor:
+def _shares(frozen: ProposerCurriculum, seen: TensorDict, batch_size: int) -> Tensor:
     """Mean composition of the proposals, float [N]."""
     distribution = frozen.agent.distribution(frozen.agent(seen.expand(SAMPLES).clone()))
     if frozen.own_action == "mode":
@@ -100,39 +102,39 @@ def _shares(frozen: FrozenProposer, seen: TensorDict, problems: int) -> Tensor:
         generator = Streams(0, "look").generator(device=seen.device)
         shape = torch.Size([1, *distribution.batch_shape, *distribution.event_shape])
         action = draw(distribution, uniform_noise(shape, 1, [generator], seen.device)[0, 0])
-    generators = [Streams(0, "look", k).generator(device=seen.device) for k in range(SAMPLES)]
-    choices = frozen.proposals.draw(action, problems, generators)
-    return choices.flatten().bincount(minlength=frozen.proposals.choices) / choices.numel()
+    generators = [Streams(0, "look", k).generator() for k in range(SAMPLES)]
+    choices = frozen.actions.draw(action.cpu(), batch_size, generators)
+    return choices.flatten().bincount(minlength=frozen.actions.bins) / choices.numel()
 
 
 def _row(
-    task: MazeTask, stage: Stage, what: str, shares: Tensor, reference: Tensor
+    space: Space, stage: Stage, what: str, shares: Tensor, reference: Tensor
 ) -> dict[str, Any]:
-    fractions, lengths = task.space.decode(torch.arange(task.space.size, device=shares.device))
+    table = shares.unflatten(0, [len(values) for values in space.axes.values()])
+    means = {
+        name: float((table.movedim(i, 0).flatten(1).sum(1) * torch.tensor(values)).sum())
+        for i, (name, values) in enumerate(space.axes.items())
+    }
     return {
         "updates": stage.updates,
-        "return": float(stage.seen["validation_return"]),
+        "return": float(stage.seen["return"]),
         "seen": what,
-        "obstacle_fraction": float(shares @ fractions.to(shares.dtype)),
-        "path_length": float(shares @ lengths.to(shares.dtype)),
+        **means,
         "distance": float((shares - reference).abs().sum() / 2),
-        "distance_from_even": float((shares - 1 / task.space.size).abs().sum() / 2),
-        "shares": shares.unflatten(0, task.space.shape).tolist(),
+        "distance_from_even": float((shares - 1 / space.size).abs().sum() / 2),
+        "shares": table.tolist(),
     }
 
 
 def _print(rows: list[dict[str, Any]]) -> None:
+    numbers = [key for key in rows[0] if key not in ("updates", "seen", "shares")]
     table = Table(
-        "updates", "measured", "seen of the Solver", "fraction", "length", "changed", "from even",
-        caption="Mean obstacle fraction and path length of the proposals; distances are total "
-        "variation: from the proposals to the Solver as it is, and from the even mixture.",
+        "updates", "seen of the Solver", *(name.replace("_", " ") for name in numbers),
+        caption="Means of the proposals along each axis; distances are total variation: from the "
+        "proposals to the Solver as it is, and from the even mixture.",
     )  # fmt: skip
     for row in rows:
-        numbers = ("obstacle_fraction", "path_length", "distance", "distance_from_even")
-        table.add_row(
-            str(row["updates"]), f"{row['return']:.3f}", row["seen"],
-            *(f"{row[key]:.3f}" for key in numbers),
-        )  # fmt: skip
+        table.add_row(str(row["updates"]), row["seen"], *(f"{row[key]:.3f}" for key in numbers))
     Console().print(table)
 
 

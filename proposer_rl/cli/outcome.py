@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from rich.console import Console
 from tqdm import tqdm
 
-from proposer_rl.cli.config import RunConfig
+from proposer_rl.cli.config import PACKAGE, RunConfig
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.terminal import screen
@@ -30,10 +30,10 @@ def run_name(config: RunConfig) -> str:
 
 def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     """What the run is, and what it is made with: method, seeds, machine, versions."""
-    device = experiment.solver.env.device
+    device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
     packages = ("proposer_rl", "torch", "torchrl", "tensordict", "hydra-core")
-    parameters = sum(p.numel() for p in experiment.solver.agent.parameters())
+    parameters = sum(p.numel() for p in experiment.learner.agent.parameters())
     return {
         "method": config.method,
         "scale": config.scale,
@@ -41,14 +41,28 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "seed": config.seed,
         "seeds": config.seeds,
         "overrides": list(HydraConfig.get().overrides.task),
+        "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
         "solver_parameters": parameters,
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": torch.get_num_threads(),
-        "collector": config.collector,
-        "workers": config.workers,
+        "collector": config.compute.collector,
+        "workers": config.compute.workers,
         "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
     }
+
+
+def _config_folder() -> str | None:
+    """The folder given with ``--config-dir``."""
+    sources = HydraConfig.get().runtime.config_sources
+    return next((source.path for source in sources if source.provider == "command-line"), None)
+
+
+def _python_path() -> str | None:
+    """The caller's PYTHONPATH: that of this process without the checkout, which bin/ adds."""
+    own = str(PACKAGE.parent)
+    given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+    return os.pathsep.join(part for part in given if part != own) or None
 
 
 def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:
@@ -77,5 +91,5 @@ def _cost_text(result: dict[str, Any], seeds: int) -> str:
     together = f" for each of {seeds} seeds" if seeds > 1 else ""
     return (
         f"Cost: {result['frames']:,} frames of the Solver{together}, "
-        f"{result['meta_frames']:,} of its copies, {result['seconds']:.0f} s."
+        f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
     )

@@ -7,9 +7,8 @@ from typing import Any
 from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
 from proposer_rl.runs.folder import RunFolder
 
-# What may differ: where and how it is computed, saved and shown, and a longer schedule.
-FREE = {"device", "graphs", "threads", "cores", "progress", "logger"}
-FREE |= {"collector", "workers", "worker_devices", "ray_address"}
+# What may differ: where it is computed and shown, and a longer schedule.
+FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
 

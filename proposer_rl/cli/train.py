@@ -8,26 +8,24 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from signal import SIGINT
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
-from proposer_rl.cli.build import build, parts
+from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
-from proposer_rl.cli.errors import FORESEEN, SIGNALLED, exit_code, one_line, refuse
+from proposer_rl.cli.errors import SIGNALLED, UNFORESEEN, command, exit_code, one_line, refuse
 from proposer_rl.cli.outcome import announce, identity, run_name
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
-from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment
-from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes.task import MazeTask
+from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder
@@ -40,36 +38,42 @@ def main() -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     # Hydra then lets its errors through, so that they can be told in one line.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    command(_compose_and_run)
+
+
+def _compose_and_run() -> None:
+    _refuse_pickles(sys.argv)
     try:
-        _refuse_pickles(sys.argv)
         _main()
-    except FORESEEN as error:
-        refuse(error)
+    except MissingConfigException as error:
+        known = f"; choose one of: {', '.join(error.options)}" if error.options else ""
+        raise ConfigError(f"{error.missing_cfg_file}: unknown{known}") from error
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(one_line(error)) from error
     except ValueError as error:
         if HydraConfig.initialized():
             raise
-        refuse(ConfigError(str(error)))  # Hydra's, of an override such as +method=3
-    except KeyboardInterrupt:
-        sys.exit(SIGNALLED + SIGINT)
+        raise ConfigError(one_line(error)) from error  # of an override such as +method=3
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
     path = Path(HydraConfig.get().runtime.output_dir)
+    signals = StopSignals()
     try:
         forget_failure(path)
         check_order(HydraConfig.get().overrides.task)
         config = read_config(hydra_config)
-        made = parts(config)  # whatever is wrong with the input is found here
-        with locked(path), StopSignals() as signals:
+        made = parts(config, signals)  # whatever is wrong with the input is found here
+        with locked(path), signals:
             try:
-                return live(config, *made, path, signals)
+                return live(config, made, path, signals)
             finally:
-                made[2].close()
+                made.curriculum.close()
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error), exit_code(error))
-        if isinstance(error, FORESEEN):
+        if exit_code(error) != UNFORESEEN:
             refuse(error)
         raise
 
@@ -80,21 +84,12 @@ def _refuse_pickles(arguments: list[str]) -> None:
         raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
 
 
-def live(
-    config: RunConfig,
-    task: MazeTask,
-    solver: PPO,
-    curriculum: Curriculum,
-    path: Path,
-    signals: StopSignals,
-) -> float:
+def live(config: RunConfig, made: Made, path: Path, signals: StopSignals) -> float:
     """Run all lifetimes: one Solver after another, on a curriculum that goes on learning.
 
     Args:
         config: the run's settings.
-        task: as :func:`parts` makes it.
-        solver: as :func:`parts` makes it; that of the first lifetime.
-        curriculum: as :func:`parts` makes it.
+        made: as :func:`parts` makes it; the Solvers are those of the first lifetime.
         path: the run's folder, which has one for each lifetime if there are several.
         signals: which may ask the run to stop.
 
@@ -106,17 +101,18 @@ def live(
     for lifetime in range(config.lifetimes):
         folder = RunFolder(path / f"lifetime_{lifetime}" if config.lifetimes > 1 else path)
         # What `auto` has become, so that a run does not go on in another precision elsewhere.
-        check_same_run(folder, config.model_copy(update={"precision": task.precision}))
+        check_same_run(folder, config.model_copy(update={"precision": made.task.precision}))
         scope: tuple[str | int, ...] = ()
         if before is not None:
             scope = ("lifetime", lifetime)
-            solver = task.solvers([Streams(seed, *scope, "solver") for seed in config.seeds])
+            streams = [Streams(seed, *scope, "solver") for seed in config.seeds]
+            made = made._replace(learner=made.task.learner(streams))
             latest = load_latest(before.path / "checkpoints")
             if latest is None:
                 raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
-            curriculum.load_state_dict(latest[1]["curriculum"])
-            curriculum.begin()
-        value = run(build(config, task, solver, curriculum, folder, signals, scope), config)
+            made.curriculum.load_state_dict(latest[1]["curriculum"])
+            made.curriculum.begin()
+        value = run(build(config, made, folder, signals, scope), config)
         before = folder
     return value
 
@@ -133,7 +129,8 @@ def run(experiment: Experiment, config: RunConfig) -> float:
     if finished is not None:
         tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {folder.path}")
         return _value(finished, config)
-    folder.write_json("run.json", {**facts, "planned_updates": config.schedule.updates})
+    described = {"planned_updates": config.schedule.updates, "task": experiment.task.facts}
+    folder.write_json("run.json", {**facts, **described})
     try:
         result = experiment.run()
     except Interrupted as stop:

@@ -1,18 +1,17 @@
 """What the Solver trains on."""
 
-from proposer_rl.curricula.base import Advance, Curriculum, Improvement
-from proposer_rl.curricula.frozen_proposer import FrozenProposer, load_agent
-from proposer_rl.curricula.proposer import ProposerCurriculum, total_gain
-from proposer_rl.curricula.sampling import SamplingCurriculum, ScheduleCurriculum
+from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
+from proposer_rl.curricula.sampling import SamplingCurriculum
+from proposer_rl.curricula.schedule import ScheduleCurriculum
 
 __all__ = [
     "Advance",
     "Curriculum",
-    "FrozenProposer",
     "Improvement",
+    "Proposal",
     "ProposerCurriculum",
+    "ProposerTrainer",
     "SamplingCurriculum",
     "ScheduleCurriculum",
-    "load_agent",
-    "total_gain",
 ]

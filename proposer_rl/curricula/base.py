@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
-from tensordict import TensorDictBase
-
-from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
+
+
+class Proposal(NamedTuple):
+    """What a learner is to train on next.
+
+    Attributes:
+        levels: [K, P].
+        frames: environment steps that choosing them cost each Solver.
+        evaluations: levels on which each Solver was evaluated for it.
+    """
+
+    levels: Any
+    frames: int = 0
+    evaluations: int = 0
 
 
 @dataclass
@@ -32,50 +44,57 @@ class Improvement:
     """What a curriculum did before a cycle.
 
     Attributes:
-        metrics: of the cycle, ready for JSON; empty if nothing was done.
-        meta_frames: inner environment steps that it cost, beyond the Solver's own.
+        metrics: of the cycle, ready for JSON; empty if there is nothing to tell.
+        frames: environment steps that it cost each Solver, beyond its own.
+        evaluations: levels on which policies were evaluated for it, for each Solver.
         advance: None if the Solver is as it was.
     """
 
     metrics: dict[str, Any] = field(default_factory=dict)
-    meta_frames: int = 0
+    frames: int = 0
+    evaluations: int = 0
     advance: Advance | None = None
 
 
 class Curriculum:
     """The interface of curricula; each method does nothing unless a curriculum has use for it.
 
-    A Solver is a :class:`~proposer_rl.learning.ppo.PPO` of a population of K; ``streams`` has the K copies'
-    random streams for the present update or cycle.
-
-    Attributes:
-        most_solvers: the largest K that it serves; None for any.
-        uses_workers: whether it has work for further processes.
+    A learner is a :class:`~proposer_rl.learning.PPO` of a population of K Solvers; ``streams`` are
+    the random streams of each, for the present update or cycle. A curriculum that is made of others
+    passes everything on to them.
     """
-
-    most_solvers: ClassVar[int | None] = None
-    uses_workers: ClassVar[bool] = False
 
     def begin(self) -> None:
         """A fresh Solver begins: forget the last one, but not what was learnt from it."""
 
-    def propose(self, solver: PPO, streams: Sequence[Streams]) -> Any:
-        """Levels [K, P] for the Solver's next update."""
-        raise TypeError(f"{type(self).__name__} must define propose(solver, streams)")
-
-    def observe(self, levels: Any, rollout: TensorDictBase) -> None:
-        """Learn from an update: its levels [K, P] and the Solver's transitions [K, P, T]."""
-
-    def improve(
-        self, solver: PPO, streams: Sequence[Streams], pause: Callable[[], None] | None = None
-    ) -> Improvement:
-        """Prepare for the next cycle, whose first update has not begun.
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
+        """Levels [K, P] for the learner's next update.
 
         Args:
-            solver: as it is before the cycle.
+            learner: as it is.
+            updates: how many it has made.
+            streams: of the update.
+        """
+        raise TypeError(f"{type(self).__name__} must define propose(learner, updates, streams)")
+
+    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
+        """Learn from an update.
+
+        Args:
+            learner: after it.
+            levels: [K, P], what it trained on.
+            update: the rollout on them [K, P, T], and what the training was like.
+        """
+
+    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
+        """Prepare for the next cycle, whose first update has not begun.
+
+        Whatever is raised in it may be followed by :meth:`load_state_dict` and a repeated call.
+
+        Args:
+            learner: as it is before the cycle.
+            updates: how many it has made.
             streams: of the cycle.
-            pause: to be called now and then by a curriculum that takes long: wherever a repeated
-                call, after :meth:`load_state_dict`, would go on from :meth:`state_dict`.
         """
         return Improvement()
 

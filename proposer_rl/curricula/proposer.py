@@ -1,173 +1,242 @@
-"""The Proposer as a curriculum: it learns in the meta-environment, then proposes."""
+"""A Proposer as a curriculum: what it proposes for what it sees, and how it learns to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Advance, Improvement
-from proposer_rl.curricula.frozen_proposer import FrozenProposer
-from proposer_rl.learning.divergence import located
-from proposer_rl.learning.ppo import PPO
+from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.learning import PPO, located
+from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.copies import Copies, CopiesHere
 from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.view import SolverView
+from proposer_rl.models import ActorCritic, draw
 from proposer_rl.streams import Streams
 
-ADVANCES = ("train", "best", "random")
 
+class ProposerCurriculum(Curriculum):
+    """The Solver trains on the proposals of an agent, which learns from copies of the Solver.
 
-class ProposerCurriculum(FrozenProposer):
-    """Proposals of an agent that is trained on what they do to copies of the Solver.
-
-    Before each cycle K copies of the Solver go through one episode of the meta-environment; the
-    Proposer's PPO learns from them; then the Solver itself trains on the Proposer's proposals.
+    With a trainer, before each cycle K copies of the Solver go through one episode of the
+    meta-environment, and the Proposer's PPO learns from them. Without one it is frozen. Then the
+    Solver itself trains on the Proposer's proposals.
 
     Args:
-        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` and
-            whose horizon is the number of steps of that environment's episodes.
-        own_action: what is proposed to the Solver itself; see :class:`FrozenProposer`.
-        copies: where the copies are rolled out; None for the Proposer's own environment, in this
-            process.
-        advance: ``"train"``: the Solver trains on new proposals; ``"best"`` or ``"random"``: it
-            becomes the copy with the greatest total gain, or any, with its optimiser.
-        table: arranges counts of the choices, int64 [N], for the record.
-
-    Raises:
-        ValueError: for an unknown ``advance`` or ``own_action``, or a horizon other than the
-            episode's.
+        agent: the Proposer.
+        view: what it sees of the Solver; new levels at every cycle.
+        actions: the levels that its actions stand for.
+        meta_episode_length: updates L of the episodes in which it learns or has learnt, from which
+            it knows how far a cycle has gone.
+        action_repeat: updates for which an action holds.
+        own_action: the action for the Solver itself: a ``"sample"`` of the policy, or its
+            ``"mode"``, without exploration.
+        trainer: how it learns; None to leave it as it is.
     """
-
-    uses_workers = True
 
     def __init__(
         self,
-        proposer: PPO,
+        agent: ActorCritic,
+        view: SolverView,
+        actions: Actions,
         *,
-        copies: Copies | None = None,
-        own_action: str = "sample",
-        advance: str = "train",
-        table: Callable[[Tensor], Tensor] | None = None,
+        meta_episode_length: int,
+        action_repeat: int,
+        own_action: Literal["sample", "mode"],
+        trainer: ProposerTrainer | None = None,
     ) -> None:
-        env = proposer.env
-        if not isinstance(env, SolverTrainingEnv):
-            raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
-        if advance not in ADVANCES:
-            raise ValueError(f"advance must be one of {list(ADVANCES)}, got {advance!r}")
-        if proposer.settings.horizon != env.steps:
-            raise ValueError(
-                f"the Proposer's horizon {proposer.settings.horizon} must be the "
-                f"meta-environment's number of steps, {env.steps}"
-            )
-        super().__init__(
-            proposer.agent,
-            env.view,
-            env.proposals,
-            episode_length=env.episode_length,
-            updates_per_step=env.updates_per_step,
-            own_action=own_action,
-        )
-        self.proposer = proposer
-        self.env = env
-        self.copies = copies or CopiesHere(proposer)
-        self.advance = advance
-        self._table = table or (lambda counts: counts)
-        self._begun: dict[str, Any] | None = None
+        self.agent = agent
+        self.view = view
+        self.actions = actions
+        self.meta_episode_length = meta_episode_length
+        self.action_repeat = action_repeat
+        self.own_action = own_action
+        self.trainer = trainer
+        self._began = 0  # the Solver's updates at the start of this cycle
+        self._action: Tensor | None = None
 
-    def improve(
-        self, solver: PPO, streams: Sequence[Streams], pause: Callable[[], None] | None = None
-    ) -> Improvement:
-        """Roll K copies of the Solver out and train the Proposer on their gains."""
-        (stream,) = streams
-        env = self.env
-        self._updates = 0
-        begun, self._begun = self._begun, None
-        rollout = self.copies.roll_out(solver.snapshot()[0], stream, pause, begun)
-        with located("the Proposer"):
-            training = self.proposer.optimise(rollout)
-            self.proposer.check()
-        gains = total_gain(rollout)
-        inner = env.solvers
-        frames = inner.env.batch_size.numel() * inner.settings.horizon * env.episode_length
-        advance = self._advance(solver, gains, stream)
-        return Improvement(self._metrics(rollout, gains, training), frames, advance)
-
-    def frozen(self) -> FrozenProposer:
+    def frozen(self) -> ProposerCurriculum:
         """The Proposer as it is, proposing without learning; it shares network and view."""
-        return FrozenProposer(
+        return ProposerCurriculum(
             self.agent,
             self.view,
-            self.proposals,
-            episode_length=self.episode_length,
-            updates_per_step=self.updates_per_step,
+            self.actions,
+            meta_episode_length=self.meta_episode_length,
+            action_repeat=self.action_repeat,
             own_action=self.own_action,
         )
 
+    def begin(self) -> None:
+        """Forget the last Solver's cycle."""
+        self._began, self._action = 0, None
+
+    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
+        """Look at the Solver through new levels, and let the trainer train."""
+        (stream,) = streams
+        self._began = updates
+        if self.trainer is not None:
+            return self.trainer.train(learner, stream)
+        self.view.draw_levels(stream)
+        return Improvement()
+
+    @torch.no_grad()
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
+        """Levels [1, P] of the Proposer's policy, given what it sees of the Solver."""
+        (stream,) = streams
+        evaluations = 0
+        if (updates - self._began) % self.action_repeat == 0:
+            self._action = self._act(learner, updates - self._began, stream)
+            evaluations = self.view.validation_levels
+        assert self._action is not None
+        batch_size = learner.env.batch_size[1:].numel()
+        levels, _ = self.actions.levels(self._action, batch_size, [stream])
+        return Proposal(levels, evaluations=evaluations)
+
     def state_dict(self) -> dict[str, Any]:
-        """That of the cycle, with the Proposer's weights and optimiser, and a begun episode."""
+        """Where the cycle's levels come from, how far it is, the action that holds; the trainer."""
         return {
-            **super().state_dict(),
-            "proposer": self.proposer.snapshot().to_dict(),
-            "episode": self.copies.episode(),
+            "streams": self.view.streams.address,
+            "began": self._began,
+            "action": self._action,
+            "proposer": None if self.trainer is None else self.trainer.learner.snapshot().to_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the Proposer and the cycle back."""
-        super().load_state_dict(state)
-        self.proposer.restore(TensorDict(state["proposer"], batch_size=[]))
-        self._begun = state["episode"]
+        """Go on within a cycle."""
+        self.view.draw_levels(Streams(*state["streams"]))
+        self._began = int(state["began"])
+        action = state["action"]
+        self._action = None if action is None else action.to(self.view.task.device)
+        if self.trainer is not None:
+            self.trainer.learner.restore(TensorDict(state["proposer"], batch_size=[]))
 
     def close(self) -> None:
         """Let go of the copies that are elsewhere."""
-        self.copies.close()
+        if self.trainer is not None:
+            self.trainer.copies.close()
 
-    def _advance(self, solver: PPO, gains: Tensor, stream: Streams) -> Advance | None:
+    def _act(self, learner: PPO, updates: int, stream: Streams) -> Tensor:
+        progress, device = updates / self.meta_episode_length, self.view.task.device
+        # -1: an episode's number that no rollout of the copies has.
+        state = self.view.observe(learner.agent, progress, -1, updates)
+        distribution = self.agent.distribution(self.agent(state))
+        if self.own_action == "mode":
+            return distribution.mode
+        generator = stream.generator("proposals", device=device)
+        shape = (1, *distribution.batch_shape[1:], *distribution.event_shape)
+        return draw(distribution, torch.rand(shape, generator=generator, device=device))
+
+
+class ProposerTrainer:
+    """Trains a Proposer on what its proposals do to K copies of the Solver.
+
+    Args:
+        learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
+            horizon is the number of steps of that environment's episodes.
+        copies: where the copies are rolled out; None for the learner's own environment, in this
+            process.
+        advance: ``"train"``: the Solver trains on new proposals; ``"best"`` or ``"random"``: it
+            becomes the copy with the greatest total reward, or any, with its optimiser.
+
+    Raises:
+        ValueError: for an environment of another kind, or a horizon other than the episode's.
+    """
+
+    def __init__(
+        self,
+        learner: PPO,
+        copies: Copies | None = None,
+        advance: Literal["train", "best", "random"] = "train",
+    ) -> None:
+        env = learner.env
+        if not isinstance(env, SolverTrainingEnv):
+            raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
+        if learner.settings.horizon != env.steps:
+            raise ValueError(
+                f"the Proposer's horizon {learner.settings.horizon} must be the "
+                f"meta-environment's number of steps, {env.steps}"
+            )
+        self.learner = learner
+        self.env = env
+        self.copies = copies or CopiesHere(learner)
+        self.advance = advance
+
+    def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
+        """The curriculum of this Proposer while it learns."""
+        env = self.env
+        return ProposerCurriculum(
+            self.learner.agent,
+            env.view,
+            env.actions,
+            meta_episode_length=env.meta_episode_length,
+            action_repeat=env.action_repeat,
+            own_action=own_action,
+            trainer=self,
+        )
+
+    def train(self, solver: PPO, stream: Streams) -> Improvement:
+        """Roll K copies of the Solver out and train the Proposer on their rewards."""
+        env = self.env
+        rollout = self.copies.roll_out(solver.snapshot()[0], stream)
+        with located("the Proposer"):
+            training = self.learner.optimise(rollout)
+            self.learner.check()
+        rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
+        copies = len(rewards)
+        frames = copies * env.batch_of_levels * env.solvers.settings.horizon
+        return Improvement(
+            self._metrics(rollout, rewards, training),
+            frames * env.meta_episode_length,
+            # Every copy after each of its actions, and all of them once at the start.
+            copies * (env.steps + 1) * env.view.validation_levels,
+            self._advance(solver, rewards, stream),
+        )
+
+    def _advance(self, solver: PPO, rewards: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
             return None
-        copies = gains.shape[0]
-        if self.advance == "best":
-            chosen = int(gains.argmax())
-        else:
+        chosen = int(rewards.argmax())
+        if self.advance == "random":
             generator = stream.generator("advance")
-            chosen = int(torch.randint(copies, (), generator=generator))
+            chosen = int(torch.randint(len(rewards), (), generator=generator))
         trained = self.copies.trained(chosen)
         solver.restore(trained.solver)
-        return Advance(self.env.episode_length, trained.levels, trained.update)
+        return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 
     def _metrics(
-        self, rollout: TensorDictBase, gains: Tensor, training: TensorDict
+        self, rollout: TensorDictBase, rewards: Tensor, training: TensorDict
     ) -> dict[str, Any]:
-        proposed = rollout["next", "proposed"].sum((0, 1))
+        proposed = rollout["next", "proposed"].sum((0, 1))  # [N]
+        sides = [len(axis) for axis in self.env.actions.space.axes.values()]
+        gains = {
+            f"{name}_gain": (rollout["next", name][:, -1, 0] - rollout[name][:, 0, 0]).tolist()
+            for name in ("return", "log_success")
+            if name in rollout.keys()
+        }
         return {
-            "total_gain": gains.tolist(),
-            "gain_sd": float(gains.std(correction=0)),
-            "gain_explained": explained_share(rollout["action"], gains),
-            "total_reward": rollout["next", "reward"].sum((-2, -1)).tolist(),
-            "return_before": float(rollout["validation_return"][0, 0]),
+            **gains,
+            "total_reward": rewards.tolist(),
+            "reward_sd": float(rewards.std(correction=0)),
+            "reward_explained": explained_share(rollout["action"], rewards),
             **{key: float(value) for key, value in training.items()},
-            "histogram": self._table(proposed).tolist(),
+            "histogram": proposed.unflatten(0, sides).tolist(),
         }
 
 
-def total_gain(rollout: TensorDictBase) -> Tensor:
-    """Return on the validation levels after the episode minus before it, [K] from [K, T]."""
-    after = rollout["next", "validation_return"][:, -1, 0]
-    return after - rollout["validation_return"][:, 0, 0]
-
-
-def explained_share(action: Tensor, gains: Tensor) -> float | None:
-    """Share of the variance of total gains that a linear function of the actions explains.
+def explained_share(action: Tensor, rewards: Tensor) -> float | None:
+    """Share of the variance of total rewards that a linear function of the actions explains.
 
     A hint, for nothing, of how much of the reward a Proposer can learn from: with adjustment for
     the number of coefficients it is 0 on average where the actions do not matter, and at most 1.
-    ``proposer_rl.meta.signal`` measures the same without supposing linearity.
+    :mod:`proposer_rl.meta.signal` measures the same without supposing linearity.
 
     Args:
         action: [K, T, D]; the mean over the T steps counts.
-        gains: float [K].
+        rewards: float [K].
 
     Returns:
         The adjusted coefficient of determination; None where actions are no numbers, or too many
@@ -177,10 +246,10 @@ def explained_share(action: Tensor, gains: Tensor) -> float | None:
         return None
     copies, directions = action.shape[0], action.shape[-1]
     spare = copies - 1 - directions
-    if spare < 1 or float(gains.var()) == 0:
+    if spare < 1 or float(rewards.var()) == 0:
         return None
-    actions, gains = action.mean(1).cpu().double(), gains.cpu().double()
+    actions, rewards = action.mean(1).cpu().double(), rewards.cpu().double()
     design = torch.cat([torch.ones(copies, 1, dtype=torch.double), actions], 1)
-    fitted = design @ torch.linalg.lstsq(design, gains[:, None]).solution
-    residual = (gains - fitted[:, 0]).square().sum() / spare
-    return float(1 - residual / gains.var())
+    fitted = design @ torch.linalg.lstsq(design, rewards[:, None]).solution
+    residual = (rewards - fitted[:, 0]).square().sum() / spare
+    return float(1 - residual / rewards.var())

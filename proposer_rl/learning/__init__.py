@@ -1,1 +1,18 @@
 """PPO of one agent, or of K copies of it at once."""
+
+from proposer_rl.learning.advantages import LeaveOneOutBaseline
+from proposer_rl.learning.divergence import DivergedError, located
+from proposer_rl.learning.ppo import PPO, MakeLoss, RolloutPolicy, Update
+from proposer_rl.learning.rollout import first_episode_success, load_agent
+
+__all__ = [
+    "PPO",
+    "DivergedError",
+    "LeaveOneOutBaseline",
+    "MakeLoss",
+    "RolloutPolicy",
+    "Update",
+    "first_episode_success",
+    "load_agent",
+    "located",
+]

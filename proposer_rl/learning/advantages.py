@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives.value.functional import reward2go
 
 
-class CopiesBaseline(TensorDictModuleBase):
+class LeaveOneOutBaseline(TensorDictModuleBase):
     """The return to come, minus what the other copies had to come at the same step.
 
     Where all K episodes start from one state, the others' mean return is an unbiased estimate of
@@ -28,7 +28,7 @@ class CopiesBaseline(TensorDictModuleBase):
         >>> reward = torch.tensor([1.0, 2.0, 6.0]).view(3, 1, 1)
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({"next": {"reward": reward, "done": reward > 0}}, [3, 1])
-        >>> CopiesBaseline(gamma=1.0)(rollout)["advantage"].flatten()
+        >>> LeaveOneOutBaseline(gamma=1.0)(rollout)["advantage"].flatten()
         tensor([-3.0000, -1.5000,  4.5000])
     """
 

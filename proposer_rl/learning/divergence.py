@@ -13,6 +13,8 @@ from torch import Tensor, nn
 class DivergedError(ArithmeticError):
     """A number is not finite; the message is one line that says which, and in which copy."""
 
+    exit_code = 3
+
 
 def require_finite(
     reward: Tensor, steps: TensorDictBase, weights: Mapping[str, Tensor], copies: int | None

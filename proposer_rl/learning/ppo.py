@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
-from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
@@ -28,7 +27,7 @@ from proposer_rl.learning.adam import CopiesAdam
 from proposer_rl.learning.cuda_graphs import Captured, Recorder
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.models import ActorCritic, draw, uniform_noise
-from proposer_rl.settings import settings
+from proposer_rl.settings import PPOSettings
 
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
@@ -39,36 +38,6 @@ class Update(NamedTuple):
 
     rollout: TensorDictBase
     metrics: TensorDict
-
-
-@settings
-class PPOSettings:
-    """PPO's numbers; the defaults are the paper's for the Solver.
-
-    Attributes:
-        horizon: steps T collected from every environment before an update.
-        updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
-        epochs: gradient steps of an update, each on the full batch.
-        learning_rate, adam_eps: Adam's step size and denominator offset.
-        gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
-        clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
-        entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
-        max_grad_norm: largest gradient norm of one copy.
-        normalize_advantage: standardise advantages over each copy's batch.
-    """
-
-    horizon: Annotated[int, Ge(1)] = 25
-    updates: Annotated[int, Ge(1)] = 1
-    epochs: Annotated[int, Ge(1)] = 8
-    learning_rate: Annotated[float, Gt(0)] = 2.5e-4
-    adam_eps: Annotated[float, Gt(0)] = 1e-5
-    gamma: Annotated[float, Interval(ge=0, le=1)] = 0.99
-    lmbda: Annotated[float, Interval(ge=0, le=1)] = 0.95
-    clip_epsilon: Annotated[float, Interval(gt=0, lt=1)] = 0.2
-    entropy_coeff: Annotated[float, Ge(0)] = 0.01
-    critic_coeff: Annotated[float, Ge(0)] = 0.5
-    max_grad_norm: Annotated[float, Gt(0)] = 1.0
-    normalize_advantage: bool = True
 
 
 class PPO:

@@ -24,6 +24,7 @@ class LevelDistribution:
             :func:`~proposer_rl.mazes.generation.generate_levels`.
         height: H, cells.
         width: W, cells.
+        device: Where the levels are returned.
 
     Raises:
         ValueError: If a specification cannot be met, or there is none.
@@ -43,7 +44,9 @@ class LevelDistribution:
         mechanism: str = "uniform",
         height: int = 10,
         width: int = 10,
+        device: torch.device | str = "cpu",
     ) -> None:
+        self.device = torch.device(device)
         self.specifications = tuple(LevelSpec(*pair) for pair in specifications)
         self.mechanism = mechanism
         self.height = height
@@ -74,12 +77,7 @@ class LevelDistribution:
             torch.tensor(lengths, device=index.device)[index],
         )
 
-    def generate(
-        self,
-        index: Tensor,
-        generator: Generators = None,
-        device: torch.device | str | None = None,
-    ) -> Level:
+    def generate(self, index: Tensor, generator: Generators = None) -> Level:
         """Draws one level for each number.
 
         Args:
@@ -87,7 +85,6 @@ class LevelDistribution:
             generator: Source of randomness; None for the default one, a sequence for one of each
                 index of the first dimension (see
                 :func:`~proposer_rl.mazes.generation.generate_levels`).
-            device: Where the levels are returned; None for that of the numbers.
 
         Returns:
             Levels ``[*B]``, in the order of the numbers.
@@ -96,31 +93,25 @@ class LevelDistribution:
             ValueError: If a number is out of range.
         """
         fraction, length = self.decode(index.cpu())
-        target = index.device if device is None else device
-        return generate_levels(
-            fraction, length, self.height, self.width, self.mechanism, generator, target
-        )
+        grid = (self.height, self.width)
+        return generate_levels(fraction, length, *grid, self.mechanism, generator, self.device)
 
     def sample(
-        self,
-        batch_shape: int | Sequence[int] = (),
-        generator: torch.Generator | None = None,
-        device: torch.device | str | None = None,
+        self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Level:
         """Draws levels of uniformly random specifications.
 
         Args:
             batch_shape: ``[*B]``; a number for ``[B]``.
             generator: Source of randomness; None for the default one.
-            device: Where the levels are returned; None for the generator's device, else the CPU.
 
         Returns:
             Levels of batch shape ``[*B]``.
         """
-        target = _target_device(generator, device)
-        place = target if generator is None else generator.device
-        index = torch.randint(self.size, _shape(batch_shape), generator=generator, device=place)
-        return self.generate(index, generator, target)
+        shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
+        place = "cpu" if generator is None else generator.device
+        index = torch.randint(self.size, shape, generator=generator, device=place)
+        return self.generate(index, generator)
 
     def _check(self, index: Tensor) -> None:
         if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
@@ -128,10 +119,6 @@ class LevelDistribution:
                 f"specifications are numbered 0 to {self.size - 1}, "
                 f"got {int(index.min())} to {int(index.max())}"
             )
-
-
-def _shape(batch_shape: int | Sequence[int]) -> tuple[int, ...]:
-    return (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
 
 
 class SpecificationSpace(LevelDistribution):
@@ -151,8 +138,8 @@ class SpecificationSpace(LevelDistribution):
 
     Example:
         >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
-        >>> space.shape, space.size
-        ((2, 3), 6)
+        >>> space.size
+        6
         >>> space.specifications[4]
         LevelSpec(obstacle_fraction=0.2, path_length=4)
     """
@@ -164,16 +151,17 @@ class SpecificationSpace(LevelDistribution):
         mechanism: str = "uniform",
         height: int = 10,
         width: int = 10,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.obstacle_fractions = _distinct("obstacle_fractions", obstacle_fractions)
         self.path_lengths = _distinct("path_lengths", path_lengths)
         pairs = list(product(self.obstacle_fractions, self.path_lengths))
-        super().__init__(pairs, mechanism, height, width)
+        super().__init__(pairs, mechanism, height, width, device)
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """(M, N)."""
-        return len(self.obstacle_fractions), len(self.path_lengths)
+    def axes(self) -> dict[str, Sequence[float]]:
+        """The M fractions and N lengths, by name."""
+        return {"obstacle fraction": self.obstacle_fractions, "path length": self.path_lengths}
 
     @property
     def coordinates(self) -> Tensor:
@@ -182,7 +170,7 @@ class SpecificationSpace(LevelDistribution):
         Of an axis with a single value the coordinate is 0.
         """
         axes = []
-        for values in (self.obstacle_fractions, self.path_lengths):
+        for values in self.axes.values():
             axis = torch.tensor(values, dtype=torch.float32)
             middle, reach = (axis.max() + axis.min()) / 2, (axis.max() - axis.min()) / 2
             axes.append((axis - middle) / reach.clamp(min=torch.finfo(axis.dtype).tiny))
@@ -196,11 +184,3 @@ def _distinct(name: str, values: Sequence[Entry]) -> tuple[Entry, ...]:
     if len(set(values)) < len(values):
         raise ValueError(f"{name} must be distinct, got {list(values)}")
     return tuple(values)
-
-
-def _target_device(
-    generator: torch.Generator | None, device: torch.device | str | None
-) -> torch.device:
-    if device is not None:
-        return torch.device(device)
-    return torch.device("cpu") if generator is None else generator.device

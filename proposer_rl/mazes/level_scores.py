@@ -3,52 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from proposer_rl.mazes import Level, planes, shortest_path_length
+from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.evaluation import ExactEvaluator, policy_path
+from proposer_rl.mazes.levels import Level, planes
+from proposer_rl.mazes.rendering import draw_level
 from proposer_rl.models import ActorCritic, cell_logits
+from proposer_rl.task import Score
 
 AT_ONCE = 2**17  # cells that go through the network together
 
 
-@dataclass(frozen=True)
-class Score:
-    """What one Solver does on one level.
-
-    Attributes:
-        level: Its name.
-        solver: The Solver's number among those of a population.
-        height, width: Of the grid, in cells.
-        path_length: Moves on the shortest path.
-        max_steps: Steps after which an episode is truncated.
-        success: Probability that the sampled policy reaches the goal.
-        mean_return: Of the sampled policy, undiscounted.
-        greedy_success: 1 or 0: whether the most probable actions lead to the goal.
-        greedy_return: Of the greedy policy.
-        path: Cells (row, column) that the greedy policy visits.
-    """
-
-    level: str
-    solver: int
-    height: int
-    width: int
-    path_length: int
-    max_steps: int
-    success: float
-    mean_return: float
-    greedy_success: float
-    greedy_return: float
-    path: list[list[int]]
-
-
 @torch.no_grad()
 def score_levels(
-    solver: ActorCritic,
+    agent: ActorCritic,
     levels: Mapping[str, Level],
     max_steps: Callable[[int], int],
     step_penalty: float = 0.01,
@@ -60,14 +36,17 @@ def score_levels(
     go through it together.
 
     Args:
-        solver: K Solvers, from :func:`~proposer_rl.models.map_actor_critic` of a population.
+        agent: K Solvers, from :func:`~proposer_rl.models.map_actor_critic` of a population.
         levels: Levels of batch shape ``[]`` by their names.
         max_steps: The step limit of a level, given the length of its shortest path.
         step_penalty: Cost of a step.
         device: That of the Solvers.
 
     Returns:
-        One score for each level and Solver, in the levels' order.
+        One score for each level and Solver, in the levels' order. ``about``: ``height``, ``width``,
+        ``path_length`` (moves on the shortest path) and ``max_steps``. ``results``: ``success`` and
+        ``return`` of the sampled policy, and of the greedy one, which takes the most probable
+        actions, ``greedy_success`` (1 or 0) and ``greedy_return``.
     """
     groups: dict[tuple[int, int, int], list[str]] = {}
     lengths = {name: int(shortest_path_length(level)) for name, level in levels.items()}
@@ -79,15 +58,14 @@ def score_levels(
         remaining = iter(members)
         while names := list(islice(remaining, max(AT_ONCE // (height * width), 1))):
             batch: Any = torch.stack([levels[name] for name in names])
-            batch = batch.to(device)
             named = [(name, lengths[name]) for name in names]
-            scores += _scored(solver, batch, named, limit, step_penalty)
+            scores += _scored(agent, batch.to(device), named, limit, step_penalty)
     place = {name: number for number, name in enumerate(levels)}
     return sorted(scores, key=lambda score: (place[score.level], score.solver))
 
 
 def _scored(
-    solver: ActorCritic,
+    agent: ActorCritic,
     levels: Level,
     named: list[tuple[str, int]],
     limit: int,
@@ -95,28 +73,29 @@ def _scored(
 ) -> Iterator[Score]:
     """Scores of K Solvers on n levels [n], given their names and shortest paths."""
     height, width = levels.walls.shape[-2:]
-    copies = levels.expand(solver.copies, *levels.batch_size)  # [K, n]
-    logits = cell_logits(solver, planes(copies))
-    sampled = ExactEvaluator(limit, step_penalty)(copies, logits)
-    greedy = ExactEvaluator(limit, step_penalty, greedy=True)(copies, logits)
+    copies = levels.expand(agent.copies, *levels.batch_size)  # [K, n]
+    logits = cell_logits(agent, planes(copies))
+    measured = {
+        f"{prefix}{key}": value
+        for prefix, greedy in (("", False), ("greedy_", True))
+        for key, value in ExactEvaluator(limit, step_penalty, greedy)(copies, logits).items()
+    }
     paths = policy_path(copies, logits, limit)  # [K, n, limit + 1, 2]
     for k in range(len(copies)):
         for i, (name, length) in enumerate(named):
-            yield Score(
-                level=name,
-                solver=k,
-                height=height,
-                width=width,
-                path_length=length,
-                max_steps=limit,
-                success=float(sampled["success"][k, i]),
-                mean_return=float(sampled["return"][k, i]),
-                greedy_success=float(greedy["success"][k, i]),
-                greedy_return=float(greedy["return"][k, i]),
-                path=_until(levels.goal[i].tolist(), paths[k, i].tolist()),
-            )
+            results = {key: float(value[k, i]) for key, value in measured.items()}
+            path = _until_goal(paths[k, i], levels[i].goal)
+            moves = f"greedy {len(path) - 1}" if results["greedy_success"] else "greedy fails"
+            about = {"height": height, "width": width, "path_length": length, "max_steps": limit}
+            note = f"shortest {length}, {moves}"
+            yield Score(name, k, about, results, note, partial(_picture, levels[i], path))
 
 
-def _until(goal: list[int], path: list[list[int]]) -> list[list[int]]:
-    """A path up to its first visit of the goal."""
-    return path[: path.index(goal) + 1] if goal in path else path
+def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:
+    return draw_level(level, path).numpy()
+
+
+def _until_goal(path: Tensor, goal: Tensor) -> list[list[int]]:
+    """Cells that a path visits, up to the goal if it gets there."""
+    reached = (path == goal).all(-1).nonzero().flatten().tolist()
+    return path[: reached[0] + 1 if reached else None].tolist()

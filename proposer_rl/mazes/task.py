@@ -1,115 +1,306 @@
-"""The maze task: all that the maze-free training loops need to know of mazes, from settings."""
+"""Mazes as a task: Solvers, levels and measurements of one configuration."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
 
 import torch
-from annotated_types import Ge, Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from proposer_rl.learning.cuda_graphs import Captured, recorder
-from proposer_rl.learning.ppo import PPO, PPOSettings
-from proposer_rl.mazes import (
-    Level,
-    LevelDistribution,
-    MazeEnv,
-    SpecificationSpace,
-    planes,
-    shortest_path_length,
-)
+from proposer_rl.learning import PPO, first_episode_success
+from proposer_rl.mazes.distance import shortest_path_length
+from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.mazes.env import MazeEnv
 from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator, worst_mean
-from proposer_rl.meta.rewards import first_episode_success
-from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
-from proposer_rl.settings import settings
+from proposer_rl.mazes.level_files import SUFFIXES, read_levels, shipped_levels, shipped_sets
+from proposer_rl.mazes.level_scores import score_levels
+from proposer_rl.mazes.levels import Level, planes
+from proposer_rl.mazes.rendering import draw_level
+from proposer_rl.mazes.settings import (
+    Channels,
+    DistributionSettings,
+    EvaluationSettings,
+    MazeSettings,
+    NetworkSettings,
+    SpaceSettings,
+)
+from proposer_rl.models import (
+    ActorCritic,
+    MapEncoder,
+    Population,
+    UNet,
+    cell_logits,
+    map_actor_critic,
+)
+from proposer_rl.runs.pictures import png
+from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
+from proposer_rl.task import Place, Score
 
 ACTIONS = 4
 PLANES = 3
-RECORDED_LEVELS = 8
+LARGEST_GRID = 10**6  # cells
+SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
-
-Mechanism = Literal["uniform", "path_first"]
-Fraction = Annotated[float, Interval(ge=0, lt=1)]
-PathLength = Annotated[int, Ge(1)]
+SLACK = 2  # of a named level: steps allowed for each move of its shortest path
+KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
-@settings
-class MazeSettings:
-    """The inner environment.
+class MazeTask:
+    """Mazes, and a U-Net that learns to solve them; a :class:`~proposer_rl.task.Task`.
 
-    Attributes:
-        height, width: the grid, in cells.
-        max_steps: steps after which an episode is truncated.
-        step_penalty: what every step costs.
-        observe_agent: draw the agent on a fourth plane; then every step needs its own forward pass.
+    Args:
+        maze: the inner environment.
+        distributions: by name.
+        target: the name of the one that the Solver is to master.
+        space: the Proposer's bins.
+        network: of the Solver.
+        encoder_channels: of the convolutions with which a Proposer reads a probe.
+        evaluation: measurements.
+        solver: the Solver's training.
+        place: device, precision and cores.
+        make_network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
+            ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
+            of the settings.
+
+    Raises:
+        ValueError: naming the key, if settings that are each valid do not go together.
     """
 
-    height: Annotated[int, Ge(1)] = 10
-    width: Annotated[int, Ge(1)] = 10
-    max_steps: Annotated[int, Ge(1)] = 25
-    step_penalty: Annotated[float, Ge(0)] = 0.01
-    observe_agent: bool = False
+    def __init__(
+        self,
+        *,
+        maze: MazeSettings,
+        distributions: dict[str, DistributionSettings],
+        target: str,
+        space: SpaceSettings,
+        network: NetworkSettings,
+        encoder_channels: Channels,
+        evaluation: EvaluationSettings,
+        solver: SolverSettings,
+        place: Place,
+        make_network: Any = None,
+    ) -> None:
+        _check_names(distributions, target, evaluation.distributions)
+        _check_network(maze, network)
+        _check_target(maze, target, distributions[target])
+        self.maze = maze
+        self.solver = solver
+        self.batch_size = solver.batch_size
+        self.device = torch.device(place.device)
+        self.precision = _precision(place, network)
+        self.cores = place.cores
+        self._network = network
+        self._make_network = make_network or self._unet
+        self._encoder_channels = encoder_channels
+        self._evaluation = evaluation
+        self._target = target
+        self._measured = {
+            name: asdict(distributions[name]) for name in (*evaluation.distributions, target)
+        }
+        grid = (maze.height, maze.width, self.device)
+        self.distributions = {
+            name: _named(f"distributions.{name}", LevelDistribution, *asdict(d).values(), *grid)
+            for name, d in distributions.items()
+        }
+        self.target = self.distributions[target]
+        self.space = _named("space", SpecificationSpace, *asdict(space).values(), *grid)
+        rules = (maze.max_steps, maze.step_penalty)
+        self._sampled = ExactEvaluator(*rules)
+        self._greedy = ExactEvaluator(*rules, greedy=True)
+        self._evaluator: ExactEvaluator | RolloutEvaluator = (
+            self._sampled
+            if evaluation.evaluator == "exact"
+            else RolloutEvaluator(*rules, episodes=evaluation.episodes)
+        )
+        self.levels_help = (
+            f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
+            f"or a distribution: {', '.join(distributions)}"
+        )
+        self._measured_on = {
+            name: self.evaluation_levels(name) for name in evaluation.distributions
+        }
+        kinds = ("success", "return", "success_worst10", "greedy_success", "greedy_return")
+        self.measurements = [f"{name}_{kind}" for name in self._measured_on for kind in kinds]
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """See :class:`~proposer_rl.task.Task`."""
+        size = f"{self.maze.height}×{self.maze.width}"
+        measured = asdict(self.maze)
+        del measured["observe_agent"]
+        return {
+            "title": f"{size} mazes",
+            "levels": "mazes",
+            "distributions": list(self._measured_on),
+            "space": {name: list(values) for name, values in self.space.axes.items()},
+            "about": {
+                "Mazes": f"{size}, at most {self.maze.max_steps} steps",
+                "Measured on": f"{'; '.join(map(self._describe, self._measured_on))}; "
+                f"{self._evaluation.levels} fixed levels each",
+            },
+            "key": KEY,
+            "measured": {
+                "maze": measured,
+                "distributions": self._measured,
+                "target": self._target,
+                "levels": [self._evaluation.levels, self._evaluation.seed],
+            },
+            "samples": {
+                name: self.record(levels[:SAMPLES], None)
+                for name, levels in self._measured_on.items()
+            },
+        }
 
-@settings
-class DistributionSettings:
-    """Levels drawn evenly from (obstacle fraction, path length) pairs, by one mechanism."""
+    def evaluation_levels(self, name: str) -> Level:
+        """The fixed levels of a distribution on which Solvers are measured, [E]."""
+        generator = Streams(self._evaluation.seed, "evaluation", name).generator()
+        return self.distributions[name].sample(self._evaluation.levels, generator)
 
-    specifications: Annotated[list[tuple[Fraction, PathLength]], Len(1)]
-    mechanism: Mechanism = "uniform"
+    def learner(self, streams: Sequence[Streams]) -> PPO:
+        """PPO of K fresh Solvers, whose weights are drawn from the streams."""
+        weights = iter(streams)
 
+        def make() -> nn.Module:
+            with next(weights).as_default("weights"):
+                return self._make_network()
 
-@settings
-class SpaceSettings:
-    """The Proposer's choices: every obstacle fraction with every path length."""
+        copies = len(streams)
+        network = Population(make, copies, self.precision, self.cores).to(self.device)
+        # Placeholders of the right shape; every update sets its own levels.
+        level = next(iter(self._measured_on.values()))[:1]
+        env = MazeEnv(level.expand(copies, self.batch_size), **self._rules)
+        agent = map_actor_critic(network, per_step=self.maze.observe_agent)
+        return PPO(env, agent, self.solver.ppo)
 
-    obstacle_fractions: Annotated[list[Fraction], Len(1)]
-    path_lengths: Annotated[list[PathLength], Len(1)]
-    mechanism: Mechanism = "uniform"
+    def performance(
+        self, agent: ActorCritic, levels: Level, generator: torch.Generator
+    ) -> TensorDictBase:
+        """Return and success of K Solvers on levels [E], [K, E], as the settings ask for it."""
+        return self._evaluator(*_with_logits(agent, levels), generator)
 
+    def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
+        """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
+        copies, logits = _with_logits(agent, levels)
+        return torch.cat([planes(copies), logits], -3)
 
-@settings
-class SolverSettings:
-    """The Solver's U-Net and how it is trained.
+    def probe_encoder(self, features: int) -> MapEncoder:
+        """A convolutional network that reads probes."""
+        return MapEncoder(PLANES + ACTIONS, self._encoder_channels, features)
 
-    Attributes:
-        channels: of each resolution, finest first.
-        groups: of every GroupNorm; divides each of the channels.
-        policy_gain, value_gain: gains of the heads' orthogonal initialisation.
-        problems: levels P of an update.
-        ppo: PPO's numbers.
-    """
+    def measure(self, agent: ActorCritic) -> TensorDict:
+        """Exact means over the fixed levels of each distribution measured on, each [K].
 
-    channels: Annotated[list[Annotated[int, Ge(1)]], Len(1)]
-    groups: Annotated[int, Ge(1)] = 8
-    policy_gain: Annotated[float, Ge(0)] = 0.01
-    value_gain: Annotated[float, Ge(0)] = 1.0
-    problems: Annotated[int, Ge(1)] = 128
-    ppo: PPOSettings = PPOSettings()
+        Entries, by the distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
+        policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one; and
+        ``<name>_success_worst10``, the sampled policy's success over the tenth of the levels on
+        which it is lowest.
+        """
+        results: dict[str, Tensor] = {}
+        for name, levels in self._measured_on.items():
+            copies, logits = _with_logits(agent, levels)
+            sampled, greedy = self._sampled(copies, logits), self._greedy(copies, logits)
+            for prefix, measured in ((name, sampled), (f"{name}_greedy", greedy)):
+                for kind in ("return", "success"):
+                    results[f"{prefix}_{kind}"] = measured[kind].mean(1)
+            results[f"{name}_success_worst10"] = worst_mean(sampled["success"], WORST)
+        return TensorDict(results, [agent.copies])
 
+    def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
+        """What the Solvers trained on and how they fared there, each [K] from [K, P]."""
+        lengths = shortest_path_length(levels).float()
+        return TensorDict(
+            {
+                "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
+                "path_length": lengths.mean(-1),
+                "path_length_sd": lengths.std(-1, correction=0),
+                "train_success": first_episode_success(rollout).float().mean(-1),
+            },
+            levels.batch_size[:1],
+        )
 
-@settings
-class EvaluationSettings:
-    """How the Solver is measured, apart from its training.
+    def record(self, levels: Level, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
+        """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
+        return list(self._records(levels.cpu(), rollout))
 
-    Attributes:
-        distributions: names of the distributions that are measured on.
-        levels: number of levels of each distribution, the same in every run.
-        seed: from which they are drawn.
-        reward: evaluator of the Proposer's validation levels: exact, or Monte-Carlo episodes.
-        episodes: Monte-Carlo episodes per level.
-    """
+    def _records(self, levels: Level, rollout: TensorDictBase | None) -> Iterator[dict[str, Any]]:
+        for i, text in enumerate(levels.to_text()):
+            path = None if rollout is None else _first_episode(rollout[i])
+            lines = [list(line) for line in text.splitlines()]
+            for row, column in path or []:
+                if lines[row][column] == ".":
+                    lines[row][column] = "•"
+            yield {
+                "picture": png(draw_level(levels[i], path).numpy()),
+                "text": ["".join(line) for line in lines],
+                **({} if path is None else {"path": path}),
+            }
 
-    distributions: Annotated[list[str], Len(1)]
-    levels: Annotated[int, Ge(1)] = 512
-    seed: Annotated[int, Ge(0)] = 0
-    reward: Literal["exact", "rollout"] = "exact"
-    episodes: Annotated[int, Ge(1)] = 1
+    def scores(self, agent: ActorCritic, name: str, max_steps: int | None) -> list[Score]:
+        """How Solvers do on a distribution's levels, a file's or those of a set that comes along.
+
+        Without a step limit a distribution has that of the task, so that the means are those of its
+        measurements; other levels at least twice the shortest path.
+        """
+        levels, slack = self._named_levels(name)
+        least = 2 ** (len(self._network.channels) - 1)
+        for level, grid in levels.items():
+            height, width = grid.walls.shape
+            if min(height, width) < least:
+                raise ValueError(
+                    f"level {level!r}: its {height}x{width} cells are halved to nothing by this "
+                    f"Solver; it sees levels of {least}x{least} cells and more"
+                )
+        limit = self.maze.max_steps
+        return score_levels(
+            agent,
+            levels,
+            lambda length: max_steps or max(limit, slack * length),
+            self.maze.step_penalty,
+            self.device,
+        )
+
+    def _named_levels(self, name: str) -> tuple[dict[str, Level], int]:
+        """Levels, and the steps that they allow for each move of the shortest path."""
+        if Path(name).suffix in SUFFIXES:
+            return read_levels(name), SLACK
+        for distribution in self.distributions:
+            if name.casefold() == distribution.casefold():
+                levels = self.evaluation_levels(distribution).cpu()
+                return {f"{distribution}_{i:03}": levels[i] for i in range(len(levels))}, 0
+        if name in shipped_sets():
+            return shipped_levels(name), SLACK
+        known = ", ".join([*self.distributions, *shipped_sets()])
+        raise ValueError(
+            f"--levels {name}: must be a file that ends in {' or '.join(SUFFIXES)}, or one of: "
+            f"{known}"
+        )
+
+    def _describe(self, name: str) -> str:
+        distribution = self.distributions[name]
+        pairs = "; ".join(
+            f"{fraction:g} obstacles, path of {length}"
+            for fraction, length in distribution.specifications[:4]
+        )
+        return f"{name.upper()} ({pairs}; {distribution.mechanism})"
+
+    @property
+    def _rules(self) -> dict[str, Any]:
+        rules = asdict(self.maze)
+        return {key: rules[key] for key in ("max_steps", "step_penalty", "observe_agent")}
+
+    def _unet(self) -> UNet:
+        return UNet(
+            in_channels=PLANES + self.maze.observe_agent,
+            head_channels=(ACTIONS, 1),
+            channels=self._network.channels,
+            groups=self._network.groups,
+            head_gains=(self._network.policy_gain, self._network.value_gain),
+        )
 
 
 def faster_precision(channels: Sequence[int], device: torch.device) -> str:
@@ -125,264 +316,70 @@ def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 
-class MazeTask:
-    """Solvers, levels and measurements of one maze configuration.
+def _precision(place: Place, network: NetworkSettings) -> str:
+    if place.precision == "auto":
+        return faster_precision(network.channels, torch.device(place.device))
+    return place.precision
 
-    Args:
-        maze: the inner environment.
-        distributions: by name.
-        target: the name of the one that the Solver is to master.
-        space: the Proposer's choices.
-        solver: network and training of the Solver.
-        evaluation: measurements.
-        device: where everything lives.
-        precision: ``"fp32"`` or ``"bf16"``, of the Solver's network.
-        cores: Solvers of a population computed at once on a CPU; None for all cores.
-        graphs: whether a GPU records rollouts, training and evaluations as CUDA graphs.
-        network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
-            ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
-            of the settings.
 
-    Attributes:
-        recipe: makes the same task, or with other arguments a like one; it can be pickled.
+def _check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
+    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
 
-    Raises:
-        ValueError: if a name is no distribution's, or levels cannot be made as specified.
-    """
 
-    def __init__(
-        self,
-        *,
-        maze: MazeSettings,
-        distributions: Mapping[str, DistributionSettings],
-        target: str,
-        space: SpaceSettings,
-        solver: SolverSettings,
-        evaluation: EvaluationSettings,
-        device: torch.device | str = "cpu",
-        precision: str = "fp32",
-        cores: int | None = None,
-        graphs: bool = True,
-        network: Callable[[], nn.Module] | None = None,
-    ) -> None:
-        self.recipe = partial(
-            MazeTask,
-            maze=maze,
-            distributions=distributions,
-            target=target,
-            space=space,
-            solver=solver,
-            evaluation=evaluation,
-            device=device,
-            precision=precision,
-            cores=cores,
-            graphs=graphs,
-            network=network,
-        )
-        for name in (target, *evaluation.distributions):
-            if name not in distributions:
-                raise ValueError(f"{name!r} is none of the distributions {sorted(distributions)}")
-        self.maze = maze
-        self.solver = solver
-        self.device = torch.device(device)
-        self.precision = precision
-        self.cores = cores
-        self.recorder = recorder(self.device, graphs)
-        grid = (maze.height, maze.width)
-        self.distributions = {
-            name: LevelDistribution(d.specifications, d.mechanism, *grid)
-            for name, d in distributions.items()
-        }
-        self.target = self.distributions[target]
-        self.space = SpecificationSpace(
-            space.obstacle_fractions, space.path_lengths, space.mechanism, *grid
-        )
-        rules = (maze.max_steps, maze.step_penalty)
-        self._network = network or self._unet
-        self._sampled = ExactEvaluator(*rules)
-        self._greedy = ExactEvaluator(*rules, greedy=True)
-        self._reward_evaluator: ExactEvaluator | RolloutEvaluator = (
-            self._sampled
-            if evaluation.reward == "exact"
-            else RolloutEvaluator(*rules, episodes=evaluation.episodes)
-        )
-        self._rate = Captured(self._rated, self.recorder)
-        self._measure = Captured(self._measured, self.recorder)
-        self._see = Captured(self._seen, self.recorder)
-        self._evaluation = evaluation
-        self._measured_on = {
-            name: self.evaluation_levels(name) for name in evaluation.distributions
-        }
-
-    def evaluation_levels(self, name: str) -> Level:
-        """The fixed levels of a distribution on which Solvers are measured, [E]."""
-        return self.distributions[name].sample(
-            self._evaluation.levels,
-            Streams(self._evaluation.seed, "evaluation", name).generator(),
-            device=self.device,
+def _check_target(maze: MazeSettings, name: str, target: DistributionSettings) -> None:
+    longest = max(length for _, length in target.specifications)
+    if longest > maze.max_steps:
+        raise ValueError(
+            f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
+            f"distributions.{name}, which is the target"
         )
 
-    def solvers(self, streams: Sequence[Streams], share: range | None = None) -> PPO:
-        """A population with one Solver for each of K streams, and its environment [K, P].
 
-        Args:
-            streams: from which the Solvers' weights are drawn.
-            share: the Solvers that are computed here; see :class:`Population`.
-        """
-        copies, problems = len(streams), self.solver.problems
-        weights = iter(streams)
-
-        def make() -> nn.Module:
-            with next(weights).as_default("weights"):
-                return self._network()
-
-        network = Population(
-            make, copies, self.precision, self.cores, recorder=self.recorder, share=share
-        ).to(self.device)
-        agent = map_actor_critic(network, per_step=self.maze.observe_agent)
-        # Placeholders of the right shape; every update sets its own levels.
-        level = self._measured_on[next(iter(self._measured_on))][:1]
-        env = MazeEnv(
-            level.expand(copies, problems),
-            max_steps=self.maze.max_steps,
-            step_penalty=self.maze.step_penalty,
-            observe_agent=self.maze.observe_agent,
+def _check_network(maze: MazeSettings, network: NetworkSettings) -> None:
+    """Refuse a grid that the U-Net of the settings cannot see."""
+    size, channels = f"{maze.height}x{maze.width}", network.channels
+    if maze.height * maze.width > LARGEST_GRID:
+        raise ValueError(
+            f"maze.height={maze.height}, maze.width={maze.width}: must be at most "
+            f"{LARGEST_GRID:,} cells together"
         )
-        return PPO(env, agent, self.solver.ppo, self.recorder)
-
-    def _unet(self) -> UNet:
-        return UNet(
-            in_channels=PLANES + self.maze.observe_agent,
-            head_channels=(ACTIONS, 1),
-            channels=self.solver.channels,
-            groups=self.solver.groups,
-            head_gains=(self.solver.policy_gain, self.solver.value_gain),
+    if min(maze.height, maze.width) >> (len(channels) - 1) < 1:
+        raise ValueError(
+            f"network.channels={channels} halve a {size} maze to nothing; give fewer channels or a "
+            "larger maze"
         )
-
-    def generate(self, choices: Tensor, generators: list[torch.Generator]) -> Level:
-        """Levels [K, P] of the Proposer's choices, int64 [K, P]; copy k's from generator k."""
-        return self.space.generate(choices, generators, self.device)
-
-    def directions(self, kind: str) -> Tensor:
-        """What the numbers of a mixture add to the log-shares of the space, float [D, M * N].
-
-        Args:
-            kind: ``"linear"``: more obstacles and longer paths (D = 2). Besides these two,
-                ``"target"``: a number that at 1 makes the target's specifications half of an
-                otherwise even mixture, or a little more (D = 3); ``"quadratic"``: their squares and
-                product, so that a mixture can favour the middle (D = 5). ``"all"``: every
-                specification by itself (D = M * N).
-
-        Raises:
-            ValueError: for ``"target"``, if the space has none or nothing but the target's.
-        """
-        if kind == "all":
-            return torch.eye(self.space.size)
-        x, y = self.space.coordinates.unbind(-1)
-        if kind == "linear":
-            return torch.stack([x, y])
-        if kind == "quadratic":
-            return torch.stack([x, y, x.square(), y.square(), x * y])
-        wanted = torch.tensor([s in self.target.specifications for s in self.space.specifications])
-        count = int(wanted.sum())
-        if count in (0, self.space.size):
+    for halvings, width in enumerate(channels):
+        if width % network.groups:
             raise ValueError(
-                f"proposer.directions=target: {count} of the space's {self.space.size} "
-                "specifications are the target's; some must be, and some not"
+                f"network.channels={channels} must be multiples of network.groups={network.groups}"
             )
-        return torch.stack([x, y, wanted * math.log(self.space.size / count)])
-
-    def sample_target(self, count: int, generator: torch.Generator) -> Level:
-        """Levels [count] of the target distribution."""
-        return self.target.sample(count, generator, self.device)
-
-    def sample_space(self, count: int, generator: torch.Generator) -> Level:
-        """Levels [count], evenly from the Proposer's space."""
-        return self.space.sample(count, generator, self.device)
-
-    def evaluate(
-        self, solver: ActorCritic, levels: Level, generator: torch.Generator
-    ) -> TensorDictBase:
-        """Return and success of K Solvers on levels [E], [K, E], as the reward counts them."""
-        if isinstance(self._reward_evaluator, RolloutEvaluator):
-            return self._reward_evaluator(*_with_logits(solver, levels), generator)
-        return self._rate(levels.to_tensordict(), solver)
-
-    def probe(self, solver: ActorCritic, levels: Level) -> Tensor:
-        """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
-        return self._see(levels.to_tensordict(), solver)["probes"]
-
-    probe_channels = PLANES + ACTIONS
-    """Channels of a probe."""
-
-    def measure(self, solver: ActorCritic) -> TensorDict:
-        """Exact means over the fixed levels of each distribution measured on, each [K].
-
-        Entries, by the distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
-        policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one; and
-        ``<name>_success_worst10``, the sampled policy's success over the tenth of the levels on
-        which it is lowest.
-        """
-        results: dict[str, Tensor] = {}
-        for name, levels in self._measured_on.items():
-            for key, value in self._measure(levels.to_tensordict(), solver).items():
-                results[f"{name}_{key}"] = value
-        return TensorDict(results, [solver.copies])
-
-    def _rated(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
-        return self._sampled(*_with_logits(solver, Level.from_tensordict(levels)))
-
-    def _seen(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
-        copies, logits = _with_logits(solver, Level.from_tensordict(levels))
-        return TensorDict({"probes": torch.cat([planes(copies), logits], -3)})
-
-    def _measured(self, levels: TensorDictBase, solver: ActorCritic) -> TensorDict:
-        copies, logits = _with_logits(solver, Level.from_tensordict(levels))
-        results: dict[str, Tensor] = {}
-        for policy, evaluator in (("", self._sampled), ("greedy_", self._greedy)):
-            measured = evaluator(copies, logits)
-            for key, value in measured.items():
-                results[f"{policy}{key}"] = value.mean(1)
-            if not policy:
-                results["success_worst10"] = worst_mean(measured["success"], WORST)
-        return TensorDict(results, [solver.copies])
-
-    def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
-        """What the Solvers trained on and how they fared there, each [K] from [K, P]."""
-        lengths = shortest_path_length(levels).float()
-        return TensorDict(
-            {
-                "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
-                "path_length": lengths.mean(-1),
-                "path_length_sd": lengths.std(-1, correction=0),
-                "train_success": first_episode_success(rollout).float().mean(-1),
-            },
-            levels.batch_size[:1],
-        )
-
-    def records(self, levels: Level, rollout: TensorDictBase) -> list[list[dict[str, Any]]]:
-        """The first levels of each copy's batch and the Solver's first episode there, for JSON."""
-        return [
-            [
-                {
-                    "level": levels[copy, problem].to_text().splitlines(),
-                    "path": _first_episode(rollout[copy, problem]),
-                }
-                for problem in range(min(RECORDED_LEVELS, levels.batch_size[1]))
-            ]
-            for copy in range(levels.batch_size[0])
-        ]
+        if (maze.height >> halvings) * (maze.width >> halvings) * width == network.groups:
+            raise ValueError(
+                f"network.channels={channels} leave a group of {width} channels with a single "
+                f"number on a {size} maze: give more channels, a larger maze or fewer than "
+                f"network.groups={network.groups}"
+            )
 
 
-def _with_logits(solver: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
+def _named(key: str, make: Any, *arguments: Any) -> Any:
+    """Make something, naming the key in whatever is wrong with its value."""
+    try:
+        return make(*arguments)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from error
+
+
+def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
     """Levels [E] once for each of K Solvers, [K, E], with the logits of every cell."""
-    copies = levels.expand(solver.copies, *levels.batch_size)
-    return copies, cell_logits(solver, planes(copies))
+    copies = levels.expand(agent.copies, *levels.batch_size)
+    return copies, cell_logits(agent, planes(copies))
 
 
 def _first_episode(steps: TensorDictBase) -> list[list[int]]:
     """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
     ended = steps["next", "done"].squeeze(-1).tolist()
     count = ended.index(True) + 1 if True in ended else len(ended)
-    cells = steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()
-    return cells
+    return steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
-import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.learning.ppo import PPO, Update
-from proposer_rl.meta.env import ReplayError, SolverTrainingEnv
+from proposer_rl.learning import PPO, Update
+from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.streams import Streams
-
-Pause = Callable[[], None]
 
 
 class Trained(NamedTuple):
@@ -33,27 +28,17 @@ class Trained(NamedTuple):
 class Copies(Protocol):
     """Where the copies of the Solver are trained while the Proposer acts on them."""
 
-    def roll_out(
-        self,
-        solver: TensorDictBase,
-        streams: Streams,
-        pause: Pause | None = None,
-        begun: dict[str, Any] | None = None,
-    ) -> TensorDictBase:
+    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
         """One episode of K copies of a Solver.
 
         Args:
             solver: a snapshot of one Solver, batch [].
             streams: of the cycle.
-            pause: see :meth:`~proposer_rl.meta.env.SolverTrainingEnv.fork`.
-            begun: what :meth:`episode` returned, to go on from there.
 
         Returns:
-            The Proposer's rollout, [K, T], ready for :meth:`~proposer_rl.learning.ppo.PPO.optimise`.
+            The Proposer's rollout, [K, T], ready for
+            :meth:`~proposer_rl.learning.ppo.PPO.optimise`.
         """
-
-    def episode(self) -> dict[str, Any] | None:
-        """What is needed to go on with a begun episode; None where it would begin anew."""
 
     def trained(self, copy: int) -> Trained:
         """A copy as the last episode has left it."""
@@ -73,22 +58,12 @@ class CopiesHere:
         self._proposer = proposer
         self._env: SolverTrainingEnv = proposer.env
 
-    def roll_out(
-        self,
-        solver: TensorDictBase,
-        streams: Streams,
-        pause: Pause | None = None,
-        begun: dict[str, Any] | None = None,
-    ) -> TensorDictBase:
+    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
         """See :meth:`Copies.roll_out`."""
-        if begun is not None:
-            with suppress(ReplayError):
-                return self._play(solver, streams, pause, begun)
-        return self._play(solver, streams, pause)
-
-    def episode(self) -> dict[str, Any] | None:
-        """See :meth:`Copies.episode`."""
-        return self._env.episode()
+        env = self._env
+        env.fork(solver, streams)
+        copies = range(env.batch_size[0])
+        return self._proposer.collect(action_generators(streams, copies, env.device))
 
     def trained(self, copy: int) -> Trained:
         """See :meth:`Copies.trained`."""
@@ -98,23 +73,3 @@ class CopiesHere:
 
     def close(self) -> None:
         """Nothing is held outside."""
-
-    def _play(
-        self,
-        solver: TensorDictBase,
-        streams: Streams,
-        pause: Pause | None,
-        begun: dict[str, Any] | None = None,
-    ) -> TensorDictBase:
-        self._env.fork(solver, streams, pause)
-        if begun is not None:
-            self._env.resume(begun)
-        env = self._env
-        return self._proposer.collect(action_generators(streams, env.batch_size[0], env.device))
-
-
-def action_generators(
-    streams: Streams, copies: int, device: torch.device | None
-) -> list[torch.Generator]:
-    """Of the Proposer's actions on each copy of a cycle."""
-    return [streams.generator("proposals", copy, device=device) for copy in range(copies)]

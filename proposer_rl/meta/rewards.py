@@ -1,4 +1,4 @@
-"""What the Proposer is paid for: functions of one training step of K Solvers, each to [K]."""
+"""What the Proposer is paid for: functions of one training step of K Solvers, each to float [K]."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.learning import first_episode_success
 from proposer_rl.models import ActorCritic
+
+LEAST_SUCCESS = 1e-3
+"""Below it, success hardly counts in :func:`log_success`."""
 
 
 class TrainingStep(NamedTuple):
@@ -17,15 +21,17 @@ class TrainingStep(NamedTuple):
     Attributes:
         levels: what they trained on, batch [K, P].
         rollout: the transitions that they collected there before the update, [K, P, T].
-        solver: the Solvers after the update.
-        return_before, return_after: mean return on the validation levels, float [K].
+        agent: the Solvers after the update.
+        before, after: their performance on the validation levels, tensordicts [K, E] with
+            ``return`` and, where it has a meaning, ``success``. Within an action that is repeated
+            both are those before it, but for its last update.
     """
 
     levels: Any
     rollout: TensorDictBase
-    solver: ActorCritic
-    return_before: Tensor
-    return_after: Tensor
+    agent: ActorCritic
+    before: TensorDictBase
+    after: TensorDictBase
 
 
 # The reward of a training step for each Solver, float [K].
@@ -33,15 +39,30 @@ Reward = Callable[[TrainingStep], Tensor]
 
 
 def performance_gain(step: TrainingStep) -> Tensor:
-    """How much the Solver's return on the validation levels went up (the paper's reward).
+    """How much the mean return on the validation levels went up: R(after) - R(before).
+
+    The paper's reward (section 5 of docs/method.md).
 
     Example:
         >>> import torch
-        >>> before, after = torch.tensor([0.1, 0.4]), torch.tensor([0.3, 0.2])
+        >>> from tensordict import TensorDict
+        >>> before, after = (
+        ...     TensorDict({"return": torch.tensor([[x, 0.3]])}, [1, 2]) for x in (0.1, 0.5)
+        ... )
         >>> performance_gain(TrainingStep(None, None, None, before, after))
-        tensor([ 0.2000, -0.2000])
+        tensor([0.2000])
     """
-    return step.return_after - step.return_before
+    return mean_return(step.after) - mean_return(step.before)
+
+
+def log_success_gain(step: TrainingStep) -> Tensor:
+    """How much the mean of log(success + 0.001) on the validation levels went up.
+
+    The default. A beginner's return on the target hardly moves, whatever it trains on: from one
+    success in five hundred to one in a hundred is a step of 0.008. Its logarithm moves by 1.6, and
+    shows what was due to the training.
+    """
+    return mean_log_success(step.after) - mean_log_success(step.before)
 
 
 def task_difficulty(step: TrainingStep) -> Tensor:
@@ -52,24 +73,25 @@ def task_difficulty(step: TrainingStep) -> Tensor:
     return 1.0 - first_episode_success(step.rollout).float().mean(1)
 
 
-def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Whether the first episode of every environment terminated, rather than was truncated or cut.
+def mean_return(performance: TensorDictBase) -> Tensor:
+    """Mean return over levels, float [K] from [K, E]."""
+    return performance["return"].mean(1)
 
-    Args:
-        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "terminated")`` [*B, T, 1].
 
-    Returns:
-        bool [*B].
+def mean_log_success(performance: TensorDictBase) -> Tensor:
+    """Mean of :func:`log_success` over levels, float [K] from [K, E]."""
+    return log_success(performance).mean(1)
 
-    Example:
-        >>> import torch
-        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
-        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
-        >>> from tensordict import TensorDict
-        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
-        >>> first_episode_success(rollout)  # the second one does not count
-        tensor([False])
+
+def log_success(performance: TensorDictBase) -> Tensor:
+    """log(success + 0.001) of every level, float [*B].
+
+    Raises:
+        ValueError: if the task tells no success.
     """
-    done = rollout["next", "done"].squeeze(-1).long()
-    first = done.cumsum(-1) - done == 0  # up to and including the first end
-    return (rollout["next", "terminated"].squeeze(-1) & first).any(-1)
+    if "success" not in performance.keys():
+        raise ValueError(
+            "log_success: this task tells no success, only the return; "
+            "take the reward performance_gain, and observe return"
+        )
+    return (performance["success"] + LEAST_SUCCESS).log()

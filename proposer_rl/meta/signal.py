@@ -17,8 +17,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.view import Evaluate, Levels, Measure, episode_return
 from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
 
 
 @dataclass(frozen=True)
@@ -85,41 +85,40 @@ def variance_components(gains: Tensor) -> Signal:
 
 
 @torch.no_grad()
-def total_gains(
+def performance_around(
     env: SolverTrainingEnv,
     solver: TensorDictBase,
     actions: Tensor,
     levels: Levels,
-    evaluate: Evaluate,
     streams: Streams,
-    measure: Measure = episode_return,
-) -> Tensor:
-    """Gains of copies of a Solver over one episode, level by level.
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """Performance of copies of a Solver before and after one episode, level by level.
 
     Args:
         env: the meta-environment, batch [K] with K = G * R.
         solver: a snapshot of one Solver, batch [].
         actions: those of G proposals in an episode of T steps, [T, G, ...]; R copies follow each.
-        levels: on which the gain is measured, [E].
-        evaluate: the Solvers' performance there.
+        levels: on which it is measured, [E].
         streams: of all randomness, which is different for every copy.
-        measure: what counts of the performance, a number for each level or several.
 
     Returns:
-        float [G, R, E], or [G, R, E, ...] for several measures.
+        Two tensordicts [G, R, E].
     """
     groups = actions.shape[1]
     replicates = env.batch_size[0] // groups
+    task = env.view.task
 
-    def measured() -> Tensor:
-        return measure(evaluate(env.solvers.agent, levels, streams.generator("gain")))
+    def measured() -> TensorDictBase:
+        generator = streams.generator("gain", device=task.device)
+        performance = task.performance(env.solvers.agent, levels, generator)
+        return performance.clone().unflatten(0, (groups, replicates))
 
     env.fork(solver, streams)
     before = measured()
     state = env.reset()
     for action in actions.repeat_interleave(replicates, 1):
         _, state = env.step_and_maybe_reset(state.set("action", action))
-    return (measured() - before).unflatten(0, (groups, replicates))
+    return before, measured()
 
 
 def by_validation_size(gains: Tensor, sizes: Sequence[int]) -> dict[int, Signal]:

@@ -9,7 +9,7 @@ from proposer_rl.models.actor_critic import (
     uniform_noise,
 )
 from proposer_rl.models.maps import cell_logits, map_actor_critic, read_maps
-from proposer_rl.models.population import Population
+from proposer_rl.models.population import Population, available_cores
 from proposer_rl.models.proposer import (
     MapEncoder,
     MixtureHead,
@@ -29,6 +29,7 @@ __all__ = [
     "ProblemHead",
     "ProposerNetwork",
     "UNet",
+    "available_cores",
     "categorical",
     "cell_logits",
     "context_width",

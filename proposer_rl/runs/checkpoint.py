@@ -36,6 +36,8 @@ State = dict[str, Any]
 class CheckpointError(ValueError):
     """A checkpoint is not what it should be; the message is one line that names the file."""
 
+    exit_code = 2
+
 
 class _DamagedError(CheckpointError):
     """The file is not what was written; an older one may be intact."""

@@ -24,6 +24,8 @@ _PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 class StorageError(OSError):
     """The disk did not take or give a file; the message is one line that names it."""
 
+    exit_code = 4
+
 
 class RunFolder:
     """The folder of one run; created, with its parents, if it does not exist.

@@ -18,6 +18,8 @@ from proposer_rl.runs.folder import storage, write_atomically
 class InUseError(RuntimeError):
     """Another process works in the folder; the message is one line that names it."""
 
+    exit_code = 5
+
 
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:

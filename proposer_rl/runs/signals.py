@@ -25,6 +25,10 @@ class Interrupted(Exception):
         self.signum = signum
 
 
+class StopRequested(Exception):
+    """A signal has come during long work, which ends here and can be repeated."""
+
+
 class StopSignals:
     """Inside this context a stop signal is kept until the run comes to a safe point.
 
@@ -52,6 +56,15 @@ class StopSignals:
     def pending(self) -> bool:
         """Whether a signal has come."""
         return self._pending is not None
+
+    def check(self) -> None:
+        """Interrupt long work that can be repeated.
+
+        Raises:
+            StopRequested: if a signal has come.
+        """
+        if self.pending:
+            raise StopRequested
 
     def deliver(self) -> None:
         """Act on the signal that has come: to be called once all is saved.

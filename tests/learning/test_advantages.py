@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.advantages import LeaveOneOutBaseline
 
 
 def episodes(rewards: torch.Tensor) -> TensorDict:
@@ -18,7 +18,7 @@ def episodes(rewards: torch.Tensor) -> TensorDict:
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
 def test_the_return_to_come_minus_the_mean_of_the_others(gamma: float) -> None:
     rewards = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
-    out = CopiesBaseline(gamma)(episodes(rewards))
+    out = LeaveOneOutBaseline(gamma)(episodes(rewards))
     for k in range(4):
         for t in range(3):
             to_come = [sum(gamma**s * r[t + s] for s in range(3 - t)) for r in rewards]
@@ -28,10 +28,10 @@ def test_the_return_to_come_minus_the_mean_of_the_others(gamma: float) -> None:
 
 
 def test_what_all_copies_share_is_no_ones_merit() -> None:
-    advantage = CopiesBaseline(1.0)(episodes(torch.arange(5.0).expand(3, 5)))["advantage"]
+    advantage = LeaveOneOutBaseline(1.0)(episodes(torch.arange(5.0).expand(3, 5)))["advantage"]
     torch.testing.assert_close(advantage, torch.zeros(3, 5, 1))
 
 
 def test_one_copy_has_no_others() -> None:
     with pytest.raises(ValueError, match="at least 2 copies, got 1"):
-        CopiesBaseline(1.0)(episodes(torch.zeros(1, 2)))
+        LeaveOneOutBaseline(1.0)(episodes(torch.zeros(1, 2)))

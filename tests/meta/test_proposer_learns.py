@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
 
 from proposer_rl.curricula import total_gain
-from proposer_rl.learning.advantages import CopiesBaseline
+from proposer_rl.learning.advantages import LeaveOneOutBaseline
 from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.models import (
@@ -54,7 +54,7 @@ def mixtures(
         episode_length=UPDATES,
         updates_per_step=updates_per_step,
     )
-    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, CopiesBaseline(1.0), **learning)
+    return _ppo(env, MixtureHead(33, choices, hidden=32), normal, LeaveOneOutBaseline(1.0), **learning)
 
 
 def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:

@@ -13,9 +13,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector
 
-from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import PPO, Update
-from proposer_rl.meta.copies import Pause, Trained
+from proposer_rl.learning import PPO, DivergedError, Update
+from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
     Order,
@@ -33,14 +32,13 @@ ATTEMPTS = 3
 
 
 class CopiesInWorkers:
-    """Copies that are trained by workers, each of which computes a share of them.
+    """Copies that are trained by workers, each of which has a share of them.
 
-    An episode goes on only as a whole: there is no saving within it. Where a worker is lost, all
-    are started anew and the episode is repeated, with the same numbers.
+    Where a worker is lost, all are started anew and the episode is repeated, with the same numbers.
 
     Args:
-        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` like
-            those of the workers; it is used for all but the copies' training.
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` of all
+            copies; it is used for all but the copies' training.
         make_env: makes a worker's environment.
         settings: how many workers there are, and where.
 
@@ -56,14 +54,8 @@ class CopiesInWorkers:
         self._shares = shares(self._env.batch_size[0], settings.workers)
         self._collector: BaseCollector | None = None
 
-    def roll_out(
-        self,
-        solver: TensorDictBase,
-        streams: Streams,
-        pause: Pause | None = None,
-        begun: dict[str, Any] | None = None,
-    ) -> TensorDictBase:
-        """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`; an episode always begins anew.
+    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
+        """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`.
 
         Raises:
             DivergedError: if a copy diverges, as in one process.
@@ -85,7 +77,7 @@ class CopiesInWorkers:
                         "same command goes on from the last checkpoint"
                     ) from error
                 # It may have been the signal that ends this run, too.
-                (pause or (lambda: None))()
+                self._env.on_update()
                 warnings.warn(
                     f"a worker was lost ({reason}); it is replaced and the episode repeated",
                     RuntimeWarning,
@@ -95,22 +87,14 @@ class CopiesInWorkers:
             raise DivergedError(message)
         return self._proposer.complete(self._together(rollout))
 
-    def episode(self) -> None:
-        """Nothing: an episode begins anew."""
-
     def trained(self, copy: int) -> Trained:
-        """See :meth:`~proposer_rl.meta.copies.Copies.trained`.
-
-        Of the update's metrics, those that TorchRL's loss gives as one number for all copies (the
-        entropy, for one) are not known here, and nan.
-        """
+        """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
         assert self._collector is not None, "there has been no episode"
-        orders = [(copy, share) for share in self._shares]
+        orders = [(copy,)] * len(self._shares)
         reports: list[Report] = self._collector.map_fn("env.report", orders)
-        (own,) = [report for report in reports if report.copy]
-        steps: Any = torch.cat([report.steps for report in reports], 1)  # [S, K]
-        metrics = TensorDict({key: entry.mean() for key, entry in steps.items()})
-        solver, levels, rollout = (entry.to(self._env.device) for entry in own.copy)
+        own = next(report.copy for report in reports if report.copy)
+        metrics = TensorDict.stack([report.metrics for report in reports]).mean(0)
+        solver, levels, rollout = (entry.to(self._env.device) for entry in own)
         return Trained(solver, levels, Update(rollout, metrics))
 
     def close(self) -> None:
@@ -122,7 +106,7 @@ class CopiesInWorkers:
     def _roll_out(
         self, solver: TensorDictBase, streams: Streams
     ) -> tuple[TensorDictBase, Sequence[str | None]]:
-        """The batch of all workers, [W, K, T], and what diverged in each."""
+        """The batch of all workers, [W, k, T], and what diverged in each."""
         if self._collector is None:
             self._collector = start(self._settings, self._order())
         collector, every = self._collector, len(self._shares)
@@ -130,11 +114,9 @@ class CopiesInWorkers:
         origin = solver.cpu().consolidate()
         named = self._proposer.agent.named_parameters()
         weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
-        shape = self._env.full_action_spec[self._proposer.agent.action_key].shape
         collector.map_fn("env.fork", [(origin, streams)] * every)
-        collector.map_fn("policy.start", [(weights, streams, shape)] * every)
-        rollouts = collect(collector)
-        return rollouts, collector.get_distant_attr("env.diverged")
+        collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
+        return collect(collector), collector.get_distant_attr("env.diverged")
 
     def _order(self) -> Order:
         """What the workers are to be."""
@@ -142,38 +124,43 @@ class CopiesInWorkers:
         horizon, threads = proposer.settings.horizon, torch.get_num_threads()
         devices = [device for _, device in zip(self._shares, cycle(settings.devices), strict=False)]
         agent = deepcopy(proposer.agent).cpu()
+        shape = self._env.full_action_spec[proposer.agent.action_key].shape[1:]
         return Order(
             [
                 partial(make_worker_env, self._make_env, share, device, threads)
                 for share, device in zip(self._shares, devices, strict=True)
             ],
-            [partial(WorkerPolicy, agent, horizon, device) for device in devices],
-            frames=self._env.batch_size[0] * horizon,
+            [partial(WorkerPolicy, agent, horizon, shape, device) for device in devices],
+            frames=len(self._shares[0]) * horizon,
             threads=threads,
         )
 
     def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
-        """The rollout [K, T] of all copies, each from the worker that computes it."""
-        own: list[Any] = [
-            rollout[share.start : share.stop]
-            for rollout, share in zip(rollouts, self._shares, strict=True)
-        ]
-        rollout: Any = torch.cat(own)
+        """The rollout [K, T] of all copies, each from the first worker that has it."""
+        at = {copy: i for i, copy in reversed([*enumerate(c for s in self._shares for c in s)])}
+        rollout: Any = rollouts.flatten(0, 1)[[at[copy] for copy in sorted(at)]]
         rollout = rollout.exclude("collector").to(self._env.device)
         rollout.names = [None, "time"]
         return rollout
 
 
 def shares(copies: int, workers: int) -> list[range]:
-    """The numbers of K copies in as many ranges as there are workers, of nearly equal length.
+    """The numbers of K copies in as many ranges as there are workers, all of the same length.
+
+    Where K is no multiple of the workers, the last ranges overlap: what one process has to do
+    takes no longer for it, and TorchRL's collectors want batches of one shape.
 
     Raises:
         ValueError: for more workers than copies, or none.
     """
     if not 1 <= workers <= copies:
-        raise ValueError(f"workers must be at least 1 and at most the {copies} copies: {workers}")
-    ends = [copies * worker // workers for worker in range(workers + 1)]
-    return [range(*ends[worker : worker + 2]) for worker in range(workers)]
+        raise ValueError(
+            f"compute.workers={workers} must be at least 1 and at most {copies}, the copies that "
+            "they share (proposer.rollouts)"
+        )
+    each = -(-copies // workers)
+    starts = [min(worker * each, copies - each) for worker in range(workers)]
+    return [range(start, start + each) for start in starts]
 
 
 def _last_line(error: Exception) -> str:

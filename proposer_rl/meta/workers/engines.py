@@ -8,15 +8,12 @@ import socket
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
-from annotated_types import Ge, Len
 from torchrl.collectors import BaseCollector, MultiSyncCollector
-
-from proposer_rl.settings import settings
 
 # What a collector raises when a process of its own has died or cannot be reached any more.
 LOST = (RuntimeError, EOFError, OSError, ValueError)
@@ -27,9 +24,10 @@ SECONDS_TO_ANSWER = 10.0
 class WorkersError(RuntimeError):
     """The workers cannot do their work; the message is one line."""
 
+    exit_code = 6
 
-@settings
-class WorkerSettings:
+
+class WorkerSettings(NamedTuple):
     """Where the copies of the Solver are trained.
 
     Attributes:
@@ -43,9 +41,9 @@ class WorkerSettings:
     """
 
     engine: Literal["multiprocess", "ray"]
-    workers: Annotated[int, Ge(1)]
-    devices: Annotated[list[str], Len(1)]
-    cores: Annotated[int, Ge(1)]
+    workers: int
+    devices: Sequence[str]
+    cores: int
     ray_address: str | None = None
 
 
@@ -140,15 +138,17 @@ def _ray(chosen: WorkerSettings, order: Order) -> BaseCollector:
             ray_init_config=_cluster(chosen),
         )
     except ConnectionError as error:  # Ray's, of an address such as auto
-        raise WorkersError(f"ray_address={chosen.ray_address}: no cluster answers there") from error
+        raise WorkersError(
+            f"compute.ray_address={chosen.ray_address}: no cluster answers there"
+        ) from error
     available = ray.cluster_resources()
     needed = {"CPU": chosen.cores * chosen.workers, "GPU": float(on_gpus)}
     for name, amount in needed.items():
         if available.get(name, 0) < amount:
             stop(collector)
             raise WorkersError(
-                f"workers={chosen.workers}: the Ray cluster has {available.get(name, 0):g} {name}, "
-                f"{amount:g} are needed"
+                f"compute.workers={chosen.workers}: the Ray cluster has "
+                f"{available.get(name, 0):g} {name}, {amount:g} are needed"
             )
     return collector
 
@@ -179,7 +179,9 @@ def _knock(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), SECONDS_TO_ANSWER).close()
     except (OSError, OverflowError) as error:
-        raise WorkersError(f"ray_address={address}: no cluster answers there: {error}") from error
+        raise WorkersError(
+            f"compute.ray_address={address}: no cluster answers there: {error}"
+        ) from error
 
 
 @contextmanager

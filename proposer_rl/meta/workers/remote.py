@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
+from proposer_rl.learning import DivergedError, RolloutPolicy
 from proposer_rl.learning.cuda_graphs import use
-from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import RolloutPolicy
-from proposer_rl.meta.copies import action_generators
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.models import ActorCritic, uniform_noise
 from proposer_rl.streams import Streams
 
@@ -21,13 +18,12 @@ class Report(NamedTuple):
     """What a worker tells of the last update of an episode, on the CPU.
 
     Attributes:
-        steps: the gradient steps of the n copies of the share, [S, n]; nan where only one number
-            is known of all copies.
+        metrics: of the training, means over the worker's copies.
         copy: snapshot, levels and rollout of the copy that was asked for, each with a first
-            dimension of one; nothing from a worker that does not compute it.
+            dimension of one; nothing from a worker that does not have it.
     """
 
-    steps: TensorDictBase
+    metrics: TensorDictBase
     copy: tuple[Any, ...]
 
 
@@ -42,27 +38,19 @@ class WorkerEnv(SolverTrainingEnv):
 
     diverged: str | None = None
 
-    def fork(
-        self, solver: TensorDictBase, streams: Streams, pause: Callable[[], None] | None = None
-    ) -> None:
+    def fork(self, solver: TensorDictBase, streams: Streams) -> None:
         """See :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
-        super().fork(solver, streams, pause)
+        super().fork(solver, streams)
 
-    def report(self, copy: int, share: range) -> Report:
-        """Tell of the last update, and all of one copy if it is in the share."""
-        own = {
-            key: entry[:, share.start : share.stop]
-            if entry.ndim == 2
-            else entry.new_full((len(entry), len(share)), torch.nan)
-            for key, entry in self.solvers.gradient_steps.items()
-        }
-        steps = TensorDict(own, [len(self.solvers.gradient_steps), len(share)]).cpu()
-        if copy not in share:
-            return Report(steps, ())
-        levels, (rollout, _) = self.last_training
-        solver = self.solvers.snapshot()[[copy]].cpu().consolidate()
-        return Report(steps, (solver, levels[[copy]].cpu(), rollout[[copy]].cpu()))
+    def report(self, copy: int) -> Report:
+        """Tell of the last update, and all of one copy if it is here."""
+        levels, (rollout, metrics) = self.last_training
+        if copy not in self._copies:
+            return Report(metrics.cpu(), ())
+        here = [copy - self._copies.start]
+        solver = self.solvers.snapshot()[here].cpu().consolidate()
+        return Report(metrics.cpu(), (solver, levels[here].cpu(), rollout[here].cpu()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:
@@ -71,15 +59,15 @@ class WorkerEnv(SolverTrainingEnv):
             except DivergedError as error:
                 self.diverged = str(error)
         # What is left of the rollout is of no use to anyone.
-        self._updates = self.episode_length
-        reward = torch.full_like(self._origin_return, torch.nan)
-        none = torch.zeros(*self.batch_size, self.proposals.choices, dtype=torch.int64)
-        state = self._state(self._origin_return, self._origin_probes, none.to(self.device))
-        return state.set("reward", reward.unsqueeze(-1))
+        state = self._reset()
+        self._updates = self.meta_episode_length
+        ended = torch.ones_like(state["terminated"])
+        state.update({"terminated": ended, "done": ended.clone()})
+        return state.set("reward", torch.full_like(state["return"], torch.nan))
 
 
 class MakeEnv(Protocol):
-    """Makes a meta-environment of all K copies that computes a share of them; can be pickled."""
+    """Makes a meta-environment of a share of the copies; can be pickled."""
 
     def __call__(
         self, *, share: range, device: str, kind: type[SolverTrainingEnv]
@@ -100,24 +88,27 @@ class WorkerPolicy(RolloutPolicy):
     Args:
         agent: the Proposer on the CPU; its weights do not matter.
         horizon: steps T of a rollout.
+        shape: of one copy's action.
         device: where it acts.
     """
 
-    def __init__(self, agent: ActorCritic, horizon: int, device: str) -> None:
+    def __init__(self, agent: ActorCritic, horizon: int, shape: torch.Size, device: str) -> None:
         super().__init__(agent.to(device))
         self.horizon = horizon
+        self.shape = shape
 
-    def start(self, weights: TensorDictBase, streams: Streams, shape: torch.Size) -> None:
+    def start(self, weights: TensorDictBase, streams: Streams, share: range) -> None:
         """Expect a rollout.
 
         Args:
             weights: of the Proposer, by name.
             streams: of the cycle.
-            shape: of an action of all copies, [K, ...].
+            share: the copies whose episodes it acts in.
         """
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():
             parameter.data.copy_(weights[name])
         device = next(agent.parameters()).device
-        generators = action_generators(streams, shape[0], device)
+        shape = torch.Size([len(share), *self.shape])
+        generators = action_generators(streams, share, device)
         self.begin(uniform_noise(shape, self.horizon, generators, device))

@@ -1,0 +1,208 @@
+"""A task of your own: on which mountain cars should a Solver train to master a weak engine?
+
+A level is a gravity, an engine's power and a start. The Solver, an MLP, is to master a weak engine,
+with which chance hardly ever reaches the top; a Proposer mixes 20 kinds of cars. All that the
+commands ask of a task is in `MountainCarTask` (the contract is `proposer_rl/task.py`):
+
+    PYTHONPATH=examples bin/train --config-dir examples/conf task=mountain_car +method=perf_gain
+
+trains, resumes, is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) like mazes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.modules import MLP
+
+from proposer_rl import PPO, ActorCritic, Place, Population, SolverSettings, Streams
+from proposer_rl.learning import first_episode_success
+from proposer_rl.models import categorical
+from proposer_rl.runs.pictures import png
+
+GRAVITIES, POWERS = (0.25, 0.5, 0.75, 1.0), (0.35, 0.7, 1.05, 1.4, 1.75)
+KINDS = torch.cartesian_prod(torch.tensor(GRAVITIES), torch.tensor(POWERS))
+TARGET = torch.tensor([16])  # gravity 1, power 0.7
+TOP = 0.5
+
+
+class MountainCar(EnvBase):
+    """Moore's car in a valley, a batch of them; an action holds for five physical steps."""
+
+    def __init__(self, levels: TensorDictBase) -> None:
+        super().__init__(batch_size=(batch := levels.batch_size))
+        self.observation_spec = Composite(observation=Unbounded((*batch, 2)), shape=batch)
+        self.action_spec, self.reward_spec = Categorical(3, batch), Unbounded((*batch, 1))
+        self.set_levels(levels)
+
+    def set_levels(self, levels: TensorDictBase) -> None:
+        self.levels = levels
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        return self._state(self.levels["start"], torch.zeros(self.batch_size))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        place, speed = (tensordict["observation"] * torch.tensor([0.9, 0.07])).unbind(-1)
+        engine = 0.001 * self.levels["power"] * (tensordict["action"] - 1)  # back, none, forth
+        for _ in range(5):
+            pull = 0.0025 * self.levels["gravity"] * torch.cos(3 * place)
+            speed = (speed + engine - pull).clamp(-0.07, 0.07)
+            place = (place + speed).clamp(-1.2, 0.6)
+            speed = speed.where(place > -1.2, speed.clamp(min=0))
+        state = self._state(place, speed)
+        return state.set("reward", state["terminated"].float() - 0.01)
+
+    def _state(self, place: Tensor, speed: Tensor) -> TensorDict:
+        seen, top = torch.stack([place / 0.9, speed / 0.07], -1), (place >= TOP).unsqueeze(-1)
+        return TensorDict({"observation": seen, "terminated": top}, self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
+
+
+@dataclass
+class Cars:
+    """Cars of some kinds; also the Proposer's space, whose bins are the kinds."""
+
+    kinds: Tensor
+    axes = {"gravity": GRAVITIES, "power": POWERS}
+    size = len(KINDS)
+    coordinates = (KINDS - KINDS.mean(0)) / KINDS.std(0)
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        kinds = self.kinds[torch.randint(len(self.kinds), (1, count), generator=generator)]
+        return self.generate(kinds, [generator])[0]
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        start = torch.stack([torch.rand(choices.shape[1], generator=g) for g in generators])
+        gravity, power = KINDS[choices].unbind(-1)
+        entries = {"gravity": gravity, "power": power, "start": 0.2 * start - 0.6}
+        return TensorDict(entries, choices.shape)
+
+
+class MountainCarTask:
+    """A `proposer_rl.task.Task`: levels are tensordicts, the Solver is an MLP, all on the CPU."""
+
+    device, precision = torch.device("cpu"), "fp32"
+    space = Cars(torch.arange(len(KINDS)))
+    target = Cars(TARGET)
+    distributions = {"target": target, "all": space}
+    measurements = [f"{name}_{what}" for name in distributions for what in ("success", "return")]
+
+    def __init__(self, *, levels: int, solver: SolverSettings, place: Place) -> None:
+        self.batch_size = solver.batch_size
+        self._solver = solver
+        self._levels = levels
+        self._measured_on = {
+            name: cars.sample(levels, Streams(0, "evaluation", name).generator())
+            for name, cars in self.distributions.items()
+        }
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        return {
+            "title": "mountain cars",
+            "levels": "cars",
+            "distributions": list(self.distributions),
+            "space": {name: list(values) for name, values in self.space.axes.items()},
+            "about": {"Measured on": f"{self._levels} cars of a weak engine, and of all kinds"},
+            "key": "Blue: start. Orange: top. Purple: where the car was.",
+            "measured": {"levels": self._levels, "steps": self._solver.ppo.horizon},
+            "samples": {name: self.record(c[:6], None) for name, c in self._measured_on.items()},
+        }
+
+    def learner(self, streams: Sequence[Streams]) -> PPO:
+        weights = iter(streams)
+
+        def make() -> nn.Module:
+            with next(weights).as_default("weights"):
+                return MLP(2, 4, 2, 32)
+
+        network = Population(make, len(streams), way="batched")
+        split = TensorDictModule(lambda x: x.split([3, 1], -1), ["x"], ["logits", "state_value"])
+        head = TensorDictSequential(TensorDictModule(network, ["observation"], ["x"]), split)
+        agent = ActorCritic(head, distribution_class=categorical, copies=len(streams))
+        levels = self.target.sample(self.batch_size, torch.Generator())
+        env = MountainCar(levels.expand(len(streams), self.batch_size))
+        return PPO(env, agent, self._solver.ppo)
+
+    def performance(
+        self, agent: ActorCritic, levels: TensorDictBase, generator: torch.Generator
+    ) -> TensorDict:
+        """Whether the most probable actions lead to the top in time, and their return."""
+        env = MountainCar(levels.expand(agent.copies, *levels.batch_size))
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            after = env.rollout(self._solver.ppo.horizon, agent.actor(), break_when_any_done=False)
+        done = after["next", "terminated"].squeeze(-1).long()
+        playing = done.cumsum(-1) - done == 0
+        returns = (after["next", "reward"].squeeze(-1) * playing).sum(-1)
+        success = first_episode_success(after).float()
+        return TensorDict({"return": returns, "success": success}, env.batch_size)
+
+    def probe(self, agent: ActorCritic, levels: TensorDictBase) -> Tensor:
+        """Probabilities of the first action, [K, C, 3]."""
+        state = MountainCar(levels.expand(agent.copies, *levels.batch_size)).reset()
+        return agent(state)["logits"].softmax(-1)
+
+    def probe_encoder(self, features: int) -> nn.Module:
+        return nn.Linear(3, features)
+
+    def measure(self, agent: ActorCritic) -> TensorDict:
+        measured = {}
+        for name, levels in self._measured_on.items():
+            performance = self.performance(agent, levels, torch.Generator())
+            for what in ("success", "return"):
+                measured[f"{name}_{what}"] = performance[what].mean(1)
+        return TensorDict(measured, [agent.copies])
+
+    def statistics(self, levels: TensorDictBase, rollout: TensorDictBase) -> TensorDict:
+        means = {name: levels[name].mean(-1) for name in ("gravity", "power")}
+        success = first_episode_success(rollout).float().mean(-1)
+        return TensorDict({**means, "train_success": success}, levels.batch_size[:1])
+
+    def record(
+        self, levels: TensorDictBase, rollout: TensorDictBase | None
+    ) -> list[dict[str, Any]]:
+        places = [[float(level["start"])] for level in levels]
+        if rollout is not None:
+            seen = 0.9 * rollout["next", "observation"][..., 0]
+            ends = rollout["next", "terminated"].squeeze(-1).long().cumsum(-1) <= 1
+            places = [p + s[e].tolist() for p, s, e in zip(places, seen, ends, strict=True)]
+        return [
+            {
+                "picture": png(draw_valley(where)),
+                "text": [f"gravity {level['gravity']:.2f}", f"power {level['power']:.2f}"],
+            }
+            for level, where in zip(levels, places, strict=True)
+        ]
+
+
+def draw_valley(places: Sequence[float]) -> np.ndarray:
+    """The valley, the top, and where a car was: uint8 [60, 120, 3]."""
+
+    def at(x: float) -> tuple[float, float]:
+        return 120 * (x + 1.2) / 1.8, 30 - 22 * math.sin(3 * x)
+
+    def dot(x: float, colour: tuple[int, int, int], radius: float) -> None:
+        across, down = at(x)
+        draw.ellipse([across - radius, down - radius, across + radius, down + radius], colour)
+
+    image = Image.new("RGB", (120, 60), (250, 250, 250))
+    draw = ImageDraw.Draw(image)
+    draw.line([at(-1.2 + 1.8 * i / 60) for i in range(61)], (45, 45, 45), 1)
+    for place in places[1:]:
+        dot(place, (204, 121, 167), 2)
+    dot(places[0], (0, 114, 178), 4)
+    dot(TOP, (230, 159, 0), 4)
+    return np.asarray(image)

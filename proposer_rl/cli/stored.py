@@ -1,0 +1,95 @@
+"""A run's folder as the instruments read it: its settings, its task, its checkpoints."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDict
+
+from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.learning import PPO
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
+from proposer_rl.runs.folder import write_atomically
+from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """All checkpoints of a run, oldest first.
+
+    Raises:
+        ConfigError: if there are none.
+    """
+    files = sorted((folder / "checkpoints").glob("step_*.pt"))
+    if not files:
+        raise ConfigError(f"{folder}: holds no checkpoints; give the folders of runs")
+    return files
+
+
+def read_checkpoint(path: Path) -> tuple[Path, State]:
+    """A run's folder and the state in one of its checkpoints.
+
+    Args:
+        path: the folder, for its newest checkpoint, or a checkpoint in it.
+
+    Raises:
+        ConfigError: if there is none.
+        CheckpointError: if it cannot be used.
+    """
+    if not path.exists():
+        raise ConfigError(f"{path}: there is no such file or folder")
+    if not path.is_dir():
+        return path.resolve().parent.parent, load_checkpoint(path)[1]
+    latest = load_latest(path / "checkpoints")
+    if latest is None:
+        raise ConfigError(f"{path}: holds no checkpoints; give a run's folder or a checkpoint")
+    return path.resolve(), latest[1]
+
+
+def restored(task: Task, config: RunConfig, state: State) -> PPO:
+    """PPO of the Solvers in a checkpoint.
+
+    Raises:
+        CheckpointError: if they have another network than the settings say.
+    """
+    learner = task.learner([Streams(seed) for seed in config.seeds])
+    try:
+        learner.restore(TensorDict(state["solver"], [len(config.seeds)]))
+        int(state["updates"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            "the checkpoint holds no Solver with the network of its run's config.json"
+        ) from error
+    return learner
+
+
+def check_output(option: str, file: Path | None, suffixes: Sequence[str]) -> None:
+    """Refuse a file that could not be written in the end.
+
+    Raises:
+        ConfigError: naming the option.
+    """
+    if file is None:
+        return
+    if file.suffix not in suffixes:
+        raise ConfigError(f"{option} {file}: must end in {' or '.join(suffixes)}")
+    if not file.parent.is_dir():
+        raise ConfigError(f"{option} {file}: there is no folder {file.parent}")
+
+
+def write_rows(rows: Sequence[Any], file: Path | None) -> None:
+    """Write rows as JSON, if a file is given."""
+    if file is not None:
+        write_atomically(file, (json.dumps(rows, indent=1) + "\n").encode())
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on, for an option."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
+    return number

@@ -1,0 +1,190 @@
+"""The contract of a task: what loops, curricula, commands and reports may ask of an environment.
+
+A task is any object with these members; nothing is inherited. What it takes as a level is its own
+business: a tensordict or tensorclass of any content, whose batch shape alone is looked at. K are
+Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
+
+:class:`~proposer_rl.mazes.task.MazeTask` is one, ``examples/mountain_car.py`` another. Methods that
+need more of a task than all of them have ask for it by name, with the optional parts below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from proposer_rl.learning import PPO
+from proposer_rl.models import ActorCritic
+from proposer_rl.streams import Streams
+
+Levels = Any
+"""A tensordict or tensorclass of levels."""
+
+
+class Place(NamedTuple):
+    """Where and how exactly a task computes; what makes a task is called with one.
+
+    Attributes:
+        device: where Solvers and levels live.
+        precision: of the Solvers' networks: ``"fp32"``, ``"bf16"``, or ``"auto"`` for the task's
+            choice.
+        cores: Solvers of a population computed at once on a CPU; None for all cores.
+    """
+
+    device: torch.device = torch.device("cpu")
+    precision: str = "fp32"
+    cores: int | None = None
+
+
+class Distribution(Protocol):
+    """Levels to draw from."""
+
+    def sample(self, count: int, generator: torch.Generator, /) -> Levels:
+        """Draw levels [count] on the task's device; the generator is one of the CPU."""
+
+
+class Space(Distribution, Protocol):
+    """The levels that a Proposer chooses among, in N bins; :meth:`sample` draws evenly from them.
+
+    Attributes:
+        axes: the values along each axis, by the axis's name; the bins are their product, the last
+            axis running fastest.
+        size: the number N of bins.
+        coordinates: of each bin, scaled to [-1, 1] along every axis, float32 [N, D] on the CPU.
+    """
+
+    axes: Mapping[str, Sequence[float]]
+    size: int
+    coordinates: Tensor
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
+        """Levels [K, P] of bins, int64 [K, P], on the task's device; copy k's from generator k."""
+
+
+@runtime_checkable
+class Task(Protocol):
+    """An environment in which Solvers are trained, and how they are looked at.
+
+    Attributes:
+        device: where Solvers and levels live.
+        precision: of the Solvers' networks, ``"fp32"`` or ``"bf16"``.
+        batch_size: levels P of an update of one Solver.
+        target: the distribution that is to be mastered.
+        space: what a Proposer chooses among.
+        distributions: by name, for curricula by hand.
+        measurements: the names of what :meth:`measure` tells.
+    """
+
+    device: torch.device
+    precision: str
+    batch_size: int
+    target: Distribution
+    space: Space
+    distributions: Mapping[str, Distribution]
+    measurements: Sequence[str]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a reader of a run is told of the task, for JSON.
+
+        - ``title``: of its runs, and ``levels``: what levels are called;
+        - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
+        - ``space``: the axes of the Proposer's bins;
+        - ``about``: texts by their labels, and ``key``: what is to be seen in a picture;
+        - ``measured``: all that must be equal for two runs' measurements to be comparable;
+        - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
+        """
+
+    def learner(self, streams: Sequence[Streams]) -> PPO:
+        """PPO of K fresh Solvers, one for each of the streams, in their environment [K, P].
+
+        The environment has a method ``set_levels(levels [K, P])``; it plays them from its next
+        reset on.
+        """
+
+    def performance(
+        self, agent: ActorCritic, levels: Levels, generator: torch.Generator
+    ) -> TensorDictBase:
+        """What K Solvers reach on levels [E]: a tensordict [K, E].
+
+        ``return`` float [K, E] is the expected return of an episode or an estimate of it,
+        ``success`` the probability of success, where that has a meaning. An exact evaluation has no
+        use for the generator, which is one of the device.
+        """
+
+    def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
+        """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...]."""
+
+    def probe_encoder(self, features: int) -> nn.Module:
+        """A network from probes [*B, ...] to features [*B, features]."""
+
+    def measure(self, agent: ActorCritic) -> TensorDictBase:
+        """Measurements of K Solvers by name, each float [K]: the columns of ``metrics.csv``."""
+
+    def statistics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
+        """What Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K]."""
+
+    def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
+        """Levels [n], and what one Solver did there [n, T], for JSON and to be looked at.
+
+        Each record has a ``picture``, a PNG in base64, and may have ``text``, its lines as they
+        are shown in a terminal, and anything else.
+        """
+
+
+@runtime_checkable
+class DifferentiableTask(Protocol):
+    """A task whose performance has gradients: first-order gain without sampling."""
+
+    def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
+        """As :meth:`Task.performance`, with gradients towards the agent's parameters."""
+
+
+class Score(NamedTuple):
+    """What one Solver does on one named level.
+
+    Attributes:
+        level: its name.
+        solver: the Solver's number among those of a population.
+        about: what the level is like, by name.
+        results: ``success`` and ``return``, and whatever else the task tells, by name.
+        note: a few words for below a picture.
+        picture: draws what the Solver does there, uint8 [H, W, 3].
+    """
+
+    level: str
+    solver: int
+    about: Mapping[str, float]
+    results: Mapping[str, float]
+    note: str
+    picture: Callable[[], NDArray[np.uint8]]
+
+
+@runtime_checkable
+class ScoringTask(Protocol):
+    """A task with named levels: files of them, sets that come along.
+
+    Attributes:
+        levels_help: for ``--levels``, what there is; the first word is the default.
+    """
+
+    levels_help: str
+
+    def scores(self, agent: ActorCritic, name: str, max_steps: int | None) -> Sequence[Score]:
+        """How K Solvers do on each level of a set, in the set's order.
+
+        Args:
+            agent: K Solvers.
+            name: of the set: a file, a distribution or whatever else there is.
+            max_steps: step limit of every level; None for the task's choice.
+
+        Raises:
+            ValueError: if there is no such set, or its levels are none for these Solvers.
+            StorageError: if a file cannot be read.
+        """
