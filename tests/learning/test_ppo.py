@@ -22,7 +22,9 @@ from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
 from proposer_rl.learning.cuda_graphs import Recorder
-from proposer_rl.learning.ppo import PPO, MakeLoss, PPOSettings, clip_gradients_
+from proposer_rl.learning.gradients import clip_gradients_
+from proposer_rl.learning.losses import MakeLoss
+from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.maps import read_maps
