@@ -23,7 +23,6 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning.adam import CopiesAdam
 from proposer_rl.learning.advantages import gae
-from proposer_rl.learning.cuda_graphs import Captured, Recorder
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
 from proposer_rl.learning.losses import (
@@ -87,8 +86,6 @@ class PPO:
         agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
             independent copies, which decides over what losses, advantages and norms are taken.
         settings: PPO's numbers.
-        recorder: records rollouts and training, which a GPU then replays; None to run them as they
-            are. A recorded environment starts an episode from the same memory every time.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
             TorchRL's :class:`GAE`.
         loss: makes another TorchRL loss of the agent's actor and critic, with
@@ -105,7 +102,6 @@ class PPO:
         env: EnvBase,
         agent: ActorCritic,
         settings: PPOSettings,
-        recorder: Recorder | None = None,
         *,
         advantage: Callable[[TensorDictBase], TensorDictBase] | None = None,
         loss: MakeLoss | None = None,
@@ -131,8 +127,6 @@ class PPO:
         self._adam = CopiesAdam(
             self._parameters, agent.copies, settings.learning_rate, settings.adam_eps
         )
-        self.collector.act = Captured(self.collector.act, recorder)  # type: ignore[method-assign]
-        self._train = Captured(self.train, recorder)
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
@@ -164,7 +158,7 @@ class PPO:
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
         steps = rollout.exclude(*self.agent.level_keys)
-        trained = self._train(TensorDict({"steps": steps, "level": level}))
+        trained = self.train(TensorDict({"steps": steps, "level": level}))
         rollout.update(trained["steps"])
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
         return TensorDict({key: taken.mean() for key, taken in self.gradient_steps.items()})
