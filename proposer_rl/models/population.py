@@ -31,7 +31,7 @@ class Population(nn.Module):
             GPU but not on a CPU, where only very small networks are faster that way.
 
     Raises:
-        ValueError: for fewer than one copy or core, an unknown precision, or a network with buffers.
+        ValueError: for fewer than one copy or core, another precision, or a network with buffers.
 
     Example:
         >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
