@@ -129,7 +129,7 @@ class MountainCarTask:
             with next(weights).as_default("weights"):
                 return MLP(2, 4, 2, 32)
 
-        network = Population(make, len(streams), way="batched")
+        network = Population(make, len(streams), batched=True)
         split = TensorDictModule(lambda x: x.split([3, 1], -1), ["x"], ["logits", "state_value"])
         head = TensorDictSequential(TensorDictModule(network, ["observation"], ["x"]), split)
         agent = ActorCritic(head, distribution_class=categorical, copies=len(streams))

@@ -44,9 +44,7 @@ def main(cycles: int = 20) -> None:
     """Train a Proposer for mountain cars with each; every cycle begins with a fresh Solver."""
     torch.set_num_threads(1)
     ppo = PPOSettings(horizon=40, learning_rate=4e-3)
-    task = MountainCarTask(
-        levels=64, solver=SolverSettings(batch_size=16, ppo=ppo), place=Place()
-    )
+    task = MountainCarTask(levels=64, solver=SolverSettings(batch_size=16, ppo=ppo), place=Place())
     settings = ProposerSettings(
         meta_episode_length=UPDATES,
         action_repeat=UPDATES // 2,

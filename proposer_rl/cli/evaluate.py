@@ -211,8 +211,8 @@ def _sheet(found: Evaluation) -> bytes:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bin/eval",
-        description="Evaluate a trained Solver on named levels, one by one. For mazes: on levels of "
-        "any size, success and return of the sampled and of the greedy policy, exactly.",
+        description="Evaluate a trained Solver on named levels, one by one. For mazes: on levels "
+        "of any size, success and return of the sampled and of the greedy policy, exactly.",
         epilog="docs/levels.md describes the files of mazes and the sets that come along.",
     )
     parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")

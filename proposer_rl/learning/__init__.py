@@ -2,8 +2,10 @@
 
 from proposer_rl.learning.advantages import LeaveOneOutBaseline
 from proposer_rl.learning.divergence import DivergedError, located
-from proposer_rl.learning.ppo import PPO, MakeLoss, RolloutPolicy, Update
-from proposer_rl.learning.rollout import first_episode_success, load_agent
+from proposer_rl.learning.losses import MakeLoss
+from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.learning.rollout import RolloutPolicy, first_episode_success
+from proposer_rl.learning.snapshot import load_agent
 
 __all__ = [
     "PPO",

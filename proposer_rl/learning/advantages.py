@@ -1,11 +1,20 @@
-"""Advantages without a critic."""
+"""Advantages: by a critic, or by the other copies."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import reward2go
+
+
+def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
+    """TorchRL's generalised advantage estimation, of values that stand in the rollout."""
+    # Its vectorised form splits the batch where episodes end, which it has to look up.
+    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator.set_keys(value=value_key)
+    return estimator
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):

@@ -1,20 +1,24 @@
-"""Functions of tensors whose kernels are recorded once, as a CUDA graph, and then replayed.
+"""A task on a GPU: rollouts, training and measurements are recorded as CUDA graphs, and replayed.
 
 Thousands of small kernels cost a GPU less time than it takes Python to ask for them one by one. A
 graph asks for all of them at once. It repeats kernels on the memory that they were recorded with
 and runs no Python, so a function that is to be recorded reads nothing back from the device, and
-what it reads and changes besides its inputs (weights, an optimiser's state) stays where it is.
+what it reads and changes besides its inputs (weights, an optimiser's state, the levels that an
+environment plays) stays where it is.
+
+Nothing of this has run on a GPU yet: it is tested with a recorder for the CPU alone.
 
 ``tensordict.nn.CudaGraphModule`` does the same, but waits for the device before every replay.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 T = TypeVar("T")
 
@@ -74,27 +78,64 @@ def use(device: torch.device) -> None:
         torch.set_float32_matmul_precision("high")
 
 
-def recorder(device: torch.device, graphs: bool = True) -> Recorder | None:
-    """The recorder for a device; None where there is none, or where none is wanted."""
-    return CudaGraphs(device) if graphs and device.type == "cuda" else None
+def recorded(task: T, recorder: Recorder | None = None) -> T:
+    """A copy of a task whose learners and measurements are replayed.
+
+    Of the learners that it makes, acting and training are recorded; of the task, ``probe`` and
+    ``measure`` for every agent, and ``performance`` where the task has an attribute
+    ``exact_performance`` that is true. Anything else may draw random numbers, which a graph would
+    repeat, and is called as it is. All the rest is the task's own.
+
+    Args:
+        task: as :mod:`proposer_rl.task` describes it. It stays as it is.
+        recorder: of the task's device; None for CUDA graphs on a GPU, and for the task itself
+            elsewhere.
+    """
+    original: Any = task
+    if recorder is None:
+        if original.device.type != "cuda":
+            return task
+        recorder = CudaGraphs(original.device)
+
+    def performance(inputs: TensorDictBase, agent: object) -> TensorDictBase:
+        return original.performance(agent, inputs["levels"], None)
+
+    def probe(inputs: TensorDictBase, agent: object) -> TensorDictBase:
+        return TensorDict({"probes": original.probe(agent, inputs["levels"])})
+
+    def measure(_: TensorDictBase, agent: object) -> TensorDictBase:
+        return original.measure(agent)
+
+    def learner(streams: object) -> Any:
+        ppo = original.learner(streams)
+        ppo.collector.act = Captured(ppo.collector.act, recorder)
+        ppo.train = Captured(ppo.train, recorder)
+        return ppo
+
+    rate, see, sum_up = (Captured(f, recorder) for f in (performance, probe, measure))
+    # A copy, and no wrapper, so that it is of the task's class and of all its protocols.
+    twin = copy.copy(original)
+    twin.learner = learner
+    twin.probe = lambda agent, levels: see(TensorDict({"levels": levels}), agent)["probes"]
+    twin.measure = lambda agent: sum_up(TensorDict({}), agent)
+    if getattr(original, "exact_performance", False):
+        twin.performance = lambda agent, levels, _: rate(TensorDict({"levels": levels}), agent)
+    return twin
 
 
 class Captured:
     """A function whose work is recorded, once for each shape of its inputs.
 
-    The first calls run the function as it is; without a recorder all of them do. Then it is
-    recorded, on inputs of its own; from there on a call copies its inputs there, replays, and
-    returns a copy of the outputs.
+    The first calls run the function as it is. Then it is recorded, on inputs of its own; from there
+    on a call copies its inputs there, replays, and returns a copy of the outputs.
 
     Args:
         function: from a tensordict, and any further objects, to a tensordict. It keeps to what the
             module says of recorded functions.
-        recorder: of the device that the tensors are on; None to record nothing.
+        recorder: of the device that the tensors are on.
     """
 
-    def __init__(
-        self, function: Callable[..., TensorDictBase], recorder: Recorder | None = None
-    ) -> None:
+    def __init__(self, function: Callable[..., TensorDictBase], recorder: Recorder) -> None:
         self._function = function
         self._recorder = recorder
         self._recordings: dict[Any, _Recording] = {}
@@ -112,8 +153,6 @@ class Captured:
         Raises:
             RuntimeError: if the function cannot be recorded.
         """
-        if self._recorder is None:
-            return self._function(inputs, *fixed)
         key = (*map(id, fixed), _shapes(inputs))
         if key not in self._recordings:
             self._recordings[key] = _Recording(self._function, fixed, self._recorder)
@@ -154,9 +193,9 @@ class _Recording:
         try:
             return self._recorder.record(lambda: self._function(self._inputs, *self._fixed))
         except RuntimeError as error:
+            name = getattr(self._function, "__qualname__", self._function)
             raise RuntimeError(
-                f"{self._function} cannot be recorded as a CUDA graph; graphs=false does without: "
-                f"{error}"
+                f"{name} cannot be recorded as a CUDA graph; graphs=false does without: {error}"
             ) from error
 
 
@@ -166,8 +205,3 @@ def _shapes(inputs: TensorDictBase) -> tuple[Any, ...]:
         for key, entry in inputs.items(include_nested=True, leaves_only=True)
     )
     return (tuple(inputs.batch_size), *leaves)
-
-
-def recorded(task):
-    """Stub."""
-    raise RuntimeError

@@ -1,21 +1,159 @@
-"""Stub, replaced by the learning branch."""
+"""Rollouts of an agent by TorchRL's collector, in which a level is read once for all steps."""
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
+
+from proposer_rl.models import ActorCritic, draw, uniform_noise
+
+
+class RolloutCollector:
+    """A TorchRL collector that begins every rollout with a reset.
+
+    Args:
+        env: batch [*B]. What the agent's encoder reads must stay the same until its next reset.
+        agent: that acts.
+        horizon: steps T of a rollout.
+    """
+
+    def __init__(self, env: EnvBase, agent: ActorCritic, horizon: int) -> None:
+        self._agent = agent
+        self._action = env.full_action_spec[agent.action_key]
+        self._horizon = horizon
+        self._level = _LevelAside(*agent.level_keys)
+        self._policy = RolloutPolicy(agent)
+        self._collector = Collector(
+            _WithoutLevel(env, self._level),
+            self._policy,
+            frames_per_batch=env.batch_size.numel() * horizon,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            use_buffers=False,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+            no_cuda_sync=True,
+        )
+
+    def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
+        """A complete rollout [*B, T]; see :meth:`~proposer_rl.learning.ppo.PPO.collect`."""
+        device = next(self._agent.parameters()).device
+        noise = uniform_noise(self._action.shape, self._horizon, generators, device)
+        acted = self.act(TensorDict({"noise": noise}))
+        rollout, level = acted["rollout"], acted["level"]
+        for key, entry in level.items(include_nested=True, leaves_only=True):
+            along_time = entry.unsqueeze(level.ndim)
+            rollout.set(key, along_time.expand(*rollout.shape, *entry.shape[level.ndim :]))
+        return rollout
+
+    @torch.no_grad()
+    def act(self, inputs: TensorDictBase) -> TensorDict:
+        """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
+        self._policy.begin(inputs["noise"], self._level)
+        rollout = self._collector.rollout()
+        set_next_values(self._agent, rollout, self._policy.context)
+        return TensorDict({"rollout": rollout, "level": self._level.entries})
+
+
+@torch.no_grad()
+def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase) -> None:
+    """Write the present values of steps [*B, T] on a level [*B], before and after each step."""
+    context = agent.encode(level)
+    now = agent.decode(steps.select(*agent.step_keys), context)
+    steps.set(agent.value_key, now.get(agent.value_key))
+    set_next_values(agent, steps, context)
+
+
+@torch.no_grad()
+def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
+    """Write the values after each of the steps [*B, T], whose level has this context [*B]."""
+    after = agent.decode(steps.get("next").select(*agent.step_keys), context)
+    steps.set(("next", agent.value_key), after.get(agent.value_key))
+
+
+class RolloutPolicy(TensorDictModuleBase):
+    """What a collector calls: reads the steps off the context and draws actions from noise.
+
+    :meth:`begin` comes before every rollout.
+
+    Args:
+        agent: its parameters do not become the policy's, so that a collector leaves them be.
+    """
+
+    context: TensorDictBase
+
+    def __init__(self, agent: ActorCritic) -> None:
+        super().__init__()
+        # In a tuple, nn.Module does not register it.
+        self._agent = (agent,)
+        self.in_keys = agent.step_keys
+        self.out_keys = [agent.action_key, agent.log_prob_key, agent.value_key]
+
+    def begin(self, noise: Tensor, level: _LevelAside | None = None) -> None:
+        """Expect a rollout with this noise [T, ...].
+
+        Args:
+            noise: uniform numbers in [0, 1), one for each element of T actions.
+            level: where the next reset puts the level aside; None where it stays in every step.
+        """
+        self._steps = enumerate(noise)
+        self._level = (level,)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write action, log-probability and value of the next step."""
+        (agent,), (level,) = self._agent, self._level
+        index, noise = next(self._steps)
+        if index == 0:
+            self.context = agent.encode(tensordict if level is None else level.entries)
+        step = agent.decode(tensordict.select(*agent.step_keys), self.context)
+        distribution = agent.distribution(step)
+        action = draw(distribution, noise)
+        tensordict.set(agent.action_key, action)
+        tensordict.set(agent.log_prob_key, distribution.log_prob(action))
+        return tensordict.set(agent.value_key, step.get(agent.value_key))
+
+
+class _LevelAside(ExcludeTransform):
+    """Puts entries aside that the collector would copy at every step, at each whole reset."""
+
+    entries: TensorDictBase
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.entries = tensordict_reset.select(*self.excluded_keys)
+        return super()._reset(tensordict, tensordict_reset)
+
+
+class _WithoutLevel(TransformedEnv):
+    """An environment without those entries, whose own way of resetting what is done is kept."""
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.base_env.maybe_reset(tensordict).exclude(*self.transform.excluded_keys)
 
 
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
+    """Whether the first episode of every environment terminated, rather than was truncated or cut.
+
+    Args:
+        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "terminated")`` [*B, T, 1].
+
+    Returns:
+        bool [*B].
+
+    Example:
+        >>> import torch
+        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
+        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
+        >>> first_episode_success(rollout)  # the second one does not count
+        tensor([False])
+    """
     done = rollout["next", "done"].squeeze(-1).long()
     first = done.cumsum(-1) - done == 0  # up to and including the first end
     return (rollout["next", "terminated"].squeeze(-1) & first).any(-1)
-
-
-def load_agent(agent, snapshot) -> None:
-    parameters = dict(agent.named_parameters())
-    shapes = {name: parameter.shape for name, parameter in parameters.items()}
-    if shapes != {name: snapshot[name, "value"].shape for name in snapshot.keys()}:
-        raise ValueError("the Proposer belongs to another network: its parameters differ")
-    for name, parameter in parameters.items():
-        parameter.data.copy_(snapshot[name, "value"])

@@ -1,4 +1,4 @@
-"""Networks and actor-critics of both agents; they know tensors, not mazes."""
+"""Networks and actor-critics of both agents; they know tensors and no environment."""
 
 from proposer_rl.models.actor_critic import (
     ActorCritic,
@@ -15,7 +15,6 @@ from proposer_rl.models.proposer import (
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
-    context_width,
     fourier_encoding,
     proposer_actor_critic,
 )
@@ -32,7 +31,6 @@ __all__ = [
     "available_cores",
     "categorical",
     "cell_logits",
-    "context_width",
     "draw",
     "fourier_encoding",
     "joint_categorical",

@@ -1,4 +1,4 @@
-"""The Solver: a network over whole levels whose maps are read at the agent's cell."""
+"""An actor-critic over whole grids: a network whose maps are read at the agent's cell."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def map_actor_critic(
         agent_key: entry of the agent's row and column, int64 [*B, 2].
 
     Example:
-        >>> from proposer_rl import MazeEnv, UNet, generate_levels
-        >>> solver = map_actor_critic(UNet(channels=(8, 8)))
-        >>> env = MazeEnv(generate_levels(torch.full((5,), 0.2), 4, 6, 6))
-        >>> env.rollout(3, solver.actor(), break_when_any_done=False)["logits"].shape
-        torch.Size([5, 3, 4])
+        >>> from proposer_rl import UNet
+        >>> agent, cells = map_actor_critic(UNet(channels=(8, 8))), torch.zeros(5, 2).long()
+        >>> state = TensorDict({"planes": torch.rand(5, 3, 6, 6), "agent": cells}, [5])
+        >>> agent(state)["logits"].shape
+        torch.Size([5, 4])
     """
     maps = TensorDictModule(network, [planes_key], ["policy_map", "value_map"])
     head = TensorDictModule(
@@ -69,21 +69,21 @@ def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Ten
 
 
 @torch.no_grad()
-def cell_logits(solver: ActorCritic, planes: Tensor) -> Tensor:
-    """Action logits at every cell of levels: what the Solver would do wherever it stood.
+def cell_logits(agent: ActorCritic, planes: Tensor) -> Tensor:
+    """Action logits at every cell of levels: what the agent would do wherever it stood.
 
     Args:
-        solver: from :func:`map_actor_critic`.
+        agent: from :func:`map_actor_critic`.
         planes: the levels without the agent, float [*B, C, H, W], with copies [K, *B, C, H, W].
 
     Returns:
         float [*B, A, H, W].
     """
     batch = planes.shape[:-3]
-    if solver.encoder is not None:
-        (planes_key,) = solver.level_keys
-        return solver.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
-    planes_key, agent_key = solver.step_keys
+    if agent.encoder is not None:
+        (planes_key,) = agent.level_keys
+        return agent.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
+    planes_key, agent_key = agent.step_keys
     height, width = planes.shape[-2:]
     number = torch.arange(height * width, device=planes.device)
     positions = torch.stack([number // width, number % width], -1)  # [H * W, 2]
@@ -96,5 +96,5 @@ def cell_logits(solver: ActorCritic, planes: Tensor) -> Tensor:
             planes_key: torch.cat([planes, drawn], -3),
             agent_key: position.expand(*batch, 2),
         }
-        cells.append(solver(TensorDict(step, batch))["logits"])
+        cells.append(agent(TensorDict(step, batch))["logits"])
     return torch.stack(cells, -1).unflatten(-1, (height, width))

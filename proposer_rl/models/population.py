@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from proposer_rl.learning.cuda_graphs import Recorder
-from proposer_rl.models.stacked import (
-    WAYS,
-    Call,
-    Way,
-    apply_on_cores,
-    measure,
-)
+from proposer_rl.models.stacked import Call, apply_alone, apply_batched, apply_on_cores
 
 
 class Population(nn.Module):
@@ -35,17 +27,11 @@ class Population(nn.Module):
             gradients and outputs stay float32).
         cores: copies that are computed at once on a CPU, each by one thread; None for as many as
             the process may use. The numbers are those of one thread whatever the cores.
-        way: how the copies are computed, one of :data:`~proposer_rl.models.stacked.WAYS`; None for
-            cores on a CPU, and on a GPU for the fastest at the first call.
-        recorder: of what runs the population, for measuring which way is fastest.
-        share: the copies that are computed here, where other processes compute the rest; None for
-            all. The outputs of the rest are zeros. They keep their place in the stack, so that
-            whatever is done to the stack rounds alike wherever a copy is computed: the last numbers
-            of a tensor are often computed in another way than the others.
+        batched: whether all copies are computed at once, in each operation; None for doing so on a
+            GPU but not on a CPU, where only very small networks are faster that way.
 
     Raises:
-        ValueError: for fewer than one copy or core, an unknown precision or way, a share that is
-            empty or goes beyond the copies, or a network with buffers.
+        ValueError: for fewer than one copy or core, another precision, or a network with buffers.
 
     Example:
         >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
@@ -59,9 +45,7 @@ class Population(nn.Module):
         copies: int,
         precision: str = "fp32",
         cores: int | None = None,
-        way: str | None = None,
-        recorder: Recorder | None = None,
-        share: range | None = None,
+        batched: bool | None = None,
     ) -> None:
         super().__init__()
         cores = available_cores() if cores is None else cores
@@ -69,20 +53,13 @@ class Population(nn.Module):
             raise ValueError(f"copies and cores must be at least 1, got {copies} and {cores}")
         if precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be 'fp32' or 'bf16', got {precision!r}")
-        if way is not None and way not in WAYS:
-            raise ValueError(f"way must be one of {list(WAYS)}, got {way!r}")
-        share = range(copies) if share is None else share
-        if not (0 <= share.start < share.stop <= copies and share.step == 1):
-            raise ValueError(f"share must be a range within {copies} copies, got {share}")
         members = [make() for _ in range(copies)]
         if next(members[0].buffers(), None) is not None:
             raise ValueError("a Population's network must not have buffers")
         self.copies = copies
         self.precision = precision
         self.cores = cores
-        self.way = way
-        self.share = share
-        self._recorder = recorder
+        self.batched = batched
         self.names = [name for name, _ in members[0].named_parameters()]
         self.stacked = nn.ParameterList(
             nn.Parameter(torch.stack([p.detach() for p in parameters]))
@@ -94,39 +71,15 @@ class Population(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
         call = Call(self._template[0], self.names, self.precision)
-        outputs = self._chosen_way(inputs)(call, list(self.stacked), inputs)
+        stacked = list(self.stacked)
+        batched = stacked[0].device.type != "cpu" if self.batched is None else self.batched
+        if self.copies == 1:
+            outputs = apply_alone(call, stacked, inputs)
+        elif batched:
+            outputs = apply_batched(call, stacked, inputs)
+        else:
+            outputs = apply_on_cores(call, stacked, inputs, self.cores)
         return outputs[0] if len(outputs) == 1 else outputs
-
-    def _of_share(
-        self, way: Way, call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
-    ) -> tuple[Tensor, ...]:
-        """Apply a way that knows no shares."""
-        outputs = way(call, self._own(stacked), self._own(inputs))
-        return tuple(self._among_all(output) for output in outputs)
-
-    def _own(self, tensors: Iterable[Tensor]) -> list[Tensor]:
-        """The share's slices of tensors [K, ...]."""
-        whole = len(self.share) == self.copies
-        return [x if whole else x[self.share.start : self.share.stop] for x in tensors]
-
-    def _among_all(self, output: Tensor) -> Tensor:
-        """A share's output among zeros for the other copies, [K, ...]."""
-        before, after = self.share.start, self.copies - self.share.stop
-        rest = [output.new_zeros(count, *output.shape[1:]) for count in (before, after)]
-        return torch.cat([rest[0], output, rest[1]]) if before or after else output
-
-    def seconds_of_ways(self, *inputs: Tensor) -> dict[str, float]:
-        """Measure how long both passes over such inputs [K, ...] take, by each way."""
-        call = Call(self._template[0], self.names, self.precision)
-        return measure(WAYS, call, self._own(self.stacked), self._own(inputs), self._recorder)
-
-    def _chosen_way(self, inputs: Sequence[Tensor]) -> Way:
-        if self.way is None and self.copies > 1:
-            if not self.stacked[0].is_cuda:
-                return partial(apply_on_cores, cores=self.cores, share=self.share)
-            seconds = self.seconds_of_ways(*inputs)
-            self.way = min(seconds, key=seconds.__getitem__)
-        return partial(self._of_share, WAYS[self.way or "in turn"])
 
 
 def available_cores() -> int:

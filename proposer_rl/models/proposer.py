@@ -50,12 +50,8 @@ class ProposerNetwork(nn.Module):
             :class:`ProblemHead` and :class:`MixtureHead`.
         encoder: from probes [*B, ...] of any kind to their features [*B, context]: a
             :class:`MapEncoder` for maps, an MLP for vectors.
-        context: number of the encoder's features; the width of the context is
-            :func:`context_width`.
+        context: number of the encoder's features; the context g is ``context + numbers`` wide.
         numbers: how many numbers, of about 0 to 1, are observed beside the probes.
-        number_bands: frequencies at which a number is told to the network by its sine and cosine,
-            from half a cycle over 0 to 1 upwards, each double the last; with 0 as it is. The more
-            of them, the less what is learnt at one value is taken for another.
         hidden: width of the value's MLP.
     """
 
@@ -66,15 +62,13 @@ class ProposerNetwork(nn.Module):
         *,
         context: int = 128,
         numbers: int = 0,
-        number_bands: int = 0,
         hidden: int = 128,
     ) -> None:
         super().__init__()
-        width = context_width(context, numbers, number_bands)
+        width = context + numbers
         self.encoder = encoder
         self.value = nn.Sequential(nn.Linear(width, hidden), nn.Tanh(), nn.Linear(hidden, 1))
         self.context = context
-        self.number_bands = number_bands
         orthogonal_(self)
         orthogonal_(self.value[-1], 1.0)
         self.head = head
@@ -86,27 +80,14 @@ class ProposerNetwork(nn.Module):
             probes: float [*B, C, ...].
             numbers: of what else is observed, each [*B, 1].
         """
-        told = [self._tell(number) for number in numbers]
-        context = torch.cat([self._encode(probes), *told], -1)
+        context = torch.cat([self._encode(probes), *numbers], -1)
         return self.head(context), self.value(context)
-
-    def _tell(self, number: Tensor) -> Tensor:
-        if self.number_bands == 0:
-            return number
-        cycles = 0.5 * 2.0 ** torch.arange(self.number_bands, device=number.device)
-        phase = 2 * math.pi * number * cycles
-        return torch.cat([phase.sin(), phase.cos()], -1)
 
     def _encode(self, probes: Tensor) -> Tensor:
         features = self.encoder(probes)  # [*B, C, context]
         if features.shape[-2] == 0:  # C = 0: a Proposer that does not see the Solver's answers
             return features.new_zeros(*features.shape[:-2], self.context)
         return torch.relu(features.mean(-2))
-
-
-def context_width(context: int, numbers: int, number_bands: int = 0) -> int:
-    """Width of the context that a :class:`ProposerNetwork` of these sizes gives to its head."""
-    return context + numbers * max(1, 2 * number_bands)
 
 
 class ProblemHead(nn.Module):

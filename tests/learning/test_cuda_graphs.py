@@ -7,8 +7,13 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, CudaGraphs, recorder
+from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, recorded
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.mazes import Level, planes
+from proposer_rl.mazes.evaluation import ExactEvaluator
+from proposer_rl.models import ActorCritic, cell_logits
 from tests.graphs import HostRead, NoHostReads, Tapes
+from tests.learning.test_ppo import learner, levels, train
 
 
 class Counter:
@@ -41,13 +46,6 @@ def test_replays_equal_calls_and_run_no_python() -> None:
         assert (result == wanted).all()
     assert torch.equal(counter.total, plain.total)
     assert (plain.runs, counter.runs, tapes.recorded) == (6, WARM_UPS + 1, 1)
-
-
-def test_without_a_recorder_it_is_the_function() -> None:
-    counter = Counter()
-    captured = Captured(counter.add)
-    assert [captured(inputs(1.0))["total"][0].item() for _ in range(5)] == [1, 2, 3, 4, 5]
-    assert counter.runs == 5
 
 
 def test_every_shape_and_every_object_has_a_recording_of_its_own() -> None:
@@ -84,7 +82,7 @@ def test_training_is_recorded_with_its_gradients_and_optimiser() -> None:
             adam.step()
             return TensorDict({"loss": loss.detach()})
 
-        captured = Captured(step, tapes)
+        captured = step if tapes is None else Captured(step, tapes)
         losses = [
             captured(TensorDict({"x": torch.randn(4, 3), "y": torch.randn(4, 1)}))["loss"]
             for _ in range(8)
@@ -126,7 +124,90 @@ def test_what_cannot_be_recorded_is_named() -> None:
         captured(inputs(0.0))
 
 
-def test_graphs_are_for_cuda() -> None:
-    assert recorder(torch.device("cpu")) is None
-    assert isinstance(recorder(torch.device("cuda:1")), CudaGraphs)
-    assert recorder(torch.device("cuda:1"), graphs=False) is None
+class Mazes:
+    """The least that a task has."""
+
+    device = torch.device("cpu")
+    exact_performance = True
+
+    def __init__(self, observe_agent: bool = False) -> None:
+        self.observe_agent = observe_agent
+
+    def learner(self, streams: range) -> PPO:
+        return learner(len(streams), observe_agent=self.observe_agent, batched=True)
+
+    def performance(self, agent: ActorCritic, levels: Level, generator: object) -> TensorDict:
+        copies = levels.expand(agent.copies, *levels.batch_size)
+        return ExactEvaluator(5)(copies, cell_logits(agent, planes(copies)))
+
+    def probe(self, agent: ActorCritic, levels: Level) -> torch.Tensor:
+        assert isinstance(levels, Level)
+        return cell_logits(agent, planes(levels.expand(agent.copies, *levels.batch_size)))
+
+    def measure(self, agent: ActorCritic) -> TensorDict:
+        return TensorDict({"id_return": self.performance(agent, GIVEN[0], None)["return"].mean(1)})
+
+
+GIVEN = levels(1, seed=7)
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
+@pytest.mark.parametrize("copies", [1, 2])
+def test_replayed_updates_train_as_plain_ones(copies: int, observe_agent: bool) -> None:
+    """Ten updates, of which the first are plain and the others replays: equal to the bit."""
+    task, tapes = Mazes(observe_agent), Tapes()
+    plain = task.learner(range(copies))
+    replayed = recorded(task, tapes).learner(range(copies))
+    for one, other in zip(train(plain, 10), train(replayed, 10), strict=True):
+        assert (one == other).all()
+    assert (plain.snapshot() == replayed.snapshot()).all()
+    assert tapes.recorded == 2  # a rollout and the training on it
+
+
+def test_replays_follow_a_restored_snapshot_and_leave_older_rollouts_alone() -> None:
+    ppo = recorded(Mazes(), Tapes()).learner(range(1))
+    *_, old = train(ppo, 4)
+    kept, snapshot = old.clone(), ppo.snapshot()
+    first = train(ppo, 2)
+    ppo.restore(snapshot)
+    assert all((a == b).all() for a, b in zip(first, train(ppo, 2), strict=True))
+    assert (old == kept).all()
+
+
+def test_recorded_measurements_follow_the_agents_and_the_levels() -> None:
+    plain, tapes = Mazes(), Tapes()
+    task = recorded(plain, tapes)
+    assert isinstance(task, Mazes) and task.device == plain.device
+    learners = [plain.learner(range(copies)) for copies in (1, 2)]
+    with torch.no_grad():
+        for update in range(5):
+            for ppo in learners:
+                agent, given = ppo.agent, levels(1, seed=update)[0]
+                assert (task.measure(agent) == plain.measure(agent)).all()
+                rated = task.performance(agent, given, torch.Generator())
+                assert (rated == plain.performance(agent, given, torch.Generator())).all()
+                assert torch.equal(task.probe(agent, given), plain.probe(agent, given))
+                with torch.enable_grad():
+                    train(ppo, 1)
+    assert tapes.recorded == 3 * 2
+
+
+def test_a_performance_that_draws_numbers_is_called_each_time() -> None:
+    class Sampled(Mazes):
+        exact_performance = False
+
+        def performance(self, agent: ActorCritic, levels: Level, generator: object) -> TensorDict:
+            drawn = torch.rand(agent.copies, len(levels), generator=generator)
+            return TensorDict({"return": drawn}, drawn.shape)
+
+    plain, tapes, drawn = Sampled(), Tapes(), []
+    for task in (plain, recorded(plain, tapes)):
+        agent, generator = task.learner(range(1)).agent, torch.Generator().manual_seed(0)
+        drawn += [[task.performance(agent, GIVEN[0], generator)["return"] for _ in range(5)]]
+    assert all(map(torch.equal, *drawn)) and not torch.equal(*drawn[1][-2:])
+    assert tapes.recorded == 0
+
+
+def test_without_a_gpu_nothing_is_recorded() -> None:
+    task = Mazes()
+    assert recorded(task) is task

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from tests.learning.test_ppo import generators, learner
 
 from proposer_rl.learning.divergence import DivergedError, located, require_finite
+from tests.learning.test_ppo import generators, learner
 
 K, S = 3, 2
 BAD = [float("nan"), float("inf"), float("-inf")]

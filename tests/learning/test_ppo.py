@@ -21,12 +21,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
-from proposer_rl.learning.cuda_graphs import Recorder
-from proposer_rl.learning.ppo import PPO, MakeLoss, PPOSettings, clip_gradients_
+from proposer_rl.learning.gradients import clip_gradients_
+from proposer_rl.learning.losses import MakeLoss
+from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.maps import read_maps
-from tests.graphs import NoHostReads, Tapes
+from tests.graphs import NoHostReads
 
 P, T = 6, 12
 SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
@@ -43,8 +44,7 @@ def learner(
     observe_agent: bool = False,
     *,
     per_step: bool | None = None,
-    way: str | None = None,
-    recorder: Recorder | None = None,
+    batched: bool | None = None,
     loss: MakeLoss | None = None,
 ) -> PPO:
     torch.manual_seed(3)
@@ -53,9 +53,9 @@ def learner(
         return UNet(in_channels=4 if observe_agent else 3, channels=(8, 16), groups=4)
 
     per_step = observe_agent if per_step is None else per_step
-    agent = map_actor_critic(Population(make, copies, way=way), per_step=per_step)
+    agent = map_actor_critic(Population(make, copies, batched=batched), per_step=per_step)
     env = MazeEnv(levels(copies), max_steps=5, observe_agent=observe_agent)
-    return PPO(env, agent, settings, recorder, loss=loss)
+    return PPO(env, agent, settings, loss=loss)
 
 
 def train(ppo: PPO, updates: int) -> list[TensorDict]:
@@ -446,41 +446,14 @@ def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
     assert moved > 5e-3
 
 
-@pytest.mark.parametrize(
-    ("copies", "observe_agent", "way"),
-    [(1, False, None), (1, True, None), (2, False, "batched"), (2, False, "4 streams")],
-)
-def test_replayed_updates_train_as_plain_ones(
-    copies: int, observe_agent: bool, way: str | None
-) -> None:
-    """Ten updates, of which the first are plain and the others replays: equal to the bit."""
-    tapes = Tapes()
-    plain = learner(copies, observe_agent=observe_agent, way=way)
-    replayed = learner(copies, observe_agent=observe_agent, way=way, recorder=tapes)
-    for one, other in zip(train(plain, 10), train(replayed, 10), strict=True):
-        assert (one == other).all()
-    assert (plain.snapshot() == replayed.snapshot()).all()
-    assert tapes.recorded == 2  # a rollout and the training on it
-
-
-def test_replays_follow_a_restored_snapshot_and_leave_older_rollouts_alone() -> None:
-    ppo = learner(way="in turn", recorder=Tapes())
-    *_, old = train(ppo, 4)
-    kept, snapshot = old.clone(), ppo.snapshot()
-    first = train(ppo, 2)
-    ppo.restore(snapshot)
-    assert all((a == b).all() for a, b in zip(first, train(ppo, 2), strict=True))
-    assert (old == kept).all()
-
-
-@pytest.mark.parametrize("way", ["batched", "4 streams"])
+@pytest.mark.parametrize("copies", [1, 2])
 @pytest.mark.parametrize("observe_agent", [False, True])
-def test_an_update_never_waits_for_the_device(observe_agent: bool, way: str) -> None:
-    ppo = learner(2, observe_agent=observe_agent, way=way)
+def test_an_update_never_waits_for_the_device(observe_agent: bool, copies: int) -> None:
+    ppo = learner(copies, observe_agent=observe_agent, batched=True)
     train(ppo, 1)  # constants are made
     with NoHostReads():
         ppo.env.set_levels(levels_on_hand := ppo.env.levels.clone())
-        ppo.update(generators(0, 1))
+        ppo.update(generators(*range(copies)))
     assert (ppo.env.levels == levels_on_hand).all()
 
 

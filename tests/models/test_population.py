@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
-from functools import partial
 
 import pytest
 import torch
 from torch import nn
 
 from proposer_rl.models import Population, UNet
-from proposer_rl.models.stacked import (
-    WAYS,
-    Call,
-    apply_in_turn,
-    apply_on_cores,
-    measure,
-)
-from tests.graphs import Tapes
 
 
 def small_unet() -> UNet:
@@ -31,49 +21,41 @@ def apart(copies: int) -> list[UNet]:
     return [small_unet() for _ in range(copies)]
 
 
-def together(copies: int, precision: str = "fp32", cores: int | None = None) -> Population:
+def together(copies: int, precision: str = "fp32", **options) -> Population:
     torch.manual_seed(7)
-    return Population(small_unet, copies, precision, cores)
+    return Population(small_unet, copies, precision, **options)
 
 
-def test_outputs_and_gradients_equal_those_of_networks_apart() -> None:
-    networks, population = apart(3), together(3)
-    planes = torch.rand(3, 5, 3, 10, 10)
-    weights = torch.tensor([1.0, -2.0, 0.5])  # each copy has another loss
+WAYS = [{}, {"cores": 1}, {"cores": 4}, {"batched": True}]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("copies", [1, 3])
+def test_outputs_and_gradients_equal_those_of_networks_apart(copies: int, way: dict) -> None:
+    networks, population = apart(copies), together(copies, **way)
+    planes = torch.rand(copies, 5, 3, 7, 9, requires_grad=True)
+    weights = torch.tensor([1.0, -2.0, 0.5])[:copies]  # each copy has another loss
     policy, value = population(planes)
+    with torch.no_grad():
+        assert all(map(torch.equal, population(planes), (policy, value)))
     ((policy.square().mean((1, 2, 3, 4)) + value.mean((1, 2, 3, 4))) * weights).sum().backward()
     for k, network in enumerate(networks):
-        own_policy, own_value = network(planes[k])
+        own = planes[k].detach().requires_grad_()
+        own_policy, own_value = network(own)
         torch.testing.assert_close(policy[k], own_policy)
         torch.testing.assert_close(value[k], own_value)
         ((own_policy.square().mean() + own_value.mean()) * weights[k]).backward()
+        torch.testing.assert_close(planes.grad[k], own.grad, rtol=1e-4, atol=1e-6)
         for stacked, parameter in zip(population.stacked, network.parameters(), strict=True):
             assert stacked.grad is not None
             torch.testing.assert_close(stacked.grad[k], parameter.grad, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("way", [*WAYS.values(), partial(apply_on_cores, cores=4)])
-def test_every_way_equals_one_copy_after_the_other(way: Callable) -> None:
-    population = together(5)
-    planes = torch.rand(5, 4, 3, 7, 9, requires_grad=True)
-    call = Call(population._template[0], population.names, "fp32")
-    results = {}
-    for name, apply in (("plain", apply_in_turn), ("way", way)):
-        outputs = apply(call, list(population.stacked), (planes,))
-        loss = sum(output.square().sum() for output in outputs)
-        gradients = torch.autograd.grad(loss, [planes, *population.stacked])
-        with torch.no_grad():
-            results[name] = (*outputs, *gradients, *apply(call, population.stacked, (planes,)))
-    for one, other in zip(*results.values(), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
-
-
 def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> None:
-    population, planes = together(6), torch.rand(6, 4, 3, 6, 6)
-    call = Call(population._template[0], population.names, "fp32")
+    population, planes = together(6, cores=4), torch.rand(6, 4, 3, 6, 6)
     runs = []
     for _ in range(3):
-        outputs = apply_on_cores(call, list(population.stacked), (planes,), cores=4)
+        outputs = population(planes)
         loss = sum(output.square().sum() for output in outputs)
         runs.append([*outputs, *torch.autograd.grad(loss, list(population.stacked))])
     assert all(parameter.grad is None for parameter in population.stacked)
@@ -111,18 +93,6 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
         os._exit(0)
     _, status = os.waitpid(child, 0)
     assert status == 0
-
-
-def test_every_way_is_measured_as_it_will_be_run_and_leaves_no_trace() -> None:
-    population, planes, tapes = together(2), torch.rand(2, 4, 3, 6, 6), Tapes()
-    before = [parameter.detach().clone() for parameter in population.stacked]
-    call = Call(population._template[0], population.names, "fp32")
-    with torch.no_grad():  # as in the rollout, where a population is called first
-        seconds = measure(WAYS, call, list(population.stacked), (planes,), tapes, repeats=1)
-    assert list(seconds) == list(WAYS) and min(seconds.values()) > 0
-    assert tapes.recorded == len(WAYS)
-    for parameter, old in zip(population.stacked, before, strict=True):
-        assert parameter.grad is None and torch.equal(parameter, old)
 
 
 def test_a_parameter_that_is_not_used_has_no_slope() -> None:
@@ -174,7 +144,6 @@ def test_a_network_with_one_output_gives_one_output() -> None:
     [
         ((small_unet, 0), "copies and cores must be at least 1, got 0 and"),
         ((small_unet, 1, "fp32", 0), "copies and cores must be at least 1, got 1 and 0"),
-        ((small_unet, 1, "fp32", 1, "magic"), "way must be one of .*, got 'magic'"),
         ((small_unet, 1, "fp8"), "precision must be 'fp32' or 'bf16', got 'fp8'"),
         ((lambda: nn.BatchNorm1d(3), 1), "must not have buffers"),
     ],
@@ -182,26 +151,3 @@ def test_a_network_with_one_output_gives_one_output() -> None:
 def test_refuses(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Population(*arguments)
-
-
-@pytest.mark.parametrize("share", [range(0, 1), range(1, 3), range(2, 5)])
-def test_a_share_has_the_bits_that_it_has_among_all(share: range) -> None:
-    torch.manual_seed(7)
-    part, whole = Population(small_unet, 5, share=share), together(5)
-    planes = torch.rand(5, 4, 3, 7, 9)
-    for population in (whole, part):
-        policy, value = population(planes)
-        (policy.square().sum() + value.sum()).backward()
-        population.outputs = policy.detach()
-    own = slice(share.start, share.stop)
-    rest = [k for k in range(5) if k not in share]
-    assert part.share == share and whole.share == range(5)
-    assert torch.equal(part.outputs[own], whole.outputs[own]) and not part.outputs[rest].any()
-    for one, other in zip(part.stacked, whole.stacked, strict=True):
-        assert torch.equal(one.grad[own], other.grad[own]) and not one.grad[rest].any()
-
-
-@pytest.mark.parametrize("share", [range(0, 0), range(0, 4), range(0, 3, 2), range(-1, 2)])
-def test_a_share_lies_within_the_copies(share: range) -> None:
-    with pytest.raises(ValueError, match="share must be a range within 3 copies"):
-        Population(small_unet, 3, share=share)

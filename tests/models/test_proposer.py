@@ -12,7 +12,6 @@ from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,
     categorical,
-    context_width,
     draw,
     fourier_encoding,
     joint_categorical,
@@ -123,21 +122,3 @@ def test_normal_is_that_of_scipy_and_drawn_by_its_quantiles() -> None:
     drawn = draw(distribution, uniform)
     assert drawn.isfinite().all()
     torch.testing.assert_close(float(drawn[1]), float(reference.ppf(0.9)[1]), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(("bands", "width"), [(0, 16 + 2), (3, 16 + 2 * 6)])
-def test_the_width_of_a_context(bands: int, width: int) -> None:
-    assert context_width(16, 2, bands) == width
-    torch.manual_seed(0)
-    head = MixtureHead(width, directions=2, hidden=8)
-    network = ProposerNetwork(head, maps(16), numbers=2, number_bands=bands, context=16, hidden=16)
-    parameters, value = network(torch.rand(5, 4, 7, 6, 6), torch.rand(5, 1), torch.rand(5, 1))
-    assert parameters.shape == (5, 2, 2) and value.shape == (5, 1)
-
-
-def test_bands_tell_numbers_from_zero_to_one_apart() -> None:
-    head = MixtureHead(context_width(4, 1, 3), directions=1, hidden=8)
-    network = ProposerNetwork(head, maps(4), numbers=1, number_bands=3, context=4, hidden=4)
-    told = network._tell(torch.linspace(0, 1, 9)[:, None])
-    torch.testing.assert_close(told[4], torch.tensor([1.0, 0, 0, 0, -1, 1]), atol=1e-6, rtol=0)
-    assert (torch.cdist(told, told) + 10 * torch.eye(9)).min() > 0.3

@@ -1,0 +1,86 @@
+"""PPO's loss of K copies at once: TorchRL's, without what would mix them or wait for a device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
+from torch.distributions import Categorical, Distribution, Independent
+from torchrl.objectives import ClipPPOLoss, LossModule
+
+from proposer_rl.models import ActorCritic
+
+# From an actor and a critic that read what stands in a tensordict already, to a loss of both.
+MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
+
+
+def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
+    """The loss of an agent's actor and critic, reading the entries that the agent writes.
+
+    Raises:
+        ValueError: if it reduces what belongs to different copies.
+    """
+    loss = make(*agent.readout())
+    if loss.reduction != "none":
+        raise ValueError(f'reduction of the loss must be "none", got {loss.reduction!r}')
+    loss.set_keys(
+        action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
+    )
+    return loss.to(next(agent.parameters()).device)
+
+
+class CopiesClipLoss(ClipPPOLoss):
+    """The clipped loss of every transition, with advantages standardised over each copy's batch.
+
+    Args:
+        actor, critic: as :meth:`~proposer_rl.models.ActorCritic.readout` makes them.
+        copies: K, or None for a single network.
+        numbers: further arguments of :class:`torchrl.objectives.ClipPPOLoss`.
+    """
+
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        critic: TensorDictModule,
+        *,
+        copies: int | None,
+        **numbers: Any,
+    ) -> None:
+        super().__init__(
+            actor,
+            critic,
+            loss_critic_type="l2",
+            normalize_advantage_exclude_dims=() if copies is None else (0,),
+            functional=False,
+            reduction="none",
+            # TorchRL's takes the variance over the first dimension alone: see explained_variance.
+            log_explained_variance=False,
+            **numbers,
+        )
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        # TorchRL's looks whether an entropy is finite, and waits: for discrete actions it is.
+        if isinstance(dist, Categorical | Independent):
+            return dist.entropy().unsqueeze(-1)
+        return super()._get_entropy(dist, adv_shape)
+
+
+def loss_terms(losses: TensorDictBase, copies: int | None) -> dict[str, Tensor]:
+    """The terms ``loss_...``, each the mean over a copy's own batch: [K], without copies []."""
+    return {
+        key: term.flatten(0 if copies is None else 1).mean(-1)
+        for key, term in losses.items()
+        if key.startswith("loss_")
+    }
+
+
+def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
+    """Share of the targets' variance that the values explain, the mean over copies."""
+    value, target = steps[value_key].detach(), steps["value_target"]
+    batch = 0 if copies is None else 1
+    residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
+    return (1 - residual / total.clamp_min(1e-12)).mean()

@@ -1,0 +1,74 @@
+"""All that training changes of an agent, taken out and put back: its weights and Adam's state."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from proposer_rl.learning.adam import CopiesAdam
+from proposer_rl.models import ActorCritic
+
+
+def take_snapshot(agent: ActorCritic, adam: CopiesAdam) -> TensorDict:
+    """A copy of weights and Adam's state, batch [K] with copies and [] without."""
+    batch = _batch(agent)
+    entries: dict[str, TensorDict] = {}
+    for i, (name, parameter) in enumerate(agent.named_parameters()):
+        state = adam.state(i)
+        entries[name] = TensorDict(
+            {
+                "value": parameter.detach().clone(),
+                "exp_avg": state["exp_avg"].clone(),
+                "exp_avg_sq": state["exp_avg_sq"].clone(),
+                "step": state["step"].expand(batch).clone(),
+            },
+            batch,
+        )
+    return TensorDict(entries, batch)
+
+
+def restore_snapshot(agent: ActorCritic, adam: CopiesAdam, snapshot: TensorDictBase) -> None:
+    """Put a snapshot of as many copies back (in place).
+
+    Raises:
+        ValueError: if its batch, a parameter's name or shape, or Adam's steps do not fit.
+    """
+    if snapshot.batch_size != _batch(agent):
+        raise ValueError(
+            f"the snapshot must have batch size {list(_batch(agent))}, "
+            f"got {list(snapshot.batch_size)}"
+        )
+    parameters = dict(agent.named_parameters())
+    if parameters.keys() != set(snapshot.keys()):
+        raise ValueError("the snapshot belongs to another network: its parameters differ")
+    for name, parameter in parameters.items():
+        if snapshot[name, "value"].shape != parameter.shape:
+            raise ValueError(f"the snapshot's {name} does not fit: another shape")
+    steps = torch.stack([snapshot[name, "step"].flatten() for name in parameters])
+    # The one question here that waits for the device.
+    if not bool((steps == steps[:, :1]).all()):
+        raise ValueError("the snapshot's copies have made different numbers of Adam steps")
+    for i, (name, parameter) in enumerate(parameters.items()):
+        entry, state = snapshot[name], adam.state(i)
+        parameter.data.copy_(entry["value"])
+        state["exp_avg"].copy_(entry["exp_avg"])
+        state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
+        state["step"].copy_(entry["step"].flatten()[0])
+
+
+def _batch(agent: ActorCritic) -> torch.Size:
+    return torch.Size([] if agent.copies is None else [agent.copies])
+
+
+def load_agent(agent: ActorCritic, snapshot: TensorDictBase) -> None:
+    """Put the weights of a snapshot into an agent (in place).
+
+    Raises:
+        ValueError: if they belong to another network.
+    """
+    parameters = dict(agent.named_parameters())
+    shapes = {name: parameter.shape for name, parameter in parameters.items()}
+    if shapes != {name: snapshot[name, "value"].shape for name in snapshot.keys()}:
+        raise ValueError("the snapshot belongs to another network: its parameters differ")
+    for name, parameter in parameters.items():
+        parameter.data.copy_(snapshot[name, "value"])
