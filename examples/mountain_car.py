@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -71,14 +70,15 @@ class MountainCar(EnvBase):
         """Nothing is random."""
 
 
-@dataclass
 class Cars:
     """Cars of some kinds; also the Proposer's space, whose bins are the kinds."""
 
-    kinds: Tensor
-    axes = {"gravity": GRAVITIES, "power": POWERS}
     size = len(KINDS)
     coordinates = (KINDS - KINDS.mean(0)) / KINDS.std(0)
+
+    def __init__(self, kinds: Tensor) -> None:
+        self.kinds = kinds
+        self.axes = {"gravity": GRAVITIES, "power": POWERS}
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         kinds = self.kinds[torch.randint(len(self.kinds), (1, count), generator=generator)]
@@ -94,14 +94,15 @@ class Cars:
 class MountainCarTask:
     """A `proposer_rl.task.Task`: levels are tensordicts, the Solver is an MLP, all on the CPU."""
 
-    device, precision = torch.device("cpu"), "fp32"
-    space = Cars(torch.arange(len(KINDS)))
-    target = Cars(TARGET)
-    distributions = {"target": target, "all": space}
-    measurements = [f"{name}_{what}" for name in distributions for what in ("success", "return")]
+    device, precision, exact_performance = torch.device("cpu"), "fp32", True
 
     def __init__(self, *, levels: int, solver: SolverSettings, place: Place) -> None:
         self.batch_size = solver.batch_size
+        self.space, self.target = Cars(torch.arange(len(KINDS))), Cars(TARGET)
+        self.distributions = {"target": self.target, "all": self.space}
+        self.measurements = [
+            f"{name}_{what}" for name in self.distributions for what in ("success", "return")
+        ]
         self._solver = solver
         self._levels = levels
         self._measured_on = {

@@ -79,6 +79,7 @@ class Task(Protocol):
         space: what a Proposer chooses among.
         distributions: by name, for curricula by hand.
         measurements: the names of what :meth:`measure` tells.
+        exact_performance: whether :meth:`performance` draws nothing at random.
     """
 
     device: torch.device
@@ -88,6 +89,7 @@ class Task(Protocol):
     space: Space
     distributions: Mapping[str, Distribution]
     measurements: Sequence[str]
+    exact_performance: bool
 
     @property
     def facts(self) -> dict[str, Any]:

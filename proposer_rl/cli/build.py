@@ -109,7 +109,7 @@ def make_task(config: RunConfig) -> Task:
         task = make_in_place(task_maker(config), config.solver, place)
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
-    return recorded(task) if compute.graphs and device.type == "cuda" else task
+    return recorded(task) if compute.graphs else task
 
 
 def make_in_place(maker: TaskMaker, solver: SolverSettings, place: Place) -> Any:
@@ -121,7 +121,7 @@ def _make_in_worker(
     maker: TaskMaker, solver: SolverSettings, place: Place, graphs: bool, device: str
 ) -> Any:
     task = make_in_place(maker, solver, place._replace(device=torch.device(device)))
-    return recorded(task) if graphs and task.device.type == "cuda" else task
+    return recorded(task) if graphs else task
 
 
 class EpisodeBar:

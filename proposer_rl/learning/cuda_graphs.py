@@ -82,9 +82,8 @@ def recorded(task: T, recorder: Recorder | None = None) -> T:
     """A copy of a task whose learners and measurements are replayed.
 
     Of the learners that it makes, acting and training are recorded; of the task, ``probe`` and
-    ``measure`` for every agent, and ``performance`` where the task has an attribute
-    ``exact_performance`` that is true. Anything else may draw random numbers, which a graph would
-    repeat, and is called as it is. All the rest is the task's own.
+    ``measure`` for every agent, and ``performance`` where it is exact. Otherwise it draws random
+    numbers, which a graph would repeat, and is called as it is. All the rest is the task's own.
 
     Args:
         task: as :mod:`proposer_rl.task` describes it. It stays as it is.
@@ -118,7 +117,7 @@ def recorded(task: T, recorder: Recorder | None = None) -> T:
     twin.learner = learner
     twin.probe = lambda agent, levels: see(TensorDict({"levels": levels}), agent)["probes"]
     twin.measure = lambda agent: sum_up(TensorDict({}), agent)
-    if getattr(original, "exact_performance", False):
+    if original.exact_performance:
         twin.performance = lambda agent, levels, _: rate(TensorDict({"levels": levels}), agent)
     return twin
 

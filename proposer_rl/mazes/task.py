@@ -121,6 +121,7 @@ class MazeTask:
             f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
             f"or a distribution: {', '.join(distributions)}"
         )
+        self.exact_performance = evaluation.evaluator == "exact"
         self._measured_on = {
             name: self.evaluation_levels(name) for name in evaluation.distributions
         }
