@@ -20,7 +20,7 @@ from proposer_rl.learning.ppo import PPOSettings
 from proposer_rl.mazes.task import EvaluationSettings, MazeSettings
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
-from tests.runs import assert_same_run, tables
+from tests.same_run import assert_same_run, tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 

@@ -25,7 +25,7 @@ from proposer_rl.learning.divergence import DivergedError
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import Interrupted, StopSignals
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 

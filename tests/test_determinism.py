@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.runs import assert_same_run, tables, trained
+from tests.same_run import assert_same_run, tables, trained
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 

@@ -12,7 +12,7 @@ import pytest
 from proposer_rl.cli.config import methods
 from proposer_rl.runs.checkpoint import load_latest
 from tests.processes import Ended, Processes
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
 # A checkpoint at every safe point: runs resume in the middle of the Proposer's episodes too.
 SMOKE = ["+scale=smoke", "progress=false", "schedule.checkpoint_seconds=1e-6"]

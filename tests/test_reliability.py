@@ -13,7 +13,7 @@ import pytest
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.lock import locked
 from tests.processes import Ended, Processes
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
 TRAIN = ["+method=target", "+scale=smoke", "progress=false"]
 ROW = "fsync metrics.csv"

@@ -10,7 +10,7 @@ import pytest
 
 from proposer_rl.runs.checkpoint import load_latest
 from tests.processes import Processes
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
 COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "progress=false"]
 MULTIPROCESS = ["collector=multiprocess", "workers=2"]
