@@ -21,7 +21,6 @@ from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.adam import CopiesAdam
 from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
@@ -33,7 +32,7 @@ from proposer_rl.learning.losses import (
     make_loss,
 )
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
-from proposer_rl.learning.snapshot import restore_snapshot, take_snapshot
+from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import settings
 
@@ -124,9 +123,7 @@ class PPO:
         )
         self._loss = make_loss(loss or clipped, agent)
         self._parameters = list(agent.parameters())
-        self._adam = CopiesAdam(
-            self._parameters, agent.copies, settings.learning_rate, settings.adam_eps
-        )
+        self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
