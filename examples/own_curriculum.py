@@ -22,8 +22,8 @@ from small_mazes import report, small_task, train
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl import PPO, Curriculum, SamplingCurriculum, Streams
+from proposer_rl.learning.rollout import first_episode_success
 from proposer_rl.mazes import Level
-from proposer_rl.meta.rewards import first_episode_success
 from proposer_rl.methods import Parts
 
 

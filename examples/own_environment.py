@@ -72,7 +72,7 @@ def sampler(kinds: torch.Tensor):
 
 def solvers(copies: int, streams: prl.Streams) -> prl.PPO:
     with streams.as_default("weights"):
-        network = prl.Population(lambda: MLP(2, 4, 2, 32), copies, way="batched")
+        network = prl.Population(lambda: MLP(2, 4, 2, 32), copies, batched=True)
     split = TensorDictModule(lambda x: x.split([3, 1], -1), ["x"], ["logits", "state_value"])
     head = TensorDictSequential(TensorDictModule(network, ["observation"], ["x"]), split)
     agent = prl.ActorCritic(head, distribution_class=categorical, copies=copies)

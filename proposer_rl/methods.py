@@ -22,7 +22,8 @@ from proposer_rl.curricula import (
     load_agent,
 )
 from proposer_rl.learning.advantages import CopiesBaseline
-from proposer_rl.learning.ppo import PPO, MakeLoss, PPOSettings
+from proposer_rl.learning.losses import MakeLoss
+from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes.task import MazeTask
 from proposer_rl.meta.actions import Mixture, ProblemChoices, Proposals
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -36,7 +37,6 @@ from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,
     categorical,
-    context_width,
     joint_categorical,
     normal,
     proposer_actor_critic,
@@ -309,11 +309,10 @@ def _view(task: MazeTask, chosen: ProposerSettings) -> SolverView:
 def _agent(task: MazeTask, chosen: ProposerSettings, action: _Action) -> ActorCritic:
     numbers = len(chosen.observes)
     network = ProposerNetwork(
-        action.head(context_width(chosen.context, numbers, chosen.number_bands)),
+        action.head(chosen.context + numbers),
         MapEncoder(task.probe_channels, chosen.channels, chosen.context),
         context=chosen.context,
         numbers=numbers,
-        number_bands=chosen.number_bands,
         hidden=chosen.hidden,
     ).to(task.device)
     return proposer_actor_critic(network, action.distribution, ["probes", *chosen.observes])

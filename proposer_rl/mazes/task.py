@@ -12,8 +12,8 @@ from annotated_types import Ge, Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from proposer_rl.learning.cuda_graphs import Captured, recorder
 from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning.rollout import first_episode_success
 from proposer_rl.mazes import (
     Level,
     LevelDistribution,
@@ -23,7 +23,6 @@ from proposer_rl.mazes import (
     shortest_path_length,
 )
 from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator, worst_mean
-from proposer_rl.meta.rewards import first_episode_success
 from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
@@ -187,7 +186,6 @@ class MazeTask:
         self.device = torch.device(device)
         self.precision = precision
         self.cores = cores
-        self.recorder = recorder(self.device, graphs)
         grid = (maze.height, maze.width)
         self.distributions = {
             name: LevelDistribution(d.specifications, d.mechanism, *grid)
@@ -206,9 +204,9 @@ class MazeTask:
             if evaluation.reward == "exact"
             else RolloutEvaluator(*rules, episodes=evaluation.episodes)
         )
-        self._rate = Captured(self._rated, self.recorder)
-        self._measure = Captured(self._measured, self.recorder)
-        self._see = Captured(self._seen, self.recorder)
+        self._rate = self._rated
+        self._measure = self._measured
+        self._see = self._seen
         self._evaluation = evaluation
         self._measured_on = {
             name: self.evaluation_levels(name) for name in evaluation.distributions
@@ -236,9 +234,7 @@ class MazeTask:
             with next(weights).as_default("weights"):
                 return self._network()
 
-        network = Population(
-            make, copies, self.precision, self.cores, recorder=self.recorder, share=share
-        ).to(self.device)
+        network = Population(make, copies, self.precision, self.cores).to(self.device)
         agent = map_actor_critic(network, per_step=self.maze.observe_agent)
         # Placeholders of the right shape; every update sets its own levels.
         level = self._measured_on[next(iter(self._measured_on))][:1]
@@ -248,7 +244,7 @@ class MazeTask:
             step_penalty=self.maze.step_penalty,
             observe_agent=self.maze.observe_agent,
         )
-        return PPO(env, agent, self.solver.ppo, self.recorder)
+        return PPO(env, agent, self.solver.ppo)
 
     def _unet(self) -> UNet:
         return UNet(

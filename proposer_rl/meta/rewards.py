@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.learning.rollout import first_episode_success
 from proposer_rl.models import ActorCritic
 
 
@@ -50,26 +51,3 @@ def task_difficulty(step: TrainingStep) -> Tensor:
     The rate is that of the Solver's own training episodes, the first on every level.
     """
     return 1.0 - first_episode_success(step.rollout).float().mean(1)
-
-
-def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Whether the first episode of every environment terminated, rather than was truncated or cut.
-
-    Args:
-        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "terminated")`` [*B, T, 1].
-
-    Returns:
-        bool [*B].
-
-    Example:
-        >>> import torch
-        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
-        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
-        >>> from tensordict import TensorDict
-        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
-        >>> first_episode_success(rollout)  # the second one does not count
-        tensor([False])
-    """
-    done = rollout["next", "done"].squeeze(-1).long()
-    first = done.cumsum(-1) - done == 0  # up to and including the first end
-    return (rollout["next", "terminated"].squeeze(-1) & first).any(-1)

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.learning.cuda_graphs import use
 from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import RolloutPolicy
+from proposer_rl.learning.rollout import RolloutPolicy
 from proposer_rl.meta.copies import action_generators
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.models import ActorCritic, uniform_noise
