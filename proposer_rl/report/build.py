@@ -73,7 +73,7 @@ def write_report(
             _content(study, f"{_slug(study.title)}_" if len(studies) > 1 else "", bar)
             for study in studies
         ]
-    title = "Curricula for a maze Solver: what the runs show"
+    title = "Curricula: what the runs show"
     command = page.report_command(folders, threshold)
     html = page.render(title, command, [content.section for content in contents], notes)
     files = {name: data for content in contents for name, data in content.files.items()}
@@ -135,7 +135,7 @@ def _content(study: Study, prefix: str, bar: tqdm) -> _Content:
 
 
 def _animations(study: Study) -> dict[str, bytes]:
-    found = {group.label: proposals.animate(group) for group in proposals.proposers(study)}
+    found = {group.label: proposals.animate(group) for group in study.groups}
     return {label: content for label, content in found.items() if content is not None}
 
 

@@ -12,6 +12,7 @@ from itertools import combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from proposer_rl.report.outcomes import (
     Comparison,
@@ -20,7 +21,8 @@ from proposer_rl.report.outcomes import (
     updates_needed,
     waiting_outcome,
 )
-from proposer_rl.report.proposals import histogram_means
+from proposer_rl.report.proposals import axis_means
+from proposer_rl.report.records import is_rate, level_text, numbers
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import Interval, mean_interval
 from proposer_rl.report.studies import Group, Study
@@ -56,8 +58,8 @@ def findings(study: Study) -> list[Finding]:
         ("The baseline that trains on the target alone stalls at first.", _stall),
         ("Both Proposers learn almost at once.", _learn_at_once),
         (
-            f"Performance gain needs clearly fewer updates to {study.threshold:.0%} than the "
-            "baseline.",
+            "Performance gain needs clearly fewer updates to "
+            f"{level_text(study.headline, study.threshold)} than the baseline.",
             lambda s: _fewer(s, GAIN, BASELINE),
         ),
         ("Out of distribution the methods end up alike.", _alike),
@@ -73,17 +75,17 @@ def finding_table(rows: Sequence[Finding]) -> Table:
     """Findings as a table."""
     columns = dict.fromkeys(("finding", "source", "verdict", "evidence"), str)
     note = (
-        "Differences are first minus second, with 95 % intervals; fewer updates and more success "
-        "are better. Undecided: the interval includes no difference. Whether one method beats "
-        "another is decided by the updates to the threshold; where these decide nothing, by mean "
-        "success, then by success at the end."
+        "Differences are first minus second, with 95 % intervals; fewer updates and higher "
+        "measurements are better. Undecided: the interval includes no difference. Whether one "
+        "method beats another is decided by the updates to the threshold; where these decide "
+        "nothing, by the mean of the measurement, then by the measurement at the end."
     )
     return Table("findings", "Findings", note, columns, [list(row) for row in rows])
 
 
 def _stall(study: Study) -> tuple[Verdict, str]:
     group = study.group(BASELINE)
-    if group is None or group not in study.compared:
+    if group is None or group not in study.compared or not is_rate(study.headline):
         return _missing(BASELINE)
     waiting = group.waiting(study.headline, STARTED)
     interval = updates_needed(study, group, STARTED)
@@ -100,7 +102,7 @@ def _stall(study: Study) -> tuple[Verdict, str]:
 
 def _learn_at_once(study: Study) -> tuple[Verdict, str]:
     groups = _present(study, GAIN, DIFFICULTY)
-    if len(groups) < 2:
+    if len(groups) < 2 or not is_rate(study.headline):
         return _missing(GAIN, DIFFICULTY)
     intervals = [updates_needed(study, group, STARTED) for group in groups]
     parts = [
@@ -128,10 +130,14 @@ def _fewer(study: Study, one: str, other: str) -> tuple[Verdict, str]:
 
 def _alike(study: Study) -> tuple[Verdict, str]:
     groups = _present(study, BASELINE, GAIN, DIFFICULTY)
-    others = [name for name in study.measured if f"{name}_success" != study.headline]
-    if len(groups) < 2 or not others:
+    elsewhere = [
+        outcome
+        for name, outcome in zip(study.measurements, outcomes(study)[2:], strict=True)
+        if is_rate(name) and name != study.headline
+    ]
+    if len(groups) < 2 or not elsewhere:
         return _missing(BASELINE, GAIN, DIFFICULTY)
-    outcome = next(o for o in outcomes(study)[2:] if o.name.startswith(f"{others[0].upper()} "))
+    outcome = elsewhere[0]
     rows = [compare(outcome, a, b) for a, b in combinations(groups, 2)]
     verdict: Verdict = "contradicted" if any(row.better for row in rows) else "undecided"
     # Alike is more than not proven different: the intervals must be narrow as well.
@@ -157,21 +163,20 @@ def _slightly(study: Study) -> tuple[Verdict, str]:
 
 
 def _grow_harder(study: Study) -> tuple[Verdict, str]:
-    groups = [group for group in study.groups if group.proposes]
-    if not groups:
-        return _missing(GAIN)
     parts: list[str] = []
     verdict: Verdict = "undecided"
-    for group in groups:
-        known = np.array([change for run in group.runs if (change := _change(run))])
-        if not len(known):
+    for group in study.groups:
+        like = group.runs[0]
+        known = [change for run in group.logs if (change := _change(run, like)) is not None]
+        if not group.proposes or not known:
             continue
-        changes = [mean_interval(known[:, i + 1] - known[:, i]) for i in (0, 2)]
-        parts.append(
-            f"{group.label}: mean path {known[:, 0].mean():.2f} to {known[:, 1].mean():.2f} moves "
-            f"(change {number(2)(changes[0])}), obstacles {known[:, 2].mean():.3f} to "
-            f"{known[:, 3].mean():.3f} (change {number(3)(changes[1])})"
-        )
+        early, late = np.mean(known, 0)
+        changes = [mean_interval(values) for values in np.diff(known, axis=1)[:, 0].T]
+        along = [
+            f"{name} {a:.3g} to {b:.3g} (change {adaptive(change)})"
+            for name, a, b, change in zip(like.task.axes, early, late, changes, strict=True)
+        ]
+        parts.append(f"{group.label}: mean {', '.join(along)}")
         harder, easier = any(map(_rises, changes)), any(map(_falls, changes))
         if group.label == GAIN and harder != easier:
             verdict = "supported" if harder else "contradicted"
@@ -188,32 +193,30 @@ def _falls(interval: Interval) -> bool:
     return interval.high < 0
 
 
-def _change(run: Run) -> tuple[float, float, float, float] | None:
-    """Mean path length and obstacle fraction in the first and the last quarter of a run."""
-    means = [found for cycle in run.cycles if (found := histogram_means(run, cycle))]
+def _change(run: Run, like: Run) -> NDArray[np.float64] | None:
+    """Mean values along each axis in the first and the last quarter of a run, [2, axes]."""
+    means = [found for cycle in run.cycles if (found := axis_means(like, cycle))]
     if len(means) < 2:
         return None
     quarter = max(len(means) // 4, 1)
-    early, late = np.mean(means[:quarter], 0), np.mean(means[-quarter:], 0)
-    return float(early[0]), float(late[0]), float(early[1]), float(late[1])
+    return np.array([np.mean(means[:quarter], 0), np.mean(means[-quarter:], 0)])
 
 
 def _gains(study: Study) -> tuple[Verdict, str]:
     group = study.group(GAIN)
-    if group is None or not group.proposes:
+    runs = group.logs if group else []
+    recorded = [[numbers(cycle.get("return_gain")) for cycle in run.cycles] for run in runs]
+    found = [[copies for copies in run if copies is not None] for run in recorded]
+    gains = [run for run in found if run]
+    if not gains:
         return _missing(GAIN)
-    gains = [[cycle["total_gain"] for cycle in run.cycles] for run in group.runs]
-    positive = [max(copies) > 0 for run in gains for copies in run]
-    late = [
-        float(np.mean([np.mean(copies) for copies in run[-max(len(run) // 4, 1) :]]))
-        for run in gains
-        if run
-    ]
+    positive = [copies.max() > 0 for run in gains for copies in run]
+    late = [np.mean([copies.mean() for copies in run[-max(len(run) // 4, 1) :]]) for run in gains]
     interval = mean_interval(late)
     share = float(np.mean(positive))
     text = (
-        f"the maximum is positive in {sum(positive)} of {len(positive)} cycles; the mean gain of "
-        f"the last quarter is {number(3)(interval)}"
+        f"the maximum gain in return is positive in {sum(positive)} of {len(positive)} cycles; the "
+        f"mean of the last quarter is {number(3)(interval)}"
     )
     if _rises(interval) or share < 0.5:
         return "contradicted", text

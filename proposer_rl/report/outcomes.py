@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from proposer_rl.report import records
+from proposer_rl.report.records import LONGEST_TEXT, level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.statistics import (
     Interval,
@@ -27,6 +29,7 @@ from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Columns, Table, adaptive, number
 
 MILLION = 1e6
+MOST_COLUMNS = 200
 
 
 class Comparison(NamedTuple):
@@ -77,7 +80,6 @@ def outcomes(study: Study) -> list[Outcome]:
 
         return Outcome(name, values, lambda a, b: mean_difference(values(a), values(b)), 1)
 
-    finals = [f"{name}_success" for name in study.measured]
     return [
         waiting_outcome(study, study.threshold),
         plain(
@@ -86,7 +88,7 @@ def outcomes(study: Study) -> list[Outcome]:
         ),
         *(
             plain(f"{words(name)} after {horizon} updates", partial(_at, name, horizon))
-            for name in finals
+            for name in study.measurements
         ),
     ]
 
@@ -96,7 +98,7 @@ def waiting_outcome(study: Study, threshold: float) -> Outcome:
     headline, limit = study.headline, study.restricted_to(threshold)
 
     return Outcome(
-        f"updates to {threshold:.0%} {words(headline)} (at most {limit:.0f})",
+        f"updates to {level_text(headline, threshold)} {words(headline)} (at most {limit:.0f})",
         lambda group: pseudo_values(group.waiting(headline, threshold), limit),
         lambda a, b: restricted_difference(
             a.waiting(headline, threshold), b.waiting(headline, threshold), limit
@@ -138,12 +140,12 @@ def comparisons(study: Study) -> Iterator[Comparison]:
 
 
 def comparison_table(rows: Sequence[Comparison]) -> Table:
-    """Pairs of groups; written with enough decimals for success rates."""
+    """Pairs of groups by every outcome."""
     return Table(
         "comparisons",
         "Pairwise comparisons",
         "Difference: first minus second, with a 95 % interval: percentile bootstrap over the runs "
-        "for updates, Welch's for success. P(first better): over all pairs of runs, ties count "
+        "for updates, Welch's for the others. P(first better): over all pairs of runs, ties count "
         "half. Seeds needed: per method, for a power of 80 % at 5 % if the true difference is the "
         "one seen. No correction for the number of comparisons.",
         {
@@ -172,57 +174,68 @@ def comparison_table(rows: Sequence[Comparison]) -> Table:
 
 def group_table(study: Study) -> Table:
     """One row per group."""
-    waiting, headline = waiting_outcome(study, study.threshold).name, study.headline
-    horizon = study.horizon
-    finals = [f"{name}_success" for name in study.measured]
+    headline, horizon, threshold = study.headline, study.horizon, study.threshold
     worst = f"{headline}_worst10"
+    with_worst = any(worst in run.metrics for run in study.runs)
     columns: Columns = {
         "method": str,
         "seeds": number(0),
-        f"reached {study.threshold:.0%}": str,
-        waiting: number(0),
-        **{f"{words(name)} after {horizon} updates": number(3) for name in finals},
+        f"reached {level_text(headline, threshold)}": str,
+        waiting_outcome(study, threshold).name: number(0),
+        **{f"{words(name)} after {horizon} updates": number(3) for name in study.measurements},
         f"IQM of {words(headline)}": number(3),
-        f"{words(headline)}, worst 10 % of levels": number(3),
+        **({f"{words(headline)}, worst 10 % of levels": number(3)} if with_worst else {}),
         "frames (M)": number(2),
-        "with the copies' (M)": number(2),
+        "with the curriculum's (M)": number(2),
+        "evaluations": number(0),
         "seconds per run": number(0),
     }
     rows: list[list[Cell]] = []
     for group in study.groups:
         runs = group.runs
         final = _known(runs, headline, horizon)
-        reached = sum(run.reached for run in group.waiting(headline, study.threshold))
+        reached = sum(run.reached for run in group.waiting(headline, threshold))
+        costs = [
+            (own / MILLION, whole / MILLION, evaluations, seconds)
+            for run in runs
+            for own, whole, evaluations, seconds in [
+                (
+                    run.metrics["frames"][-1],
+                    run.total_frames[-1],
+                    run.metrics["evaluations"][-1],
+                    run.own_seconds[-1],
+                )
+            ]
+        ]
         rows.append(
             [
                 group.label,
                 len(runs),
                 f"{reached} of {len(runs)}",
-                updates_needed(study, group, study.threshold) if group in study.compared else None,
-                *(_mean(_known(runs, name, horizon)) for name in finals),
+                updates_needed(study, group, threshold) if group in study.compared else None,
+                *(_mean(_known(runs, name, horizon)) for name in study.measurements),
                 interquartile_mean(final) if final else None,
-                _mean(_known(runs, worst, horizon)),
-                float(np.mean([run.metrics["frames"][-1] for run in runs])) / MILLION,
-                float(np.mean([run.total_frames[-1] for run in runs])) / MILLION,
-                float(np.mean([run.own_seconds[-1] for run in runs])),
+                *([_mean(_known(runs, worst, horizon))] if with_worst else []),
+                *map(float, np.mean(costs, 0)),
             ]
         )
     note = (
-        f"Updates: mean of min(updates, {study.restricted_to(study.threshold):.0f}) by "
-        "Kaplan-Meier, so that "
-        "censored runs count; measured every few updates, so never exact. Brackets: 95 % interval."
+        f"Updates: mean of min(updates, {study.restricted_to(threshold):.0f}) by Kaplan-Meier, so "
+        "that censored runs count; measured every few updates, so never exact. Frames: the "
+        "Solver's own, and with all that the curriculum spent. Evaluations: of levels, asked for "
+        "by the curriculum. Brackets: 95 % interval."
     )
     return Table("methods", "Methods", note, columns, rows)
 
 
 def run_table(study: Study) -> Table:
     """One row per run."""
-    headline = study.headline
-    measured = [f"{name}_success" for name in study.measured]
+    measured = study.measurements
     rows: list[list[Cell]] = []
     for group in study.groups:
-        for run in group.runs:
-            waiting = run.waiting(headline, study.threshold)
+        for run, waiting in zip(
+            group.runs, group.waiting(study.headline, study.threshold), strict=True
+        ):
             rows.append(
                 [
                     group.label,
@@ -232,8 +245,7 @@ def run_table(study: Study) -> Table:
                     run.updates,
                     waiting.updates if waiting.reached else None,
                     "reached" if waiting.reached else f"censored at {waiting.updates:.0f}",
-                    *(float(run.metrics[name][-1]) for name in measured),
-                    *(float(run.metrics[name][-1]) for name in COST[1:3]),
+                    *(float(run.metrics[name][-1]) for name in (*measured, *COST[1:4])),
                     float(run.own_seconds[-1]),
                 ]
             )
@@ -243,14 +255,15 @@ def run_table(study: Study) -> Table:
         "folder": str,
         "state": str,
         "updates": number(0),
-        f"updates to {study.threshold:.0%}": number(0),
+        f"updates to {level_text(study.headline, study.threshold)}": number(0),
         "threshold": str,
         **{f"last {words(name)}": number(3) for name in measured},
         "frames": number(0),
-        "frames of copies": number(0),
+        "the curriculum's frames": number(0),
+        "evaluations": number(0),
         "seconds": number(0),
     }
-    return Table("runs", "Runs", "Success is that at the run's last evaluation.", columns, rows)
+    return Table("runs", "Runs", "Measurements are the run's last.", columns, rows)
 
 
 def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
@@ -269,38 +282,32 @@ def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
 
 
 def tidy_cycles(study: Study) -> tuple[list[str], list[list[Cell]]]:
-    """Every cycle of every Proposer: its scalars, its gains, its proposals."""
-    records = [
+    """Every cycle of every curriculum: whatever it recorded, lists as numbers with spaces."""
+    found = [
         (group.label, run.seed, cycle)
         for group in study.groups
-        for run in group.runs
+        for run in group.logs
         for cycle in run.cycles
     ]
-    scalars = list(
-        dict.fromkeys(
-            name
-            for *_, cycle in records
-            for name, value in cycle.items()
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        )
-    )
+    names = list(dict.fromkeys(name for *_, cycle in found for name in cycle))[:MOST_COLUMNS]
     rows: list[list[Cell]] = [
-        [
-            label,
-            seed,
-            *(cycle.get(name) for name in scalars),
-            " ".join(f"{gain:.6g}" for gain in cycle["total_gain"]),
-            " ".join(str(count) for line in cycle.get("histogram", []) for count in line),
-        ]
-        for label, seed, cycle in records
+        [label, seed, *(_cell(cycle.get(name)) for name in names)] for label, seed, cycle in found
     ]
-    return ["method", "seed", *scalars, "total_gain", "histogram"], rows
+    return ["method", "seed", *names], rows
 
 
-def words(name: str) -> str:
-    """A column of the metrics in words: ``id_success`` is ID success."""
-    first, _, rest = name.partition("_")
-    return f"{first.upper()} {rest.replace('_', ' ')}".strip()
+def _cell(value: Any) -> Cell:
+    if isinstance(value, str):
+        return value[:LONGEST_TEXT]
+    return " ".join(_flat(value)) if isinstance(value, list) else records.number(value)
+
+
+def _flat(value: Any) -> Iterator[str]:
+    if isinstance(value, list):
+        for item in value:
+            yield from _flat(item)
+    else:
+        yield f"{records.number(value):.6g}"
 
 
 def _at(name: str, updates: float, run: Run) -> float:

@@ -9,10 +9,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from proposer_rl.report.runs import LONGEST_NAME, Run, UnreadableRun, read_run
+from proposer_rl.report.records import LONGEST_TEXT
+from proposer_rl.report.runs import DEEPEST, Run, UnreadableRun, read_run
 
 FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
-DEEPEST = 4
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _failure(folder: Path) -> str:
     if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**20:
         return ""
     try:
-        return " ".join(str(json.loads(path.read_text())["message"]).split())[: 4 * LONGEST_NAME]
+        return " ".join(str(json.loads(path.read_text())["message"]).split())[:LONGEST_TEXT]
     except (OSError, ValueError, KeyError, TypeError):
         return f"{FAILURE} cannot be read"
 

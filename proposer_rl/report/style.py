@@ -40,6 +40,7 @@ SETTINGS: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.8,
+    "text.parse_math": False,  # a dollar sign in a name is no formula
     "svg.hashsalt": "proposer_rl",
     "savefig.dpi": 130,
     "figure.facecolor": "white",

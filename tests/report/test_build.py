@@ -15,7 +15,7 @@ from proposer_rl.cli.report import main
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.curves import cost_curves
-from tests.report.folders import cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
 
@@ -53,7 +53,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600)
         write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0)
     write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up")
-    write_run(runs / "large", "target", maze={"height": 5, "width": 5})
+    write_run(runs / "large", "target", task={**TASK, "title": "5×5 mazes", "measured": 5})
     return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
 
 
@@ -154,9 +154,9 @@ def test_wrong_folders_get_one_line(tmp_path: Path, capsys) -> None:
 
 def test_a_wrong_threshold_is_refused(runs: Path, capsys) -> None:
     with pytest.raises(SystemExit) as end:
-        main([str(runs), "--threshold", "80"])
+        main([str(runs), "--threshold", "nan"])
     assert end.value.code == 2
-    assert "must be above 0 and at most 1, got '80'" in capsys.readouterr().err
+    assert "must be a number, got 'nan'" in capsys.readouterr().err
 
 
 def refused(capsys, *arguments: str) -> str:

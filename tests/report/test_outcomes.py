@@ -97,7 +97,8 @@ def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     assert rows["target"]["IQM of ID success"] == pytest.approx(np.mean(curve_last(SLOW)))
     worst = rows["target"]["ID success, worst 10 % of levels"]
     assert worst.estimate == pytest.approx(np.mean(curve_last(SLOW)) / 2)
-    assert rows["perf_gain"]["with the copies' (M)"] == pytest.approx(50 * 700 / 1e6)
+    assert rows["perf_gain"]["evaluations"] == 150
+    assert rows["perf_gain"]["with the curriculum's (M)"] == pytest.approx(50 * 700 / 1e6)
 
 
 def test_the_tidy_metrics_are_those_of_the_runs(tmp_path: Path) -> None:
@@ -109,7 +110,7 @@ def test_the_tidy_metrics_are_those_of_the_runs(tmp_path: Path) -> None:
     assert [float(row["id_success"]) for row in own] == pytest.approx(curve_of(SLOW, 1))
     header, rows = tidy_cycles(study)
     read = list(csv.DictReader(io.StringIO(to_csv(header, rows))))
-    assert len(read) == 3 * 8 and read[0]["total_gain"] == "0.3 0.1"
+    assert len(read) == 3 * 8 and read[0]["return_gain"] == "0.3 0.1"
     assert read[0]["histogram"] == "8 1 1 1 1 1"
 
 

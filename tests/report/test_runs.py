@@ -86,26 +86,51 @@ def set_key(*keys: str, value: object):
     return change
 
 
+def in_levels(key: str, value: object):
+    def change(text: str) -> str:
+        row = json.loads(text.splitlines()[0])
+        row["levels"][0][key] = value
+        return json.dumps(row) + "\n"
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
         ("config.json", lambda text: "[]", "not a JSON object"),
         ("config.json", lambda text: "[" * 100_000, "recursion"),
-        ("config.json", lambda text: text[:-5], "delimiter"),
-        ("config.json", set_key("maze", "height", value=10**9), "cannot be drawn"),
-        ("config.json", set_key("maze", value={}), "'height' is missing"),
-        ("config.json", set_key("method", value="x" * 1000), "method is no name"),
-        ("config.json", set_key("method", value="a\nb"), "method is no name"),
+        ("config.json", lambda text: text[:-5], "Unterminated"),
+        ("config.json", set_key("schedule", value={}), "'headline' is missing"),
+        ("config.json", set_key("method", value="x" * 1000), "method is no text of one line"),
+        ("config.json", set_key("method", value="a\nb"), "method is no text of one line"),
         ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),
         ("metrics.csv", lambda text: text.replace("0.5", "nan"), "id_success is not always a"),
         ("metrics.csv", lambda text: text.replace("0.5", "half"), "is not a number"),
         ("metrics.csv", lambda text: text.replace("id_success", "x"), "no column 'id_success'"),
         ("metrics.csv", lambda text: text.splitlines()[0] + "\n", "no rows yet"),
         ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
-        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[1, 4]"), "leaves its level"),
-        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[-1, 3]"), "leaves its level"),
-        ("proposer.jsonl", lambda text: text.replace("0.1", '"x"'), "could not convert"),
-        ("proposer.jsonl", lambda text: text.replace("[[1], [1]]", "[1]"), "histogram is no table"),
+        ("metrics.csv", lambda text: text.replace("0.5", "1e300"), "id_success is not always a"),
+        ("training.csv", lambda text: text.replace("updates", "x"), "no column 'updates'"),
+        ("training.csv", lambda text: text.replace("fuel", "\x1b[2J"), "name is no text of one"),
+        ("curriculum.jsonl", in_levels("picture", 1), "picture is no PNG of at most"),
+        ("curriculum.jsonl", in_levels("picture", "A" * 2**21), "picture is no PNG of at most"),
+        ("curriculum.jsonl", in_levels("text", "S G"), "text is no list of 64 lines"),
+        ("curriculum.jsonl", in_levels("text", ["x"] * 65), "text is no list of 64 lines"),
+        ("curriculum.jsonl", in_levels("text", ["x" * 201]), "line of a level is no text"),
+        ("curriculum.jsonl", in_levels("text", ["\x1b[2J"]), "line of a level is no text"),
+        ("cycles.jsonl", lambda text: text.replace('"updates": 0', '"updates": "x"'), "no number"),
+        ("cycles.jsonl", lambda text: text.replace('"updates"', '"x"'), "'updates' is missing"),
+        ("run.json", lambda text: "{}", "'task' is missing"),
+        ("run.json", set_key("task", value=[]), "task is no object"),
+        ("run.json", set_key("task", "title", value="\x07"), "task.title is no text"),
+        ("run.json", set_key("task", "distributions", value=[]), "is no list of names"),
+        ("run.json", set_key("task", "distributions", value=[[]]), "distributions is no text"),
+        ("run.json", set_key("task", "space", value={"a": ["x"]}), "is no list of 256 values"),
+        ("run.json", set_key("task", "space", value={"a": [0] * 257}), "is no list of 256 values"),
+        ("run.json", set_key("task", "space", value=dict.fromkeys("abcdefghi", [0])), "8 axes"),
+        ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a is no text"),
+        ("run.json", set_key("task", "samples", value={"id": [1]}), "no list of objects"),
     ],
 )
 def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(

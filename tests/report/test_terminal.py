@@ -32,9 +32,11 @@ def test_one_run_is_a_screen(tmp_path: Path, capsys) -> None:
     text = watch(capsys, str(folder))
     assert listing(tmp_path) == before
     assert "perf_gain, seed 7" in text and "finished" in text and "20/20 updates" in text
-    assert "2,000 frames + 12,000 of the copies" in text
-    assert "90.0%" in text and "+0.250" in text and "-0.125" in text
+    assert "2,000 frames + 12,000 of the curriculum" in text
+    assert "90.0%" in text and "+0.500" in text and "-0.250" in text
     assert "███" in text  # all proposals are of one kind
+    assert "rows: obstacle fraction, columns: path length" in text
+    assert "mazes at update 20 (S start, G goal)" in text
     assert "S • • G" in text  # the path of the level that was recorded
 
 
