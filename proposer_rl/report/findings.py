@@ -26,7 +26,7 @@ from proposer_rl.report.records import is_rate, level_text, numbers
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import Interval, mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.tables import Table, adaptive, number
+from proposer_rl.report.tables import Cell, Table, write
 
 Verdict = Literal["supported", "contradicted", "undecided", "no data"]
 
@@ -73,14 +73,16 @@ def findings(study: Study) -> list[Finding]:
 
 def finding_table(rows: Sequence[Finding]) -> Table:
     """Findings as a table."""
-    columns = dict.fromkeys(("finding", "source", "verdict", "evidence"), str)
     note = (
         "Differences are first minus second, with 95 % intervals; fewer updates and higher "
         "measurements are better. Undecided: the interval includes no difference. Whether one "
         "method beats another is decided by the updates to the threshold; where these decide "
         "nothing, by the mean of the measurement, then by the measurement at the end."
     )
-    return Table("findings", "Findings", note, columns, [list(row) for row in rows])
+    named: list[dict[str, Cell]] = [
+        {"finding": row.claim, **dict(list(row._asdict().items())[1:])} for row in rows
+    ]
+    return Table("findings", "Findings", note, named)
 
 
 def _stall(study: Study) -> tuple[Verdict, str]:
@@ -91,7 +93,7 @@ def _stall(study: Study) -> tuple[Verdict, str]:
     interval = updates_needed(study, group, STARTED)
     others = _present(study, GAIN, DIFFICULTY)
     text = (
-        f"{BASELINE} needs {number(0)(interval)} updates to {STARTED:.0%} "
+        f"{BASELINE} needs {write(interval, 0)} updates to {STARTED:.0%} "
         f"({_range(run.updates for run in waiting)}; paper: about 150 of 750)"
     )
     if not others:
@@ -106,7 +108,7 @@ def _learn_at_once(study: Study) -> tuple[Verdict, str]:
         return _missing(GAIN, DIFFICULTY)
     intervals = [updates_needed(study, group, STARTED) for group in groups]
     parts = [
-        f"{group.label} {number(0)(interval)} ({interval.estimate / study.horizon:.0%} of the run)"
+        f"{group.label} {write(interval, 0)} ({interval.estimate / study.horizon:.0%} of the run)"
         for group, interval in zip(groups, intervals, strict=True)
     ]
     verdict: Verdict = "undecided"
@@ -173,7 +175,7 @@ def _grow_harder(study: Study) -> tuple[Verdict, str]:
         early, late = np.mean(known, 0)
         changes = [mean_interval(values) for values in np.diff(known, axis=1)[:, 0].T]
         along = [
-            f"{name} {a:.3g} to {b:.3g} (change {adaptive(change)})"
+            f"{name} {a:.3g} to {b:.3g} (change {write(change)})"
             for name, a, b, change in zip(like.task.axes, early, late, changes, strict=True)
         ]
         parts.append(f"{group.label}: mean {', '.join(along)}")
@@ -216,7 +218,7 @@ def _gains(study: Study) -> tuple[Verdict, str]:
     share = float(np.mean(positive))
     text = (
         f"the maximum gain in return is positive in {sum(positive)} of {len(positive)} cycles; the "
-        f"mean of the last quarter is {number(3)(interval)}"
+        f"mean of the last quarter is {write(interval, 3)}"
     )
     if _rises(interval) or share < 0.5:
         return "contradicted", text
@@ -267,7 +269,7 @@ def _differences(rows: Sequence[Comparison]) -> str:
 
 
 def _difference(row: Comparison) -> str:
-    text = adaptive(row.difference)
+    text = write(row.difference)
     if row.difference.low == row.difference.high == 0:
         return f"{text} (no run of either reached it, or all alike)"
     if row.seeds:
@@ -282,7 +284,7 @@ def _updates_text(study: Study, groups: Sequence[Group]) -> str:
         reached = sum(run.reached for run in waiting)
         interval = updates_needed(study, group, study.threshold)
         parts.append(
-            f"{group.label} {number(0)(interval)} updates, reached by {reached} of {len(waiting)}"
+            f"{group.label} {write(interval, 0)} updates, reached by {reached} of {len(waiting)}"
         )
     return "; ".join(parts)
 

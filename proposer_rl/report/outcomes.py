@@ -12,7 +12,7 @@ import numpy as np
 
 from proposer_rl.report import records
 from proposer_rl.report.records import LONGEST_TEXT, level_text, words
-from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     Interval,
     Values,
@@ -26,7 +26,7 @@ from proposer_rl.report.statistics import (
     seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.tables import Cell, Columns, Table, adaptive, number
+from proposer_rl.report.tables import Cell, Table
 
 MILLION = 1e6
 MOST_COLUMNS = 200
@@ -139,131 +139,94 @@ def comparisons(study: Study) -> Iterator[Comparison]:
             yield compare(outcome, one, other)
 
 
-def comparison_table(rows: Sequence[Comparison]) -> Table:
-    """Pairs of groups by every outcome."""
-    return Table(
-        "comparisons",
-        "Pairwise comparisons",
+def comparison_table(study: Study) -> Table:
+    """Every pair of groups by every outcome."""
+    rows: list[dict[str, Cell]] = [
+        {
+            "outcome": row.outcome,
+            "first": row.one,
+            "second": row.other,
+            "difference": row.difference,
+            "better": row.better or "undecided",
+            "P(first better)": row.improvement,
+            "seeds needed": row.seeds,
+        }
+        for row in comparisons(study)
+    ]
+    note = (
         "Difference: first minus second, with a 95 % interval: percentile bootstrap over the runs "
         "for updates, Welch's for the others. P(first better): over all pairs of runs, ties count "
         "half. Seeds needed: per method, for a power of 80 % at 5 % if the true difference is the "
-        "one seen. No correction for the number of comparisons.",
-        {
-            "outcome": str,
-            "first": str,
-            "second": str,
-            "difference": adaptive,
-            "better": str,
-            "P(first better)": number(2),
-            "seeds needed": number(0),
-        },
-        [
-            [
-                row.outcome,
-                row.one,
-                row.other,
-                row.difference,
-                row.better or "undecided",
-                row.improvement,
-                row.seeds,
-            ]
-            for row in rows
-        ],
+        "one seen. No correction for the number of comparisons."
     )
+    return Table("comparisons", "Pairwise comparisons", note, rows)
 
 
 def group_table(study: Study) -> Table:
     """One row per group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
-    worst = f"{headline}_worst10"
-    with_worst = any(worst in run.metrics for run in study.runs)
-    columns: Columns = {
-        "method": str,
-        "seeds": number(0),
-        f"reached {level_text(headline, threshold)}": str,
-        waiting_outcome(study, threshold).name: number(0),
-        **{f"{words(name)} after {horizon} updates": number(3) for name in study.measurements},
-        f"IQM of {words(headline)}": number(3),
-        **({f"{words(headline)}, worst 10 % of levels": number(3)} if with_worst else {}),
-        "frames (M)": number(2),
-        "with the curriculum's (M)": number(2),
-        "evaluations": number(0),
-        "seconds per run": number(0),
-    }
-    rows: list[list[Cell]] = []
+    waiting, worst = waiting_outcome(study, threshold).name, f"{headline}_worst10"
+    rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        runs = group.runs
-        final = _known(runs, headline, horizon)
+        runs, final = group.runs, _known(group.runs, headline, horizon)
         reached = sum(run.reached for run in group.waiting(headline, threshold))
-        costs = [
-            (own / MILLION, whole / MILLION, evaluations, seconds)
-            for run in runs
-            for own, whole, evaluations, seconds in [
-                (
-                    run.metrics["frames"][-1],
-                    run.total_frames[-1],
-                    run.metrics["evaluations"][-1],
-                    run.own_seconds[-1],
-                )
-            ]
-        ]
-        rows.append(
-            [
-                group.label,
-                len(runs),
-                f"{reached} of {len(runs)}",
-                updates_needed(study, group, threshold) if group in study.compared else None,
-                *(_mean(_known(runs, name, horizon)) for name in study.measurements),
-                interquartile_mean(final) if final else None,
-                *([_mean(_known(runs, worst, horizon))] if with_worst else []),
-                *map(float, np.mean(costs, 0)),
-            ]
-        )
+        needed = updates_needed(study, group, threshold) if group in study.compared else None
+        row: dict[str, Cell] = {
+            "method": group.label,
+            "seeds": len(runs),
+            f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
+            waiting: needed,
+        }
+        for name in study.measurements:
+            row[f"{words(name)} after {horizon} updates"] = _mean(_known(runs, name, horizon))
+        row[f"IQM of {words(headline)}"] = interquartile_mean(final) if final else None
+        if any(worst in run.metrics for run in study.runs):
+            row[f"{words(headline)}, worst 10 %"] = _mean(_known(runs, worst, horizon))
+        cost: dict[str, Callable[[Run], float]] = {
+            "frames (M)": lambda run: run.metrics["frames"][-1] / MILLION,
+            "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
+            "evaluations": lambda run: run.metrics["evaluations"][-1],
+            "seconds per run": lambda run: run.own_seconds[-1],
+        }
+        row |= {name: float(np.mean([paid(run) for run in runs])) for name, paid in cost.items()}
+        rows.append(row)
     note = (
         f"Updates: mean of min(updates, {study.restricted_to(threshold):.0f}) by Kaplan-Meier, so "
         "that censored runs count; measured every few updates, so never exact. Frames: the "
         "Solver's own, and with all that the curriculum spent. Evaluations: of levels, asked for "
         "by the curriculum. Brackets: 95 % interval."
     )
-    return Table("methods", "Methods", note, columns, rows)
+    return Table("methods", "Methods", note, rows)
 
 
 def run_table(study: Study) -> Table:
     """One row per run."""
-    measured = study.measurements
-    rows: list[list[Cell]] = []
+    rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        for run, waiting in zip(
-            group.runs, group.waiting(study.headline, study.threshold), strict=True
-        ):
+        for run in group.runs:
+            waiting = run.waiting(study.headline, study.threshold)
+            last = {name: float(values[-1]) for name, values in run.metrics.items()}
             rows.append(
-                [
-                    group.label,
-                    run.seed,
-                    run.folder.name,
-                    "finished" if run.finished else "unfinished",
-                    run.updates,
-                    waiting.updates if waiting.reached else None,
-                    "reached" if waiting.reached else f"censored at {waiting.updates:.0f}",
-                    *(float(run.metrics[name][-1]) for name in (*measured, *COST[1:4])),
-                    float(run.own_seconds[-1]),
-                ]
+                {
+                    "method": group.label,
+                    "seed": str(run.seed),
+                    "folder": run.folder.name,
+                    "state": "finished" if run.finished else "unfinished",
+                    "updates": run.updates,
+                    f"updates to {level_text(study.headline, study.threshold)}": (
+                        int(waiting.updates) if waiting.reached else None
+                    ),
+                    "threshold": (
+                        "reached" if waiting.reached else f"censored at {waiting.updates:.0f}"
+                    ),
+                    **{f"last {words(name)}": last[name] for name in study.measurements},
+                    "frames": int(last["frames"]),
+                    "the curriculum's frames": int(last["curriculum_frames"]),
+                    "evaluations": int(last["evaluations"]),
+                    "seconds": float(run.own_seconds[-1]),
+                }
             )
-    columns: Columns = {
-        "method": str,
-        "seed": str,
-        "folder": str,
-        "state": str,
-        "updates": number(0),
-        f"updates to {level_text(study.headline, study.threshold)}": number(0),
-        "threshold": str,
-        **{f"last {words(name)}": number(3) for name in measured},
-        "frames": number(0),
-        "the curriculum's frames": number(0),
-        "evaluations": number(0),
-        "seconds": number(0),
-    }
-    return Table("runs", "Runs", "Measurements are the run's last.", columns, rows)
+    return Table("runs", "Runs", "Measurements are the run's last.", rows)
 
 
 def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from proposer_rl.report.findings import Finding
 from proposer_rl.report.proposals import ANIMATION
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Panel, data_uri, look, save_panel
-from proposer_rl.report.tables import Table
+from proposer_rl.report.style import Drawing, look, save_panel
 
 PIXELS = 78  # of an inch of a figure
 LONGEST_WORD = 2000  # of a command
@@ -26,46 +25,34 @@ WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
 
 
-class Section(NamedTuple):
-    """All that the page shows of a study."""
-
-    study: Study
-    facts: Sequence[tuple[str, str]]
-    unfinished: Sequence[str]
-    overview: Table
-    finding_note: str
-    findings: Sequence[Finding]
-    figures: Sequence[Mapping[str, Any]]
-    tables: Sequence[Table]
-    commands: Sequence[str]
-    configs: Sequence[tuple[str, str]]
+Section = dict[str, Any]  # all that the page shows of a study, as the template names it
 
 
-def render(title: str, command: str, sections: Sequence[Section], notes: Sequence[str]) -> str:
+def render(**content: Any) -> str:
     """The page as HTML; whatever comes from a run is escaped."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
-    page = environment.from_string(source)
-    return page.render(title=title, command=command, sections=sections, notes=notes)
+    return environment.from_string(source).render(content)
 
 
-def figure(drawing: Drawing, animations: Mapping[str, bytes]) -> dict[str, Any]:
+def figure(drawing: Drawing, animations: Mapping[str, bytes]) -> Section:
     """A figure as the page shows it: each panel an image of its own, so that they can wrap."""
     images = []
     for panel in drawing.panels:
-        images.append(_image(panel))
+        images.append(_image(save_panel(panel), "image/svg+xml", panel.description, panel.size))
         if panel.name in animations:
-            images.append(_animation(animations[panel.name], panel))
+            height = panel.size[1] * 1.2
+            size = (height * ANIMATION[0] / ANIMATION[1], height)
+            text = f"{panel.description} As an animation over the cycles."
+            images.append(_image(animations[panel.name], "image/gif", text, size))
+    legend = [(label, *look(label)) for label in drawing.labels]
     return {
         "title": drawing.title,
         "caption": drawing.caption,
         "images": images,
-        "legend": [
-            {"label": label, "colour": look(label).colour, "dash": DASHES[look(label).dash]}
-            for label in drawing.labels
-        ],
+        "legend": [{"label": n, "colour": c, "dash": DASHES[dash]} for n, c, dash in legend],
     }
 
 
@@ -119,25 +106,13 @@ def configs(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _image(panel: Panel) -> dict[str, Any]:
-    width, height = panel.size
+def _image(content: bytes, kind: str, description: str, size: tuple[float, float]) -> Section:
     return {
-        "address": data_uri(save_panel(panel), "image/svg+xml"),
-        "description": panel.description,
-        "width": round(width * PIXELS),
-        "height": round(height * PIXELS),
-        "wide": width >= WIDE,
-    }
-
-
-def _animation(content: bytes, panel: Panel) -> dict[str, Any]:
-    height = round(panel.size[1] * PIXELS * 1.2)
-    return {
-        "address": data_uri(content, "image/gif"),
-        "description": f"{panel.description} As an animation over all cycles.",
-        "width": round(height * ANIMATION[0] / ANIMATION[1]),
-        "height": height,
-        "wide": False,
+        "address": f"data:{kind};base64,{base64.b64encode(content).decode()}",
+        "description": description,
+        "width": round(size[0] * PIXELS),
+        "height": round(size[1] * PIXELS),
+        "wide": size[0] >= WIDE,
     }
 
 

@@ -110,27 +110,13 @@ def heat_maps(study: Study) -> Drawing | None:
     )
 
 
-def animate(group: Group) -> bytes | None:
-    """The heat map of the cycles as an animated GIF; None without histograms."""
-    found = _histograms(group)
-    if found is None:
-        return None
-    updates, shares = found
-    frames = np.unique(np.linspace(0, len(shares) - 1, min(len(shares), MOST_FRAMES)).round())
-    with rc_context(SETTINGS):
-        figure, axes, mesh = _one_map(shares[0], group.runs[0], shares.max())
-        title = axes.set_title("")
-
-        def draw(frame: float) -> list[Any]:
-            mesh.set_array(shares[int(frame)])
-            title.set_text(f"{group.label}, update {updates[int(frame)]:.0f}")
-            return [mesh, title]
-
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "animation.gif"
-            writer = PillowWriter(fps=round(1 / FRAME_SECONDS))
-            FuncAnimation(figure, draw, frames=list(frames)).save(file, writer=writer, dpi=100)
-            return file.read_bytes()
+def animations(study: Study) -> dict[str, bytes]:
+    """The heat map of the cycles as an animated GIF, by label, for groups with histograms."""
+    return {
+        group.label: _animate(group, *found)
+        for group in study.groups
+        if (found := _histograms(group)) is not None
+    }
 
 
 def diagnostics(study: Study) -> Drawing | None:
@@ -244,6 +230,23 @@ def _one_map(share: Column, run: Run, largest: float) -> tuple[Figure, Axes, Any
     mesh = _draw_map(axes, share, run, largest, edge=True)
     _colour_bar(figure, mesh, axes, share.size, largest)
     return figure, axes, mesh
+
+
+def _animate(group: Group, updates: Column, shares: Column) -> bytes:
+    frames = np.unique(np.linspace(0, len(shares) - 1, min(len(shares), MOST_FRAMES)).round())
+    with rc_context(SETTINGS), tempfile.TemporaryDirectory() as folder:
+        figure, axes, mesh = _one_map(shares[0], group.runs[0], shares.max())
+        title = axes.set_title("")
+
+        def draw(frame: float) -> list[Any]:
+            mesh.set_array(shares[int(frame)])
+            title.set_text(f"{group.label}, update {updates[int(frame)]:.0f}")
+            return [mesh, title]
+
+        file = Path(folder) / "animation.gif"
+        writer = PillowWriter(fps=round(1 / FRAME_SECONDS))
+        FuncAnimation(figure, draw, frames=list(frames)).save(file, writer=writer, dpi=100)
+        return file.read_bytes()
 
 
 def _draw_map(axes: Axes, share: Column, run: Run, largest: float, edge: bool) -> Any:

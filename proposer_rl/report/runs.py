@@ -30,6 +30,7 @@ from proposer_rl.runs.folder import read_csv, read_jsonl
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
 DEEPEST = 4  # folders between the one that was named and a run's
 MOST_FOLDERS = 20_000
+FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
@@ -166,16 +167,12 @@ def share_map(shares: Column) -> Column:
 def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Folders of runs: those given, or else those found within them.
 
-    Links to folders are not followed.
-
     Raises:
         UnreadableRun: if a folder is none, or there is no run in it.
     """
     found: list[Path] = []
     for folder in folders:
-        if not folder.is_dir():
-            raise UnreadableRun(f"{folder}: there is no such folder")
-        inside = [path for path in _walk(folder) if is_run(path)]
+        inside = [path for path, files in begun(folder) if {"config.json", "metrics.csv"} <= files]
         if not inside:
             raise UnreadableRun(
                 f"{folder}: no run in it: a run's folder has config.json and metrics.csv, as "
@@ -185,20 +182,23 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     return sorted({path.resolve(): path for path in found}.values())
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder looks like a run's."""
-    return (folder / "config.json").is_file() and (folder / "metrics.csv").is_file()
+def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
+    """Folders of runs in a folder, or itself, with names of their files; links are not followed.
 
-
-def _walk(folder: Path) -> Iterator[Path]:
-    for seen, (root, names, _) in enumerate(os.walk(folder)):
+    Raises:
+        UnreadableRun: if there is no such folder, or there are too many in it.
+    """
+    if not folder.is_dir():
+        raise UnreadableRun(f"{folder}: there is no such folder")
+    for seen, (root, names, files) in enumerate(os.walk(folder)):
         if seen > MOST_FOLDERS:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
         path = Path(root)
         names.sort()
-        if is_run(path) or len(path.relative_to(folder).parts) >= DEEPEST:
+        if "config.json" in files or len(path.relative_to(folder).parts) >= DEEPEST:
             names.clear()
-        yield path
+        if {"config.json", FAILURE} & set(files):
+            yield path, set(files)
 
 
 def read_run(folder: Path) -> list[Run]:

@@ -12,10 +12,11 @@ import pytest
 from PIL import Image, ImageSequence
 
 from proposer_rl.cli.report import main
+from proposer_rl.cli.watch import main as watch
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.curves import cost_curves
-from tests.report.folders import TASK, cycle, write_run
+from tests.report.folders import TASK, cycle, write_rockets, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
 
@@ -166,3 +167,58 @@ def refused(capsys, *arguments: str) -> str:
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     return line
+
+
+ANYTHING = [
+    {
+        "updates": 0,
+        "scores": [[1, 2], [3]],
+        "note": "x",
+        "rate": 0.25,
+        "buffer": [3, 4],
+        "ok": True,
+    },
+    {"updates": 20, "rate": None, "staleness": 1e300, "histogram": "no", "return_gain": ["a"]},
+    {"updates": 40, "rate": float("nan"), "buffer": {}, "total": 10**400, "$\\bad{": 1, "\x07": 2},
+    {"updates": 40, "histogram": [[[]]], "log_success_gain": [], "return_gain": 3, "buffer": [5]},
+]
+
+
+def test_the_report_is_built_for_any_task(tmp_path: Path, capsys) -> None:
+    """One axis, no success, a return as headline, curricula that record what they like."""
+    for seed in range(2):
+        cycles = [cycle(i, [0.1, -0.1], [9 - i, 1, 1, 1], every=10) for i in range(3)]
+        for record in cycles:
+            del record["log_success_gain"]  # there is none without success
+        write_rockets(tmp_path / "runs" / f"p{seed}", "perf_gain", seed, cycles=cycles)
+        write_rockets(tmp_path / "runs" / f"a{seed}", "plr", seed, cycles=ANYTHING)
+        write_rockets(tmp_path / "runs" / f"t{seed}", "target", seed)
+    page = write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
+    figures = {path.name for path in (page.parent / "figures").iterdir()}
+    for name in ("learning_curves", "cost", "difficulty", "gains", "proposals", "levels"):
+        assert f"{name}.svg" in figures
+    assert {"samples.svg", "diagnostics.svg", "proposals_perf_gain.gif"} <= figures
+    assert "worst_levels.svg" not in figures and "proposals_plr.gif" not in figures
+    text = Tags(page.read_text(encoding="utf-8")).text
+    assert "Tiny scale, rockets" in text and "updates to 12.5 target return" in text
+    assert "Total gain in return" in text and "Proposals over thrust" in text
+    assert not re.search("success of|log success|maze|obstacle|path length", text)
+    rows = list(csv.DictReader((page.parent / "tables" / "cycles.csv").open(encoding="utf-8")))
+    assert [row["rate"] for row in rows if row["method"] == "plr"] == ["0.25", "", "", ""] * 2
+    for folder in ("a0", "p0", "t0", "."):
+        watch([str(tmp_path / "runs" / folder), "--once"])
+    screen = capsys.readouterr().out
+    assert "columns: thrust" in screen and "buffer" in screen and "\x07" not in screen
+
+
+def test_gains_name_their_measure(report: Path) -> None:
+    text = Tags(report.read_text(encoding="utf-8")).text
+    assert "Total gain in log success" in text and "Total gain in return" not in text
+    assert "the maximum gain in return is positive in 6 of 6 cycles" in text
+
+
+def test_a_threshold_of_a_success_is_a_share(runs: Path, tmp_path: Path, capsys) -> None:
+    out = str(tmp_path / "out")
+    assert "must be above 0 and at most 1" in refused(
+        capsys, str(runs), "-o", out, "--threshold=80"
+    )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +130,7 @@ def in_levels(key: str, value: object):
         ("run.json", set_key("task", "distributions", value=[[]]), "distributions is no text"),
         ("run.json", set_key("task", "space", value={"a": ["x"]}), "is no list of 256 values"),
         ("run.json", set_key("task", "space", value={"a": [0] * 257}), "is no list of 256 values"),
-        ("run.json", set_key("task", "space", value=dict.fromkeys("abcdefghi", [0])), "8 axes"),
+        ("run.json", set_key("task", "space", value={key: [0] for key in "abcdefghi"}), "8 axes"),
         ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a is no text"),
         ("run.json", set_key("task", "samples", value={"id": [1]}), "no list of objects"),
     ],
@@ -158,3 +160,26 @@ def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(runs, "LARGEST_FILE", 100)
     with pytest.raises(UnreadableRun, match="is larger than"):
         read_run(folder)
+
+
+def test_a_share_is_never_more_than_all(tmp_path: Path) -> None:
+    """What float32 sums to 1.0000001 is 1; a success of 1.1 is left to be seen."""
+    (run,) = read_run(write_run(tmp_path / "run", curve=[-1e-7, 1.0000001, 1.1]))
+    assert run.metrics["id_success"].tolist() == [0, 1, 1.1]
+
+
+def test_the_reader_is_independent_of_training() -> None:
+    """Folders are read where no torch is, and bin/watch starts at once."""
+    code = (
+        "import sys, types, importlib\n"
+        "package = types.ModuleType('proposer_rl')\n"
+        f"package.__path__ = [{str(Path(runs.__file__).parents[1])!r}]\n"
+        "sys.modules['proposer_rl'] = package\n"
+        "for name in ('cli.report', 'cli.watch', 'report.build'):\n"
+        "    importlib.import_module('proposer_rl.' + name)\n"
+        "loaded = {name.split('.')[0] for name in sys.modules}\n"
+        "assert not loaded & {'torch', 'torchrl', 'tensordict', 'hydra'}, loaded\n"
+        "rooms = {name.split('.')[1] for name in sys.modules if name.startswith('proposer_rl.')}\n"
+        "assert rooms == {'cli', 'report', 'runs'}, rooms\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
