@@ -65,18 +65,10 @@ def worst_levels(study: Study) -> Drawing | None:
 
 def cost_curves(study: Study) -> Drawing:
     """The headline against what was paid for it, the curriculum's part counted."""
-    axes: list[tuple[str, str, Callable[[Run], Column]]] = [
-        (
-            "frames",
-            "environment frames, millions (the curriculum's counted)",
-            lambda run: run.total_frames / 1e6,
-        ),
-        (
-            "seconds",
-            "wall-clock minutes (the curriculum's counted)",
-            lambda run: (run.own_seconds - run.own_seconds[0]) / 60,
-        ),
-    ]
+    costs: dict[str, Callable[[Run], Column]] = {
+        "environment frames, millions": lambda run: run.total_frames / 1e6,
+        "wall-clock minutes": lambda run: (run.own_seconds - run.own_seconds[0]) / 60,
+    }
     return Drawing(
         "cost",
         f"The same {words(study.headline)} against its whole cost",
@@ -85,11 +77,11 @@ def cost_curves(study: Study) -> Drawing:
         "an even share. Minutes can be compared only between runs on equal machines.",
         [
             Panel(
-                name,
-                f"{words(study.headline)} against {axis}, by method.",
-                partial(_draw_against_cost, study=study, axis=axis, x=cost),
+                axis,
+                f"{words(study.headline)} against {axis} (the curriculum's counted), by method.",
+                partial(_draw_against_cost, study=study, axis=f"{axis} (all)", x=cost),
             )
-            for name, axis, cost in axes
+            for axis, cost in costs.items()
         ],
         labels=[group.label for group in study.groups],
     )
@@ -130,47 +122,40 @@ def draw_curve(axes: Axes, x: Column, rows: Column, label: str) -> Column:
     Returns:
         The mean, float [n].
     """
-    present = (~np.isnan(rows)).sum(0)
-    mean = np.array(
-        [
-            values[~np.isnan(values)].mean() if n else np.nan
-            for values, n in zip(rows.T, present, strict=True)
-        ]
-    )
-    whole = present == len(rows)
+    mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
+    whole = ~np.isnan(rows).any(0)
     axes.plot(x, mean, alpha=0.5, linewidth=0.8, **style(label))
     axes.plot(x, np.where(whole, mean, np.nan), **style(label))
     if len(rows) > 1 and whole.any():
-        bounds = np.array([mean_interval(values) for values in rows.T[whole]])
-        axes.fill_between(
-            x[whole], bounds[:, 1], bounds[:, 2], color=look(label).colour, alpha=0.15, linewidth=0
-        )
+        _, low, high = np.array([mean_interval(values) for values in rows.T[whole]]).T
+        axes.fill_between(x[whole], low, high, color=look(label).colour, alpha=0.15, linewidth=0)
     return mean
 
 
-def focus(axes: Axes, means: Sequence[Column], *, zero: bool = False) -> None:
-    """Limit the ordinate to the means with some margin: intervals of few runs can be huge.
+def finish(
+    axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
+) -> None:
+    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge.
 
     Args:
         axes: where they are drawn.
+        x: name of the abscissa.
+        y: name of the ordinate.
         means: of all methods.
-        zero: whether the ordinate begins at zero, where nothing is less.
+        rate: whether the ordinate goes from 0 to 1.
+        zero: whether it begins at zero, where nothing is less.
     """
-    values = np.concatenate(means) if means else np.empty(0)
-    values = values[np.isfinite(values)]
-    if len(values):
-        low, high = float(values.min()), float(values.max())
-        zero = zero and low >= 0
-        margin = 0.3 * (high - (0 if zero else low)) or 0.1 * abs(high) or 1.0
-        axes.set_ylim(0 if zero else low - margin, high + margin)
-
-
-def finish(axes: Axes, x: str, y: str, rate: bool) -> None:
-    """Name the axes; a rate's goes from 0 to 1."""
     axes.set(xlabel=x, ylabel=y)
     axes.margins(x=0.01)
-    if rate:
+    values = np.concatenate([[], *means])
+    values = values[np.isfinite(values)]
+    if rate or not len(values):
         axes.set_ylim(0, 1)
+        return
+    low, high = float(values.min()), float(values.max())
+    zero = zero and low >= 0
+    margin = 0.3 * (high - (0 if zero else low)) or 0.1 * abs(high) or 1.0
+    axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
 def _curve_panel(study: Study, name: str) -> Panel:
@@ -192,11 +177,9 @@ def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: 
             for row, own in zip(rows, columns, strict=True):
                 row[np.searchsorted(x, own["updates"])] = own[name]
             means.append(draw_curve(axes, x, rows, group.label))
-    focus(axes, means, zero=table == "training")
-    measured = table == "metrics"
-    finish(
-        axes, "Solver updates", _axis(name) if measured else name.replace("_", " "), is_rate(name)
-    )
+    trained = table == "training"
+    text = name.replace("_", " ") if trained else _axis(name)
+    finish(axes, "Solver updates", text, means, rate=is_rate(name), zero=trained)
 
 
 def _draw_against_cost(
@@ -212,8 +195,7 @@ def _draw_against_cost(
             for run in group.runs
         ]
         means.append(draw_curve(axes, grid, np.array(rows), group.label))
-    focus(axes, means)
-    finish(axes, axis, _axis(name), is_rate(name))
+    finish(axes, axis, _axis(name), means, rate=is_rate(name))
 
 
 def _axis(name: str) -> str:

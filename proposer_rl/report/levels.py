@@ -109,8 +109,8 @@ def _draw_measurements(axes: Axes, runs: Sequence[Run]) -> None:
         for run in runs:
             label = words(name) if run is runs[0] else None
             axes.plot(run.metrics["updates"], run.metrics[name], color=colour, label=label)
-    rates = all(map(is_rate, names))
-    finish(axes, "Solver updates", "success rate" if rates else "measurement", rates)
+    rates, every = all(map(is_rate, names)), [run.metrics[name] for run in runs for name in names]
+    finish(axes, "Solver updates", "rate" if rates else "measurement", every, rate=rates)
     axes.legend()
 
 

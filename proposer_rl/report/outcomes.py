@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
 
 MILLION = 1e6
-MOST_COLUMNS = 200
+MOST_COLUMNS, DEEPEST = 200, 8
 
 
 class Comparison(NamedTuple):
@@ -75,19 +75,19 @@ def outcomes(study: Study) -> list[Outcome]:
 
     def plain(name: str, value: Callable[[Run], float]) -> Outcome:
         def values(group: Group) -> list[float]:
-            found = [value(run) for run in group.runs]
-            return [one for one in found if not math.isnan(one)]
+            return [one for run in group.runs if not math.isnan(one := value(run))]
 
         return Outcome(name, values, lambda a, b: mean_difference(values(a), values(b)), 1)
 
+    mean = f"{words(headline)}, mean over {horizon} updates"
     return [
         waiting_outcome(study, study.threshold),
-        plain(
-            f"{words(headline)}, mean over {horizon} updates",
-            lambda run: run.mean_until(headline, horizon),
-        ),
+        plain(mean, lambda run: run.mean_until(headline, horizon)),
         *(
-            plain(f"{words(name)} after {horizon} updates", partial(_at, name, horizon))
+            plain(
+                f"{words(name)} after {horizon} updates",
+                partial(Run.at, measurement=name, updates=horizon),
+            )
             for name in study.measurements
         ),
     ]
@@ -95,14 +95,16 @@ def outcomes(study: Study) -> list[Outcome]:
 
 def waiting_outcome(study: Study, threshold: float) -> Outcome:
     """Restricted updates to a threshold of the headline measurement."""
-    headline, limit = study.headline, study.restricted_to(threshold)
+    name, limit = study.headline, study.restricted_to(threshold)
+
+    def difference(one: Group, other: Group) -> Interval:
+        waiting = [group.waiting(name, threshold) for group in (one, other)]
+        return restricted_difference(waiting[0], waiting[1], limit)
 
     return Outcome(
-        f"updates to {level_text(headline, threshold)} {words(headline)} (at most {limit:.0f})",
-        lambda group: pseudo_values(group.waiting(headline, threshold), limit),
-        lambda a, b: restricted_difference(
-            a.waiting(headline, threshold), b.waiting(headline, threshold), limit
-        ),
+        f"updates to {level_text(name, threshold)} {words(name)} (at most {limit:.0f})",
+        lambda group: pseudo_values(group.waiting(name, threshold), limit),
+        difference,
         -1,
     )
 
@@ -132,11 +134,10 @@ def compare(outcome: Outcome, one: Group, other: Group) -> Comparison:
     )
 
 
-def comparisons(study: Study) -> Iterator[Comparison]:
+def comparisons(study: Study) -> list[Comparison]:
     """Every pair of groups by every outcome."""
-    for outcome in outcomes(study):
-        for one, other in combinations(study.compared, 2):
-            yield compare(outcome, one, other)
+    pairs = list(combinations(study.compared, 2))
+    return [compare(outcome, *pair) for outcome in outcomes(study) for pair in pairs]
 
 
 def comparison_table(study: Study) -> Table:
@@ -235,46 +236,32 @@ def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
     rows: list[list[Cell]] = []
     for group in study.groups:
         for run in group.runs:
-            for i in range(len(run.metrics["updates"])):
-                values = [
-                    float(run.metrics[name][i]) if name in run.metrics else math.nan
-                    for name in names
-                ]
-                rows.append([group.label, run.seed, *values])
+            none = np.full(len(run.metrics["updates"]), math.nan)
+            columns = [run.metrics.get(name, none) for name in names]
+            rows += [[group.label, run.seed, *map(float, row)] for row in np.transpose(columns)]
     return ["method", "seed", *names], rows
 
 
 def tidy_cycles(study: Study) -> tuple[list[str], list[list[Cell]]]:
     """Every cycle of every curriculum: whatever it recorded, lists as numbers with spaces."""
-    found = [
-        (group.label, run.seed, cycle)
-        for group in study.groups
-        for run in group.logs
-        for cycle in run.cycles
-    ]
-    names = list(dict.fromkeys(name for *_, cycle in found for name in cycle))[:MOST_COLUMNS]
+    found = [(group.label, run) for group in study.groups for run in group.logs]
+    names = list(dict.fromkeys(name for _, run in found for cycle in run.cycles for name in cycle))
+    names = names[:MOST_COLUMNS]
     rows: list[list[Cell]] = [
-        [label, seed, *(_cell(cycle.get(name)) for name in names)] for label, seed, cycle in found
+        [label, run.seed, *(_cell(cycle.get(name)) for name in names)]
+        for label, run in found
+        for cycle in run.cycles
     ]
     return ["method", "seed", *names], rows
 
 
-def _cell(value: Any) -> Cell:
+def _cell(value: Any, depth: int = 0) -> Cell:
     if isinstance(value, str):
         return value[:LONGEST_TEXT]
-    return " ".join(_flat(value)) if isinstance(value, list) else records.number(value)
-
-
-def _flat(value: Any) -> Iterator[str]:
-    if isinstance(value, list):
-        for item in value:
-            yield from _flat(item)
-    else:
-        yield f"{records.number(value):.6g}"
-
-
-def _at(name: str, updates: float, run: Run) -> float:
-    return run.at(name, updates)
+    if isinstance(value, list) and depth < DEEPEST:
+        cells = [_cell(item, depth + 1) for item in value]
+        return " ".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in cells)
+    return records.number(value)
 
 
 def _known(runs: Sequence[Run], name: str, updates: float) -> list[float]:

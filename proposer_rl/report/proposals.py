@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
-from proposer_rl.report.curves import draw_curve, finish, focus
+from proposer_rl.report.curves import draw_curve, finish
 from proposer_rl.report.records import (
     GAINS,
     LONGEST_NAME,
@@ -31,6 +31,8 @@ from proposer_rl.report.records import (
 from proposer_rl.report.runs import Run, read_run, share_map
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, look
+
+Value = Callable[[Record], float]  # of a cycle; NaN where it has none
 
 STAGES = 5
 STRIP = (7.6, 2.1)  # inches, of a row of heat maps
@@ -57,18 +59,11 @@ def recorded_gain(group: Group) -> str | None:
 def gains(study: Study) -> Drawing | None:
     """The paper's Figure 4: maximum and mean total gain of a cycle's copies."""
     shown = [(group, name) for group in study.groups if (name := recorded_gain(group))]
+    every = {name: np.zeros(1) for _, name in shown}  # of all groups, so that axes are alike
+    for group, name in shown:
+        every[name] = np.concatenate([every[name], *(c for _, c in _lists(group, name))])
     if not shown:
         return None
-    every = {
-        wanted: [
-            gain
-            for group, name in shown
-            for _, copies in _lists(group, name)
-            for gain in copies
-            if name == wanted
-        ]
-        for _, wanted in shown
-    }
     return Drawing(
         "gains",
         f"Total gain in {' or '.join(map(GAINS.__getitem__, every))} of the copies in each cycle "
@@ -125,27 +120,12 @@ def diagnostics(study: Study) -> Drawing | None:
     names = _scalars(groups)
     chosen = {name: text for name, text in DIAGNOSTICS.items() if name in names}
     chosen |= {name: name.replace("_", " ") for name in sorted(names - chosen.keys())}
-    panels = [
-        Panel(
-            name,
-            f"The curricula's {text} against Solver updates.",
-            partial(_draw_over_cycles, groups=groups, value=_named(name), axis=text),
-            SMALL,
-        )
-        for name, text in list(chosen.items())[:MOST_PANELS]
-    ]
+    values: dict[str, Value] = {
+        text: partial(_value, name=name) for name, text in list(chosen.items())[:MOST_PANELS]
+    }
     if any(map(recorded_gain, groups)):
-        panels.append(
-            Panel(
-                "gain_ratio",
-                "Mean total gain over its standard deviation across copies, by Solver updates.",
-                partial(
-                    _draw_over_cycles, groups=groups, value=_ratio, axis="total gain: mean / sd"
-                ),
-                SMALL,
-            )
-        )
-    if not panels:
+        values["total gain: mean / sd of copies"] = partial(_of_gains, names=GAINS, reduce=_ratio)
+    if not values:
         return None
     return Drawing(
         "diagnostics",
@@ -153,7 +133,15 @@ def diagnostics(study: Study) -> Drawing | None:
         "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, "
         "mean over standard deviation between the copies: where it is large, all copies gain alike "
         "whatever they are proposed, and there is little to learn from.",
-        panels,
+        [
+            Panel(
+                text,
+                f"The curricula's {text} against Solver updates.",
+                partial(_draw_over_cycles, groups=groups, value=value, axis=text),
+                SMALL,
+            )
+            for text, value in values.items()
+        ],
         3,
         [group.label for group in groups],
     )
@@ -192,22 +180,20 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _draw_gains(figure: FigureBase, group: Group, name: str, every: Sequence[float]) -> None:
+def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> None:
     axes = axes_of(figure)
     colour = look(group.label).colour
     points = np.array([(updates, gain) for updates, c in _lists(group, name) for gain in c])
     # As pixels also in SVG, where thousands of dots would make the page heavy.
     axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
-    for reduce, dash in (("max", "-"), ("mean", "--")):
-        x, rows = _per_cycle(group, partial(_reduced, name=name, reduce=reduce))
-        seen = ~np.isnan(rows).all(0)
-        label = {"max": "maximum"}.get(reduce, reduce)
-        mean = np.nanmean(rows[:, seen], 0)
-        axes.plot(x[seen], mean, dash, color=colour, label=f"{label} of the copies")
+    reductions: list[tuple[str, Any, str]] = [("maximum", np.max, "-"), ("mean", np.mean, "--")]
+    for text, reduce, dash in reductions:
+        x, rows = _per_cycle(group, partial(_of_gains, names=[name], reduce=reduce))
+        mean = np.ma.masked_invalid(rows).mean(0)
+        axes.plot(x, mean, dash, color=colour, label=f"{text} of the copies")
     axes.axhline(0, color="0.2", linewidth=0.8)
-    margin = 0.05 * (max(every) - min(every) or 1)
-    axes.set(title=group.label, ylim=(min(*every, 0) - margin, max(*every, 0) + margin))
-    finish(axes, "Solver updates", f"total gain in target {GAINS[name]}", rate=False)
+    finish(axes, "Solver updates", f"total gain in target {GAINS[name]}", [every])
+    axes.set_title(group.label)
     axes.legend(loc="best")
 
 
@@ -217,19 +203,10 @@ def _draw_strip(figure: FigureBase, group: Group) -> None:
     updates, shares = found
     stages = sorted({round(i) for i in np.linspace(0, len(shares) - 1, STAGES)})
     row = figure.subplots(1, len(stages), squeeze=False, sharey=True)[0]
+    _draw_maps(figure, list(row), [shares[i] for i in stages], group.runs[0], shares.max())
     for axes, stage in zip(row, stages, strict=True):
-        mesh = _draw_map(axes, shares[stage], group.runs[0], shares.max(), edge=axes is row[0])
         axes.set_title(f"update {updates[stage]:.0f}", fontsize=9)
     figure.suptitle(group.label, fontsize=10, x=0.01, ha="left")
-    _colour_bar(figure, mesh, list(row), shares[0].size, shares.max())
-
-
-def _one_map(share: Column, run: Run, largest: float) -> tuple[Figure, Axes, Any]:
-    figure = Figure(figsize=ANIMATION, layout="constrained")
-    axes = axes_of(figure)
-    mesh = _draw_map(axes, share, run, largest, edge=True)
-    _colour_bar(figure, mesh, axes, share.size, largest)
-    return figure, axes, mesh
 
 
 def _animate(group: Group, updates: Column, shares: Column) -> bytes:
@@ -249,20 +226,33 @@ def _animate(group: Group, updates: Column, shares: Column) -> bytes:
         return file.read_bytes()
 
 
-def _draw_map(axes: Axes, share: Column, run: Run, largest: float, edge: bool) -> Any:
-    # White is the uniform distribution, orange more than that, purple less.
-    even = 1 / share.size
-    norm = TwoSlopeNorm(even, 0, max(largest, 2 * even))
-    mesh = axes.pcolormesh(share, cmap="PuOr_r", norm=norm)
-    *above, (across, values) = list(run.task.axes.items())[:2]
-    axes.set_xticks(*_ticks(values))
-    axes.set_xlabel(across, fontsize=8)
-    axes.set_yticks([])
-    for name, values in above:
-        axes.set_yticks(*_ticks(values))
-        axes.set_ylabel(name if edge else "", fontsize=8)
-    axes.tick_params(labelsize=7, length=0)
-    axes.grid(visible=False)
+def _one_map(share: Column, run: Run, largest: float) -> tuple[Figure, Axes, Any]:
+    figure = Figure(figsize=ANIMATION, layout="constrained")
+    axes = axes_of(figure)
+    return figure, axes, _draw_maps(figure, [axes], [share], run, largest)
+
+
+def _draw_maps(
+    figure: FigureBase, row: Sequence[Axes], shares: Sequence[Column], run: Run, largest: float
+) -> Any:
+    """Maps side by side with one bar of colours: white is even, orange more, purple less."""
+    even = 1 / shares[0].size
+    largest = max(largest, 2 * even)
+    *above, (across, columns) = list(run.task.axes.items())[:2]
+    for axes, share in zip(row, shares, strict=True):
+        mesh = axes.pcolormesh(share, cmap="PuOr_r", norm=TwoSlopeNorm(even, 0, largest))
+        axes.set_xticks(*_ticks(columns))
+        axes.set_xlabel(across, fontsize=8)
+        axes.set_yticks([])
+        for name, values in above:
+            axes.set_yticks(*_ticks(values))
+            axes.set_ylabel(name if axes is row[0] else "", fontsize=8)
+        axes.tick_params(labelsize=7, length=0)
+        axes.grid(visible=False)
+    bar = figure.colorbar(mesh, ax=list(row), format=lambda value, _: f"{value:.1%}")
+    bar.set_ticks([0, even, largest])
+    bar.set_label("share of proposals", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
     return mesh
 
 
@@ -272,24 +262,15 @@ def _ticks(values: Column) -> tuple[Column, list[str]]:
     return np.arange(0.5, len(values), step), [f"{value:g}" for value in values[::step]]
 
 
-def _colour_bar(figure: FigureBase, mesh: Any, axes: Any, bins: int, largest: float) -> None:
-    bar = figure.colorbar(mesh, ax=axes, format=lambda value, _: f"{value:.1%}")
-    bar.set_ticks([0, 1 / bins, max(largest, 2 / bins)])
-    bar.set_label("share of proposals", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-
-
-def _draw_over_cycles(
-    figure: FigureBase, groups: Sequence[Group], value: Callable[[Record], float], axis: str
-) -> None:
+def _draw_over_cycles(figure: FigureBase, groups: Sequence[Group], value: Value, axis: str) -> None:
     axes = axes_of(figure)
     found = [(group.label, *_per_cycle(group, value)) for group in groups]
     curves = [(label, x, rows) for label, x, rows in found if not np.isnan(rows).all()]
-    focus(axes, [draw_curve(axes, x, rows, label) for label, x, rows in curves])
-    finish(axes, "Solver updates", axis, rate=False)
+    means = [draw_curve(axes, x, rows, label) for label, x, rows in curves]
+    finish(axes, "Solver updates", axis, means)
 
 
-def _per_cycle(group: Group, value: Callable[[Record], float]) -> tuple[Column, Column]:
+def _per_cycle(group: Group, value: Value) -> tuple[Column, Column]:
     """A number of every cycle: the Solver's updates [n] and the values [runs, n]."""
     logs = group.logs
     x = np.unique([number(cycle["updates"]) for run in logs for cycle in run.cycles])
@@ -307,20 +288,19 @@ def _lists(group: Group, name: str) -> list[tuple[float, Column]]:
     return [(updates, values) for updates, values in found if values is not None]
 
 
-def _named(name: str) -> Callable[[Record], float]:
-    return lambda cycle: number(cycle.get(name))
+def _value(cycle: Record, name: str) -> float:
+    return number(cycle.get(name))
 
 
-def _reduced(cycle: Record, name: str, reduce: str) -> float:
-    values = numbers(cycle.get(name))
-    return np.nan if values is None else float(getattr(values, reduce)())
+def _of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], float]) -> float:
+    """A number of a cycle's gains, of the first that it has; NaN where it has none."""
+    found = [values for name in names if (values := numbers(cycle.get(name))) is not None]
+    return float(reduce(found[0])) if found else np.nan
 
 
-def _ratio(cycle: Record) -> float:
-    """Mean over standard deviation of a cycle's gains."""
-    found = [values for name in GAINS if (values := numbers(cycle.get(name))) is not None]
-    spread = float(found[0].std(ddof=1)) if found and len(found[0]) > 1 else 0.0
-    return float(found[0].mean()) / spread if spread else np.nan
+def _ratio(gains: Column) -> float:
+    spread = float(gains.std(ddof=1)) if len(gains) > 1 else 0.0
+    return float(gains.mean()) / spread if spread else np.nan
 
 
 def _histograms(group: Group) -> tuple[Column, Column] | None:

@@ -63,34 +63,35 @@ def read_task(value: Any) -> TaskFacts:
         ValueError: if an entry is not what it should be.
     """
     task = _mapping(value, "task")
+    space, about, samples = (
+        _mapping(task.get(key) or {}, f"task.{key}") for key in ("space", "about", "samples")
+    )
+    axes = {plain(name, "run.json: task.space"): numbers(axis) for name, axis in space.items()}
+    kept = {name: axis for name, axis in axes.items() if axis is not None}
+    if len(kept) < len(axes) or not all(len(axis) <= LONGEST_AXIS for axis in kept.values()):
+        raise ValueError(f"run.json: an axis of task.space is no list of {LONGEST_AXIS} values")
+    if len(axes) > MOST_AXES:
+        raise ValueError(f"run.json: task.space has more than {MOST_AXES} axes")
     names = task["distributions"]
     if not isinstance(names, list) or not names:
         raise ValueError("run.json: task.distributions is no list of names")
-    axes = {}
-    for name, values in _mapping(task.get("space") or {}, "task.space").items():
-        known = numbers(values)
-        if known is None or len(known) > LONGEST_AXIS:
-            raise ValueError(f"run.json: an axis of task.space is no list of {LONGEST_AXIS} values")
-        axes[plain(name, "run.json: an axis of task.space")] = known
-    if len(axes) > MOST_AXES:
-        raise ValueError(f"run.json: task.space has more than {MOST_AXES} axes")
-    about = _mapping(task.get("about", {}), "task.about")
-    samples = _mapping(task.get("samples", {}), "task.samples")
+
+    def text(key: str, value: Any, longest: int = LONGEST_NAME) -> str:
+        return plain(value, f"run.json: task.{key}", longest)
+
     return TaskFacts(
-        title=plain(task["title"], "run.json: task.title"),
-        levels=plain(task.get("levels", "levels"), "run.json: task.levels"),
-        distributions=tuple(plain(name, "run.json: task.distributions") for name in names),
-        axes=axes,
+        title=text("title", task["title"]),
+        levels=text("levels", task.get("levels", "levels")),
+        distributions=tuple(text("distributions", name) for name in names),
+        axes=kept,
         about={
-            plain(label, "run.json: task.about"): plain(
-                text, f"run.json: task.about.{label}", LONGEST_TEXT
-            )
-            for label, text in about.items()
+            text("about", key): text(f"about.{key}", line, LONGEST_TEXT)
+            for key, line in about.items()
         },
         measured=task["measured"],
-        samples={name: checked_levels(of, "run.json") for name, of in samples.items()},
-        key=plain(task.get("key", " "), "run.json: task.key", LONGEST_TEXT).strip(),
-        text_key=plain(task.get("text_key", " "), "run.json: task.text_key", LONGEST_TEXT).strip(),
+        samples={name: checked_levels(levels, "run.json") for name, levels in samples.items()},
+        key=text("key", task.get("key") or " ", LONGEST_TEXT).strip(),
+        text_key=text("text_key", task.get("text_key") or " ", LONGEST_TEXT).strip(),
     )
 
 
