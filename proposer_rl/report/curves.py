@@ -125,7 +125,7 @@ def draw_curve(axes: Axes, x: Column, rows: Column, label: str) -> Column:
     mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
     whole = ~np.isnan(rows).any(0)
     axes.plot(x, mean, alpha=0.5, linewidth=0.8, **style(label))
-    axes.plot(x, np.where(whole, mean, np.nan), **style(label))
+    axes.plot(x, np.where(whole, mean, np.nan), **style(label), marker="." if len(x) == 1 else "")
     if len(rows) > 1 and whole.any():
         _, low, high = np.array([mean_interval(values) for values in rows.T[whole]]).T
         axes.fill_between(x[whole], low, high, color=look(label).colour, alpha=0.15, linewidth=0)

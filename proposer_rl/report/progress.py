@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from proposer_rl.report.records import LONGEST_TEXT
+from proposer_rl.report.records import LONGEST_TEXT, printable
 from proposer_rl.report.runs import FAILURE as FAILURE
 from proposer_rl.report.runs import Run, UnreadableRun, begun, read_run
 
@@ -47,7 +47,7 @@ def read_progress(folder: Path) -> Progress:
     except UnreadableRun as error:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
-            failure = str(error).removeprefix(f"{folder}: ")
+            failure = printable(str(error).removeprefix(f"{folder}: "))
     return Progress(folder, runs, failure, _age(folder))
 
 
@@ -68,8 +68,8 @@ def _failure(folder: Path) -> str:
     if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**20:
         return ""
     try:
-        return " ".join(str(json.loads(path.read_text())["message"]).split())[:LONGEST_TEXT]
-    except (OSError, ValueError, KeyError, TypeError):
+        return printable(str(json.loads(path.read_text())["message"]))[:LONGEST_TEXT]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return f"{FAILURE} cannot be read"
 
 

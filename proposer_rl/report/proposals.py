@@ -264,9 +264,11 @@ def _ticks(values: Column) -> tuple[Column, list[str]]:
 
 def _draw_over_cycles(figure: FigureBase, groups: Sequence[Group], value: Value, axis: str) -> None:
     axes = axes_of(figure)
-    found = [(group.label, *_per_cycle(group, value)) for group in groups]
-    curves = [(label, x, rows) for label, x, rows in found if not np.isnan(rows).all()]
-    means = [draw_curve(axes, x, rows, label) for label, x, rows in curves]
+    means = []
+    for group in groups:
+        x, rows = _per_cycle(group, value)
+        seen = ~np.isnan(rows).all(0)
+        means.append(draw_curve(axes, x[seen], rows[:, seen], group.label))
     finish(axes, "Solver updates", axis, means)
 
 

@@ -106,6 +106,11 @@ def plain(value: Any, where: str, longest: int = LONGEST_NAME) -> str:
     raise ValueError(f"{where} is no text of one line and at most {longest} characters")
 
 
+def printable(text: str) -> str:
+    """A text as one line that can do nothing to a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
 def checked_levels(records: Any, where: str) -> list[Record]:
     """Records of levels: a picture and lines of text, each optional and bounded.
 

@@ -271,6 +271,7 @@ def _short_names(keys: Sequence[str]) -> dict[str, str]:
 def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from _leaves(item, f"{prefix}.{key}" if prefix else str(key))
+            name = json.dumps(key)[1:-1]  # it may hold whatever JSON can
+            yield from _leaves(item, f"{prefix}.{name}" if prefix else name)
     else:
         yield prefix, json.dumps(value)

@@ -15,7 +15,16 @@ from rich.table import Table
 from rich.text import Text
 
 from proposer_rl.report.progress import Progress
-from proposer_rl.report.records import GAINS, PLACE, Column, is_rate, number, numbers, words
+from proposer_rl.report.records import (
+    GAINS,
+    PLACE,
+    Column,
+    is_rate,
+    number,
+    numbers,
+    printable,
+    words,
+)
 from proposer_rl.report.runs import Run, share_map
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
@@ -46,7 +55,7 @@ def screen(progress: Progress) -> RenderableType:
 def overview(found: Sequence[Progress]) -> RenderableType:
     """Several runs: one line each, and how many are in which state."""
     parent = os.path.commonpath([progress.folder.parent for progress in found])
-    names = [str(progress.folder.relative_to(parent)) for progress in found]
+    names = [printable(str(progress.folder.relative_to(parent))) for progress in found]
     table = Table(box=None, pad_edge=False)
     table.add_column("run", overflow="fold")
     for name, width in (("state", 10), ("updates", 7), ("last", 16), ("written", 10)):
@@ -78,7 +87,7 @@ def sparkline(values: Iterable[float], low: float, high: float) -> str:
 
 def _name(progress: Progress) -> Text:
     if not progress.runs:
-        return Text(progress.folder.name)
+        return Text(printable(progress.folder.name))
     run = progress.runs[0]
     seeds = ", ".join(str(run.seed) for run in progress.runs)
     ablation = "" if run.ablation == "none" else f", {run.ablation}"
@@ -105,26 +114,25 @@ def _curves(runs: Sequence[Run]) -> RenderableType:
         rate = is_rate(name)
         low, high = (0, 1) if rate else (float(values.min()), float(values.max()))
         last = f"{values[-1]:.1%}" if rate else f"{values[-1]:.4g}"
-        grid.add_row(words(name), Text(sparkline(_some(values), low, high)), last)
+        grid.add_row(Text(words(name)), Text(sparkline(_some(values), low, high)), last)
     return grid
 
 
 def _cycles(run: Run) -> list[RenderableType]:
     """The gains of the copies or, where there are none, the curriculum's numbers; its proposals."""
     cycle, grid = run.cycles[-1], Table.grid(padding=(0, 1))
-    recorded = [[numbers(cycle.get(name)) for cycle in run.cycles] for name in GAINS]
-    gains = next((found for each in recorded if (found := [g for g in each if g is not None])), [])
-    best, mean = [float(g.max()) for g in gains], [float(g.mean()) for g in gains]
-    low, high = min(0.0, *mean, 0.0), max(0.0, *best, 0.0)
-    for name, values in (("maximum gain", best), ("mean gain", mean)):
+    for name, text in GAINS.items():
+        gains = [found for c in run.cycles if (found := numbers(c.get(name))) is not None]
+        best, mean = [float(each.max()) for each in gains], [float(each.mean()) for each in gains]
+        for kind, values in (("maximum", best), ("mean", mean)) if gains else ():
+            drawn = sparkline(_some(values), min(0, *mean), max(0, *best))
+            grid.add_row(f"{kind} gain in {text}", Text(drawn), f"{values[-1]:+.3f}")
+    names = [n for n in cycle if n not in PLACE and n not in GAINS and n.isprintable()]
+    for name in names[:NUMBERS] if not grid.row_count else ():
+        values = [value for c in run.cycles if not math.isnan(value := number(c.get(name)))]
         if values:
-            grid.add_row(name, Text(sparkline(_some(values), low, high)), f"{values[-1]:+.3f}")
-    others = [name for name in cycle if name not in PLACE and name.isprintable()]
-    for name in others[:NUMBERS] if not gains else ():
-        known = [value for c in run.cycles if not math.isnan(value := number(c.get(name)))]
-        if known:
-            drawn = sparkline(_some(known), min(known), max(known))
-            grid.add_row(Text(words(name)), Text(drawn), f"{known[-1]:.4g}")
+            drawn = sparkline(_some(values), min(values), max(values))
+            grid.add_row(Text(words(name)), Text(drawn), f"{values[-1]:.4g}")
     shares = run.shares(cycle)
     return [grid] if shares is None else [grid, *_map(run, share_map(shares))]
 

@@ -160,3 +160,30 @@ def test_the_threshold_can_be_chosen(tmp_path: Path) -> None:
     write_run(tmp_path / "a")
     assert read_studies([tmp_path / "a"], 0.5)[0][0].threshold == 0.5
     assert read_studies([tmp_path / "a"], None)[0][0].threshold == 0.8
+
+
+def test_a_label_is_one_line_whatever_settings_are_called(tmp_path: Path) -> None:
+    for i in range(2):
+        write_run(tmp_path / str(i), facts={"overrides": None}, solver={"a\n```\n": i})
+    (study,), _ = read(tmp_path)
+    assert len(study.groups) == 2
+    assert all(line.isprintable() for line in [*labels(study), *commands(study)])
+
+
+def test_seeds_trained_together_have_one_curriculum(tmp_path: Path) -> None:
+    """Its cycles would else count once for every seed, and an interval be of nothing."""
+    write_run(tmp_path / "a", "plr", [0, 1], cycles=[{"updates": 0, "score": 1}])
+    write_run(tmp_path / "b", "plr", [2], cycles=[{"updates": 0, "score": 2}])
+    (study,), _ = read(tmp_path)
+    (group,) = study.groups
+    assert group.seeds == [0, 1, 2] and not group.proposes
+    assert sorted(run.folder.name for run in group.logs) == ["a", "b"]
+
+
+def test_a_reused_proposers_settings_tell_runs_apart(tmp_path: Path) -> None:
+    curriculum = {"checkpoint": "runs/seed_0"}
+    for i in range(2):
+        proposer = {"rollouts": i}
+        write_run(tmp_path / str(i), "frozen", curriculum=curriculum, proposer=proposer)
+    (study,), _ = read(tmp_path)
+    assert len(study.groups) == 2
