@@ -107,10 +107,10 @@ def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> p
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
-            animations = proposals.animations(study) if draw is proposals.heat_maps else {}
-            figures.append(page.figure(drawing, animations))
+            figures.append(page.figure(drawing))
             files |= {f"{path}.{suffix}": content for suffix, content in save(drawing).items()}
-            files |= {f"{path}_{_slug(label)}.gif": gif for label, gif in animations.items()}
+            animations = [panel.animation for panel in drawing.panels if panel.animation]
+            files |= {f"{path}_{_slug(name)}.gif": content for name, content in animations}
         bar.update()
     return {
         "study": study,

@@ -26,7 +26,6 @@ def learning_curves(study: Study) -> Drawing:
     panels = [_curve_panel(study, name) for name in study.measurements[:MOST_PANELS]]
     rows = len(study.groups)
     bars = Panel(
-        "updates",
         f"Updates until {words(study.headline)} reached "
         f"{level_text(study.headline, study.threshold)}, by method.",
         partial(_draw_bars, study=study),
@@ -77,7 +76,6 @@ def cost_curves(study: Study) -> Drawing:
         "an even share. Minutes can be compared only between runs on equal machines.",
         [
             Panel(
-                axis,
                 f"{words(study.headline)} against {axis} (the curriculum's counted), by method.",
                 partial(_draw_against_cost, study=study, axis=f"{axis} (all)", x=cost),
             )
@@ -97,14 +95,7 @@ def difficulty(study: Study) -> Drawing | None:
         "What the Solver trained on",
         "Statistics of the task over the batch of each evaluated update: means, or where a name "
         "says so standard deviations (sd). Lines and bands as above.",
-        [
-            Panel(
-                name,
-                f"{name.replace('_', ' ')}, by method.",
-                partial(_draw_curves, groups=study.groups, name=name, table="training"),
-            )
-            for name in names[:MOST_PANELS]
-        ],
+        [_curve_panel(study, name, "training") for name in names[:MOST_PANELS]],
         3,
         [group.label for group in study.groups],
     )
@@ -158,12 +149,11 @@ def finish(
     axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
-def _curve_panel(study: Study, name: str) -> Panel:
-    return Panel(
-        name,
-        f"{words(name)} against Solver updates, by method.",
-        partial(_draw_curves, groups=study.groups, name=name, table="metrics"),
-    )
+def _curve_panel(study: Study, name: str, table: str = "metrics") -> Panel:
+    trained = table == "training"
+    text = name.replace("_", " ") if trained else words(name)
+    draw = partial(_draw_curves, groups=study.groups, name=name, table=table)
+    return Panel(f"{text} against Solver updates, by method.", draw)
 
 
 def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: str) -> None:

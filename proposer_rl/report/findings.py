@@ -59,10 +59,7 @@ def findings(study: Study) -> list[Finding]:
     tests: list[tuple[str, Callable[[Study], Evidence]]] = [
         ("The baseline that trains on the target alone stalls at first.", _stall),
         ("Both Proposers learn almost at once.", _learn_at_once),
-        (
-            f"Performance gain needs clearly fewer updates to {threshold} than the baseline.",
-            _fewer,
-        ),
+        (f"Performance gain needs clearly fewer updates to {threshold} than the baseline.", _fewer),
         ("Out of distribution the methods end up alike.", _alike),
         ("Performance gain beats task difficulty slightly, not significantly.", _slightly),
         ("Proposals start easy and grow harder.", _grow_harder),

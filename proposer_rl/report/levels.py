@@ -27,7 +27,6 @@ def along_training(study: Study) -> Drawing | None:
     shown = [(group.label, group.runs[0].samples) for group in study.groups]
     panels = [
         Panel(
-            label,
             f"Levels that {label} trained on at several stages.",
             partial(_draw_stages, samples=samples, title=label),
             (SIDE * STAGES, SIDE * BATCH + 0.5),
@@ -57,7 +56,6 @@ def side_by_side(study: Study) -> Drawing | None:
             rows.append((title, sample["levels"]))
     panels = [
         Panel(
-            title,
             f"Sample {task.levels}: {title}.",
             partial(_draw_row, records=records, title=title),
             (SIDE * SAMPLES, SIDE + 0.35),

@@ -6,7 +6,7 @@ import base64
 import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -37,16 +37,16 @@ def render(**content: Any) -> str:
     return environment.from_string(source).render(content)
 
 
-def figure(drawing: Drawing, animations: Mapping[str, bytes]) -> Section:
+def figure(drawing: Drawing) -> Section:
     """A figure as the page shows it: each panel an image of its own, so that they can wrap."""
     images = []
     for panel in drawing.panels:
         images.append(_image(save_panel(panel), "image/svg+xml", panel.description, panel.size))
-        if panel.name in animations:
+        if panel.animation is not None:
             height = panel.size[1] * 1.2
             size = (height * ANIMATION[0] / ANIMATION[1], height)
             text = f"{panel.description} As an animation over the cycles."
-            images.append(_image(animations[panel.name], "image/gif", text, size))
+            images.append(_image(panel.animation[1], "image/gif", text, size))
     legend = [(label, *look(label)) for label in drawing.labels]
     return {
         "title": drawing.title,

@@ -19,15 +19,7 @@ from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
 from proposer_rl.report.curves import draw_curve, finish
-from proposer_rl.report.records import (
-    GAINS,
-    LONGEST_NAME,
-    PLACE,
-    Column,
-    Record,
-    number,
-    numbers,
-)
+from proposer_rl.report.records import GAINS, LONGEST_NAME, PLACE, Column, Record, number, numbers
 from proposer_rl.report.runs import Run, read_run, share_map
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, look
@@ -72,7 +64,6 @@ def gains(study: Study) -> Drawing | None:
         "meta-episode. Lines: maximum and mean over a cycle's copies, averaged over the seeds.",
         [
             Panel(
-                group.label,
                 f"Total {GAINS[name]} gains of the copies against Solver updates, {group.label}.",
                 partial(_draw_gains, group=group, name=name, every=every[name]),
             )
@@ -83,35 +74,26 @@ def gains(study: Study) -> Drawing | None:
 
 def heat_maps(study: Study) -> Drawing | None:
     """Where in the space of levels the proposals lie, along training."""
-    groups = [group for group in study.groups if _histograms(group) is not None]
-    if not groups:
+    found = [(group, maps) for group in study.groups if (maps := _histograms(group)) is not None]
+    if not found:
         return None
     return Drawing(
         "proposals",
-        f"Proposals over {' and '.join(list(groups[0].runs[0].task.axes)[:2])}, along training",
+        f"Proposals over {' and '.join(list(study.example.task.axes)[:2])}, along training",
         "Share of a cycle's proposals, averaged over the seeds. White is what even draws would "
         "give, orange is more, purple less: a map that stays "
         "white is a Proposer that has not learnt, or seeds that went different ways.",
         [
             Panel(
-                group.label,
                 f"Heat maps of the proposals of {group.label} at several stages of training.",
-                partial(_draw_strip, group=group),
+                partial(_draw_strip, group=group, updates=updates, shares=shares),
                 STRIP,
+                (group.label, _animate(group, updates, shares)),
             )
-            for group in groups
+            for group, (updates, shares) in found
         ],
         1,
     )
-
-
-def animations(study: Study) -> dict[str, bytes]:
-    """The heat map of the cycles as an animated GIF, by label, for groups with histograms."""
-    return {
-        group.label: _animate(group, *found)
-        for group in study.groups
-        if (found := _histograms(group)) is not None
-    }
 
 
 def diagnostics(study: Study) -> Drawing | None:
@@ -135,7 +117,6 @@ def diagnostics(study: Study) -> Drawing | None:
         "whatever they are proposed, and there is little to learn from.",
         [
             Panel(
-                text,
                 f"The curricula's {text} against Solver updates.",
                 partial(_draw_over_cycles, groups=groups, value=value, axis=text),
                 SMALL,
@@ -197,10 +178,7 @@ def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> N
     axes.legend(loc="best")
 
 
-def _draw_strip(figure: FigureBase, group: Group) -> None:
-    found = _histograms(group)
-    assert found is not None
-    updates, shares = found
+def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Column) -> None:
     stages = sorted({round(i) for i in np.linspace(0, len(shares) - 1, STAGES)})
     row = figure.subplots(1, len(stages), squeeze=False, sharey=True)[0]
     _draw_maps(figure, list(row), [shares[i] for i in stages], group.runs[0], shares.max())

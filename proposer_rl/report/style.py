@@ -58,16 +58,16 @@ class Panel(NamedTuple):
     """A part of a figure that can stand alone.
 
     Attributes:
-        name: of the part.
         description: what is to be seen, for those who cannot see it.
         draw: draws it.
         size: width and height in inches.
+        animation: a GIF of the same, with a name for its file; None without one.
     """
 
-    name: str
     description: str
     draw: Callable[[FigureBase], None]
     size: tuple[float, float] = PANEL
+    animation: tuple[str, bytes] | None = None
 
 
 class Drawing(NamedTuple):
