@@ -176,7 +176,7 @@ def _grow_harder(study: Study) -> Evidence:
         changes = [mean_interval(values) for values in np.diff(known, axis=1)[:, 0].T]
         along = [
             f"{name} {a:.3g} to {b:.3g} (change {write(change)})"
-            for name, a, b, change in zip(like.task.axes, early, late, changes, strict=True)
+            for name, a, b, change in zip(like.task.space, early, late, changes, strict=True)
         ]
         parts.append(f"{group.label}: mean {', '.join(along)}")
         harder = any(change.low > 0 for change in changes)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from proposer_rl.report.curves import finish
-from proposer_rl.report.records import Record, is_rate, picture, words
+from proposer_rl.report.records import LevelRecord, SampleRecord, is_rate, picture, words
 from proposer_rl.report.runs import Run, read_run
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import SETTINGS, SKY, VERMILLION, Drawing, Panel, axes_of
@@ -32,7 +32,7 @@ def along_training(study: Study) -> Drawing | None:
             (SIDE * STAGES, SIDE * BATCH + 0.5),
         )
         for label, samples in shown
-        if any("picture" in record for sample in samples for record in sample["levels"][:BATCH])
+        if any(level.picture for sample in samples for level in sample.levels[:BATCH])
     ]
     if not panels:
         return None
@@ -48,20 +48,20 @@ def along_training(study: Study) -> Drawing | None:
 def side_by_side(study: Study) -> Drawing | None:
     """The paper's Figure 5: the distributions measured on, early and late proposals."""
     task = study.example.task
-    rows = [(words(name), task.samples.get(name, ())) for name in task.distributions]
+    rows = [(words(name), task.samples.get(name, [])) for name in task.distributions]
     for group in study.groups:
         samples = group.runs[0].samples if group.proposes else ()
         for stage, sample in zip(("first", "last"), (*samples[:1], *samples[-1:]), strict=False):
-            title = f"{group.label}, {stage} (update {sample['updates']})"
-            rows.append((title, sample["levels"]))
+            title = f"{group.label}, {stage} (update {sample.updates})"
+            rows.append((title, sample.levels))
     panels = [
         Panel(
             f"Sample {task.levels}: {title}.",
-            partial(_draw_row, records=records, title=title),
+            partial(_draw_row, levels=levels, title=title),
             (SIDE * SAMPLES, SIDE + 0.35),
         )
-        for title, records in rows
-        if any("picture" in record for record in records[:SAMPLES])
+        for title, levels in rows
+        if any(level.picture for level in levels[:SAMPLES])
     ]
     if not panels:
         return None
@@ -112,28 +112,28 @@ def _draw_measurements(axes: Axes, runs: Sequence[Run]) -> None:
     axes.legend()
 
 
-def _draw_stages(figure: FigureBase, samples: Sequence[Record], title: str) -> None:
+def _draw_stages(figure: FigureBase, samples: Sequence[SampleRecord], title: str) -> None:
     """Stages from left to right, the levels of a batch from top to bottom."""
     last = len(samples) - 1
     stages = [samples[i] for i in sorted({round(i * last / (STAGES - 1)) for i in range(STAGES)})]
     grid = figure.subplots(BATCH, STAGES, squeeze=False)
     for column, sample in zip(grid.T, stages, strict=False):
-        column[0].set_title(f"update {sample['updates']}", fontsize=8)
-        _show(column, sample["levels"])
+        column[0].set_title(f"update {sample.updates}", fontsize=8)
+        _show(column, sample.levels)
     _show(list(grid.T[len(stages) :].flat), ())
     figure.suptitle(title, fontsize=9)
 
 
-def _draw_row(figure: FigureBase, records: Sequence[Record], title: str) -> None:
-    _show(figure.subplots(1, SAMPLES, squeeze=False)[0], records)
+def _draw_row(figure: FigureBase, levels: Sequence[LevelRecord], title: str) -> None:
+    _show(figure.subplots(1, SAMPLES, squeeze=False)[0], levels)
     figure.suptitle(title, fontsize=9, x=0.01, ha="left")
 
 
-def _show(places: Sequence[Axes], records: Sequence[Record]) -> None:
+def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
     """Draw pictures of levels; a place stays empty where there is none that can be shown."""
     for axes in places:
         axes.set_axis_off()
-    for axes, record in zip(places, records, strict=False):
-        image = picture(record)
+    for axes, level in zip(places, levels, strict=False):
+        image = picture(level.picture)
         if image is not None:
             axes.imshow(image)

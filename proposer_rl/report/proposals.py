@@ -19,7 +19,7 @@ from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
 from proposer_rl.report.curves import draw_curve, finish
-from proposer_rl.report.records import GAINS, LONGEST_NAME, PLACE, Column, Record, number, numbers
+from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
 from proposer_rl.report.runs import Run, read_run, share_map
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, look
@@ -79,7 +79,7 @@ def heat_maps(study: Study) -> Drawing | None:
         return None
     return Drawing(
         "proposals",
-        f"Proposals over {' and '.join(list(study.example.task.axes)[:2])}, along training",
+        f"Proposals over {' and '.join(list(found[0][0].runs[0].task.space)[:2])}, along training",
         "Share of a cycle's proposals, averaged over the seeds. White is what even draws would "
         "give, orange is more, purple less: a map that stays "
         "white is a Proposer that has not learnt, or seeds that went different ways.",
@@ -136,7 +136,7 @@ def axis_means(run: Run, cycle: Record) -> list[float] | None:
     sides = range(shares.ndim)
     return [
         float(shares.sum(tuple(other for other in sides if other != side)) @ values)
-        for side, values in zip(sides, run.task.axes.values(), strict=True)
+        for side, values in zip(sides, run.task.space.values(), strict=True)
     ]
 
 
@@ -216,7 +216,7 @@ def _draw_maps(
     """Maps side by side with one bar of colours: white is even, orange more, purple less."""
     even = 1 / shares[0].size
     largest = max(largest, 2 * even)
-    *above, (across, columns) = list(run.task.axes.items())[:2]
+    *above, (across, columns) = list(run.task.space.items())[:2]
     for axes, share in zip(row, shares, strict=True):
         mesh = axes.pcolormesh(share, cmap="PuOr_r", norm=TwoSlopeNorm(even, 0, largest))
         axes.set_xticks(*_ticks(columns))
@@ -234,7 +234,7 @@ def _draw_maps(
     return mesh
 
 
-def _ticks(values: Column) -> tuple[Column, list[str]]:
+def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:
     """Places and texts of an axis' values, or of some of them where they are many."""
     step = -(-len(values) // MOST_TICKS)
     return np.arange(0.5, len(values), step), [f"{value:g}" for value in values[::step]]
@@ -301,4 +301,4 @@ def _scalars(groups: Sequence[Group]) -> set[str]:
     """Names of the numbers that were recorded and are not drawn elsewhere."""
     cycles = [cycle for group in groups for run in group.logs for cycle in run.cycles]
     found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
-    return {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_NAME}
+    return {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}

@@ -6,19 +6,17 @@ import base64
 import io
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
-LONGEST_NAME, LONGEST_TEXT = 80, 400  # characters
-MOST_AXES, LONGEST_AXIS = 8, 256
-TEXT_LINES, TEXT_COLUMNS = 64, 200  # of a level drawn in characters
 PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
+LONGEST_TEXT = 400
 
 # Total gains of copies, by their name in the records of cycles; the first that is there is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
@@ -27,83 +25,75 @@ PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histog
 
 Column = NDArray[np.float64]
 Record = Mapping[str, Any]
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class TaskFacts:
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("must be printable, on one line")
+    return text
+
+
+Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_one_line)]
+Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_one_line)]
+
+
+class LevelRecord(BaseModel):
+    """A level as its task recorded it: a PNG in base64, and lines of text."""
+
+    picture: Annotated[str, Field(max_length=PICTURE_BYTES * 4 // 3 + 4)] | None = None
+    text: Annotated[list[Text], Field(max_length=64)] = []
+
+
+class SampleRecord(BaseModel):
+    """Levels that a seed trained on."""
+
+    updates: int
+    seed: int
+    levels: list[LevelRecord]
+
+
+class TaskFacts(BaseModel):
     """What a run says of its task, for a reader.
 
     Attributes:
         title: what it is, as ``6×6 mazes``.
         levels: what a level is called, plural.
         distributions: names of what was measured on.
-        axes: of the space of levels that is chosen from: the values along each, by its name.
+        space: of the levels that are chosen from: the values along each axis, by its name.
         about: further facts, by their label.
         measured: all that must be equal for two runs to be comparable.
-        samples: records of levels of each distribution.
-        key, text_key: what is to be seen in pictures, and in levels drawn in characters.
+        samples: levels of each distribution.
+        key: what is to be seen in pictures.
+        text_key: what is to be seen in levels drawn in characters.
     """
 
-    title: str
-    levels: str
-    distributions: tuple[str, ...]
-    axes: Mapping[str, Column]
-    about: Mapping[str, str]
+    title: Name
+    levels: Name = "levels"
+    distributions: Annotated[list[Name], Field(min_length=1)]
+    space: Annotated[
+        dict[Name, Annotated[list[FiniteFloat], Field(min_length=1, max_length=256)]],
+        Field(max_length=8),
+    ] = {}
+    about: dict[Name, Text] = {}
     measured: Any
-    samples: Mapping[str, Sequence[Record]]
-    key: str
-    text_key: str
+    samples: dict[Name, list[LevelRecord]] = {}
+    key: Text = ""
+    text_key: Text = ""
 
 
-def read_task(value: Any) -> TaskFacts:
-    """The facts of a task from ``run.json``.
-
-    Raises:
-        KeyError: if title, distributions or measured is missing.
-        ValueError: if an entry is not what it should be.
-    """
-    task = _mapping(value, "task")
-    space, about, samples = (
-        _mapping(task.get(key) or {}, f"task.{key}") for key in ("space", "about", "samples")
-    )
-    axes = {plain(name, "run.json: task.space"): numbers(axis) for name, axis in space.items()}
-    kept = {name: axis for name, axis in axes.items() if axis is not None}
-    if len(kept) < len(axes) or not all(len(axis) <= LONGEST_AXIS for axis in kept.values()):
-        raise ValueError(f"run.json: an axis of task.space is no list of {LONGEST_AXIS} values")
-    if len(axes) > MOST_AXES:
-        raise ValueError(f"run.json: task.space has more than {MOST_AXES} axes")
-    names = task["distributions"]
-    if not isinstance(names, list) or not names:
-        raise ValueError("run.json: task.distributions is no list of names")
-
-    def text(key: str, value: Any, longest: int = LONGEST_NAME) -> str:
-        return plain(value, f"run.json: task.{key}", longest)
-
-    return TaskFacts(
-        title=text("title", task["title"]),
-        levels=text("levels", task.get("levels", "levels")),
-        distributions=tuple(text("distributions", name) for name in names),
-        axes=kept,
-        about={
-            text("about", key): text(f"about.{key}", line, LONGEST_TEXT)
-            for key, line in about.items()
-        },
-        measured=task["measured"],
-        samples={name: checked_levels(levels, "run.json") for name, levels in samples.items()},
-        key=text("key", task.get("key") or " ", LONGEST_TEXT).strip(),
-        text_key=text("text_key", task.get("text_key") or " ", LONGEST_TEXT).strip(),
-    )
-
-
-def plain(value: Any, where: str, longest: int = LONGEST_NAME) -> str:
-    """A text of one line.
+def checked(kind: type[T], value: Any, where: str) -> T:
+    """A value from a file as it should be.
 
     Raises:
-        ValueError: if it is none, or too long; naming ``where``.
+        ValueError: with the place of the first thing that is not so.
     """
-    if isinstance(value, str) and 0 < len(value) <= longest and value.isprintable():
-        return value
-    raise ValueError(f"{where} is no text of one line and at most {longest} characters")
+    try:
+        return TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{where}: {place}{': ' * bool(place)}{first['msg']}") from error
 
 
 def printable(text: str) -> str:
@@ -111,29 +101,10 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
 
 
-def checked_levels(records: Any, where: str) -> list[Record]:
-    """Records of levels: a picture and lines of text, each optional and bounded.
-
-    Raises:
-        ValueError: if they are not so; naming ``where``.
-    """
-    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise ValueError(f"{where}: levels are no list of objects")
-    for record in records:
-        encoded, lines = record.get("picture", ""), record.get("text", [])
-        if not isinstance(encoded, str) or len(encoded) > PICTURE_BYTES * 4 // 3 + 4:
-            raise ValueError(f"{where}: a picture is no PNG of at most {PICTURE_BYTES} bytes")
-        if not isinstance(lines, list) or len(lines) > TEXT_LINES:
-            raise ValueError(f"{where}: a level's text is no list of {TEXT_LINES} lines")
-        for line in lines:
-            plain(line, f"{where}: a line of a level", TEXT_COLUMNS)
-    return records
-
-
-def picture(record: Record) -> NDArray[np.uint8] | None:
-    """A level's picture, uint8 [H, W, 3]; None without one that can be shown."""
+def picture(encoded: Any) -> NDArray[np.uint8] | None:
+    """A picture that was recorded, uint8 [H, W, 3]; None where it is none that can be shown."""
     try:
-        content = base64.b64decode(record["picture"], validate=True)
+        content = base64.b64decode(encoded, validate=True)
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
@@ -180,9 +151,3 @@ def words(name: str) -> str:
 def level_text(name: str, value: float) -> str:
     """A value of a column as a reader wants it: 80% of a success, 0.8 of anything else."""
     return f"{value:.0%}" if is_rate(name) else f"{value:g}"
-
-
-def _mapping(value: Any, key: str) -> Mapping[str, Any]:
-    if isinstance(value, dict):
-        return value
-    raise ValueError(f"run.json: {key} is no object")

@@ -16,13 +16,14 @@ import numpy as np
 from proposer_rl.report.records import (
     LARGEST,
     Column,
+    Name,
     Record,
+    SampleRecord,
     TaskFacts,
-    checked_levels,
+    checked,
     is_rate,
     number,
-    plain,
-    read_task,
+    printable,
 )
 from proposer_rl.report.statistics import Waiting
 from proposer_rl.runs.folder import read_csv, read_jsonl
@@ -70,7 +71,7 @@ class Run:
     metrics: Mapping[str, Column]
     training: Mapping[str, Column]
     cycles: Sequence[Record]
-    samples: Sequence[Record]
+    samples: Sequence[SampleRecord]
 
     @property
     def method(self) -> str:
@@ -93,7 +94,7 @@ class Run:
     @property
     def headline(self) -> str:
         """The measurement that runs are summed up by."""
-        return str(self.config["schedule"]["headline"])
+        return _headline(self.config)
 
     @property
     def measurements(self) -> list[str]:
@@ -149,7 +150,7 @@ class Run:
 
     def shares(self, cycle: Record) -> Column | None:
         """Shares of a cycle's proposals, a dimension for each axis; None if not recorded."""
-        sides = tuple(len(values) for values in self.task.axes.values())
+        sides = tuple(len(values) for values in self.task.space.values())
         try:
             counts = np.asarray(cycle.get("histogram"), float)
         except (ValueError, TypeError, OverflowError):
@@ -212,14 +213,14 @@ def read_run(folder: Path) -> list[Run]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
-        raise UnreadableRun(f"{folder}: {' '.join(reason.split())[:300]}") from error
+        raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
 
 
 def _read_run(folder: Path) -> list[Run]:
     config = _read_config(folder)
     summary = _read_json(folder, "summary.json") or {}
     facts = {**(_read_json(folder, "run.json") or {}), **summary}
-    task = read_task(facts["task"])
+    task = checked(TaskFacts, facts["task"], "run.json: task")
     rows = read_csv(_checked(folder, "metrics.csv"))
     seeds = sorted({int(row["seed"]) for row in rows})
     if not seeds:
@@ -230,14 +231,8 @@ def _read_run(folder: Path) -> list[Run]:
     cycles = _optional(folder, "cycles.jsonl", read_jsonl)
     if any(math.isnan(number(row["updates"])) for row in cycles):
         raise ValueError("cycles.jsonl: updates is no number")
-    samples = [
-        {
-            "updates": int(row["updates"]),
-            "seed": int(row["seed"]),
-            "levels": checked_levels(row["levels"], "curriculum.jsonl"),
-        }
-        for row in _optional(folder, "curriculum.jsonl", read_jsonl)
-    ]
+    recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
+    samples = checked(list[SampleRecord], recorded, "curriculum.jsonl")
     runs = []
     for seed in seeds:
         metrics = _columns(rows, seed)
@@ -254,7 +249,7 @@ def _read_run(folder: Path) -> list[Run]:
                 metrics=metrics,
                 training=_columns(training, seed),
                 cycles=cycles,
-                samples=[row for row in samples if row["seed"] == seed],
+                samples=[sample for sample in samples if sample.seed == seed],
             )
         )
     return runs
@@ -287,8 +282,8 @@ def _read_config(folder: Path) -> dict[str, Any]:
     if config is None:
         raise ValueError("there is no config.json")
     for name in ("method", "scale", "ablation"):
-        plain(config.get(name, "none"), f"config.json: {name}")
-    plain(_headline(config), "config.json: schedule.headline")
+        checked(Name, config.get(name, "none"), f"config.json: {name}")
+    checked(Name, config["schedule"]["headline"], "config.json: schedule.headline")
     if math.isnan(number(config["schedule"]["threshold"])):
         raise ValueError("config.json: schedule.threshold is no number")
     return config
@@ -313,7 +308,8 @@ def _columns(rows: Sequence[Mapping[str, float]], seed: int) -> dict[str, Column
         if is_rate(name):  # a sum of probabilities is rounded, to 1.0000001 too
             inside = values.clip(0, 1)
             values = np.where(np.abs(values - inside) < ROUNDING, inside, values)
-        columns[plain(name, "a column's name")] = np.where(np.abs(values) < LARGEST, values, np.nan)
+        checked(Name, name, "the name of a column")
+        columns[name] = np.where(np.abs(values) < LARGEST, values, np.nan)
     columns.pop("seed", None)
     return columns
 

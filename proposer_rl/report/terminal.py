@@ -138,7 +138,7 @@ def _cycles(run: Run) -> list[RenderableType]:
 
 
 def _map(run: Run, shares: Column) -> list[RenderableType]:
-    *above, (across, columns) = list(run.task.axes.items())[:2]
+    *above, (across, columns) = list(run.task.space.items())[:2]
     if max(shares.shape) > WIDEST_MAP:
         return []
     rows = [f"{value:g}" for _, values in above for value in values] or [""]
@@ -155,11 +155,11 @@ def _map(run: Run, shares: Column) -> list[RenderableType]:
 def _levels(run: Run) -> RenderableType:
     """The first levels of the last recorded batch that can be drawn in characters."""
     sample = run.samples[-1]
-    drawn = [Text("\n".join(r["text"])) for r in sample["levels"][:LEVELS] if r.get("text")]
+    drawn = [Text("\n".join(level.text)) for level in sample.levels[:LEVELS] if level.text]
     if not drawn:
         return Text("")
     key = f" ({run.task.text_key})" if run.task.text_key else ""
-    title = f"{run.task.levels} at update {sample['updates']}{key}"
+    title = f"{run.task.levels} at update {sample.updates}{key}"
     return Group(Text(title), Columns(drawn, padding=(0, 3)))
 
 
