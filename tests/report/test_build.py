@@ -7,6 +7,7 @@ import html
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image, ImageSequence
@@ -16,7 +17,8 @@ from proposer_rl.cli.watch import main as watch
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.curves import cost_curves
-from tests.report.folders import TASK, cycle, write_rockets, write_run
+from proposer_rl.report.levels import along_training, draw_run, side_by_side
+from tests.report.folders import LEVEL, TASK, cycle, write_rockets, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
 
@@ -169,11 +171,15 @@ def refused(capsys, *arguments: str) -> str:
     return line
 
 
+DEEP: list[Any] = []
+for _ in range(300):
+    DEEP = [DEEP]
 ANYTHING = [
     {
         "updates": 0,
         "scores": [[1, 2], [3]],
         "note": "x",
+        "deep": DEEP,
         "rate": 0.25,
         "buffer": [3, 4],
         "ok": True,
@@ -222,3 +228,18 @@ def test_a_threshold_of_a_success_is_a_share(runs: Path, tmp_path: Path, capsys)
     assert "must be above 0 and at most 1" in refused(
         capsys, str(runs), "-o", out, "--threshold=80"
     )
+
+
+def test_pictures_that_cannot_be_shown_leave_their_place_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [along_training, side_by_side])
+    broken = {"picture": LEVEL["picture"][:-40]}
+    task = {**TASK, "samples": {"id": [broken, {}], "ood": []}}
+    folder = write_run(tmp_path / "runs" / "a", task=task)
+    lines = (folder / "curriculum.jsonl").read_text().replace(LEVEL["picture"], "no picture")
+    (folder / "curriculum.jsonl").write_text(lines)
+    page = write_report([folder], tmp_path / "report", progress=False)
+    assert (page.parent / "figures" / "samples.png").is_file()
+    with Image.open(draw_run(folder, "$\\bad{")) as image:
+        assert image.width > 500

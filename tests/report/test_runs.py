@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -12,9 +13,10 @@ import numpy as np
 import pytest
 
 from proposer_rl.report import runs
-from proposer_rl.report.runs import UnreadableRun, find_runs, read_run
+from proposer_rl.report.proposals import axis_means
+from proposer_rl.report.runs import UnreadableRun, find_runs, read_run, share_map
 from proposer_rl.report.statistics import Waiting
-from tests.report.folders import cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 
 def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -191,3 +193,26 @@ def test_the_reader_is_independent_of_training() -> None:
         "assert rooms == {'cli', 'report', 'runs'}, rooms\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_proposals_are_counted_along_every_axis(tmp_path: Path) -> None:
+    """The map is the sum over the third axis and the fourth; means are over all."""
+    space = {"a": [0, 1], "b": [1, 2, 4], "c": [5, 7], "d": [9]}
+    counts = np.random.default_rng(0).integers(0, 9, (2, 3, 2, 1))
+    cycles = [{"updates": 0, "histogram": counts.tolist()}]
+    (run,) = read_run(write_run(tmp_path / "a", cycles=cycles, task={**TASK, "space": space}))
+    shares = run.shares(run.cycles[0])
+    assert shares is not None
+    assert share_map(shares) == pytest.approx(counts[..., 0].sum(2) / counts.sum())
+    drawn = [
+        values
+        for place, values in zip(
+            np.ndindex(2, 3, 2, 1), itertools.product(*space.values()), strict=True
+        )
+        for _ in range(counts[place])
+    ]
+    assert axis_means(run, run.cycles[0]) == pytest.approx(np.mean(drawn, 0))
+    assert run.shares({"histogram": counts[:1].tolist()}) is None
+    assert run.shares({"histogram": (0 * counts).tolist()}) is None
+    assert run.shares({"histogram": (-counts).tolist()}) is None
+    assert share_map(np.array([0.25, 0.75])).tolist() == [[0.25, 0.75]]
