@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,20 +55,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--threshold",
-        type=_share,
-        help="of sample efficiency, above 0 and at most 1 (default: the runs' own, 0.8)",
+        type=_finite,
+        help="of sample efficiency, such as 0.8 of a success (default: the runs' own)",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser
 
 
-def _share(text: str) -> float:
+def _finite(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = 0.0
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"must be above 0 and at most 1, got {text!r}")
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
     return value
 
 
