@@ -47,6 +47,7 @@ LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 SLACK = 2  # of a named level: steps allowed for each move of its shortest path
+TEXT_KEY = "S start, G goal, • the Solver's episode"
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
@@ -145,6 +146,7 @@ class MazeTask:
                 f"{self._evaluation.levels} fixed levels each",
             },
             "key": KEY,
+            "text_key": TEXT_KEY,
             "measured": {
                 "maze": measured,
                 "distributions": self._measured,
@@ -237,7 +239,7 @@ class MazeTask:
                     lines[row][column] = "•"
             yield {
                 "picture": png(draw_level(levels[i], path).numpy()),
-                "text": ["".join(line) for line in lines],
+                "text": [" ".join(line) for line in lines],
                 **({} if path is None else {"path": path}),
             }
 

@@ -38,6 +38,8 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
 class OutputError(ValueError):
     """The output folder cannot be taken; the message is one line."""
 
+    exit_code = 2
+
 
 def write_report(
     folders: Sequence[Path], output: Path, threshold: float | None = None, progress: bool = True

@@ -43,6 +43,8 @@ _LIFETIME = re.compile(r"lifetime_(\d{1,9})")
 class UnreadableRun(ValueError):
     """A folder looks like a run's but cannot be read; the message is one line."""
 
+    exit_code = 2
+
 
 @dataclass(frozen=True)
 class Run:
