@@ -133,10 +133,24 @@ class Mixture(Proposals):
 
     def draw(self, action: Tensor, problems: int, generators: Sequence[torch.Generator]) -> Tensor:
         """Systematic draws from the mixture of actions [K, D]."""
-        cumulative = self.shares(action).double().cumsum(-1)
-        offset = torch.stack([torch.rand(1, generator=g) for g in generators])
-        order = torch.stack([torch.rand(problems, generator=g).argsort() for g in generators])
-        steps = torch.arange(problems, dtype=torch.double)
-        marks = (steps + offset) / problems * cumulative[:, -1:]  # [K, P], one in each P-th
-        choices = torch.searchsorted(cumulative, marks, right=True)
-        return choices.clamp_(max=self.choices - 1).gather(1, order)
+        return systematic_draw(self.shares(action), problems, generators)
+
+
+def systematic_draw(shares: Tensor, count: int, generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw from mixtures so that nothing occurs more or less often than its share says.
+
+    Args:
+        shares: of N choices, float [K, N] on the CPU.
+        count: number P of draws.
+        generators: of the CPU; copy k draws from the k-th.
+
+    Returns:
+        int64 [K, P]: each choice as often as its share of P, rounded up or down, in random order.
+    """
+    cumulative = shares.double().cumsum(-1)
+    offset = torch.stack([torch.rand(1, generator=g) for g in generators])
+    order = torch.stack([torch.rand(count, generator=g).argsort() for g in generators])
+    steps = torch.arange(count, dtype=torch.double)
+    marks = (steps + offset) / count * cumulative[:, -1:]  # [K, P], one in each P-th
+    choices = torch.searchsorted(cumulative, marks, right=True)
+    return choices.clamp_(max=shares.shape[-1] - 1).gather(1, order)
