@@ -11,19 +11,22 @@ from torch import Tensor
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.meta.actions import systematic_draw
-from proposer_rl.meta.first_order import (
-    Direction,
-    alignment,
-    bin_scores,
-    target_direction,
-    target_performance,
-)
+from proposer_rl.meta.first_order import bin_scores, exact_alignment, exact_direction
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask, Task
 
 
 class ExactTask(Task, DifferentiableTask, Protocol):
     """A task whose performance has gradients."""
+
+
+def require_gradients(task: object) -> None:
+    """Raise a TypeError if the task's performance has none."""
+    if not isinstance(task, DifferentiableTask):
+        raise TypeError(
+            f"first-order gain needs gradients: {type(task).__name__} must define "
+            "differentiable_performance(agent, levels)"
+        )
 
 
 class FirstOrderCurriculum(Curriculum):
@@ -62,11 +65,7 @@ class FirstOrderCurriculum(Curriculum):
         smoothing: float = 0.9,
         measure: str = "log_success",
     ) -> None:
-        if not isinstance(task, DifferentiableTask):
-            raise TypeError(
-                f"first-order gain needs gradients: {type(task).__name__} must define "
-                "differentiable_performance(agent, levels)"
-            )
+        require_gradients(task)
         if min(every, target_levels, candidates) < 1:
             raise ValueError(
                 "every, target_levels and candidates must be at least 1, got "
@@ -136,16 +135,14 @@ class FirstOrderCurriculum(Curriculum):
         self._proposed = state["proposed"].clone()
 
     def _score(self, learner: PPO, streams: Sequence[Streams]) -> None:
-        target, direction = self._direction(learner, streams)
+        target = torch.stack(
+            [self._task.target.sample(self._target_levels, s.generator("target")) for s in streams]
+        )
+        reached, direction = exact_direction(self._task, learner, target, self._measure)
         size, count = self._task.space.size, self._candidates
         bins = torch.arange(size).repeat_interleave(count).expand(len(streams), -1)
         levels = self._task.space.generate(bins, [s.generator("candidates") for s in streams])
-        found = alignment(
-            learner.agent,
-            direction,
-            learner.settings.learning_rate,
-            lambda: self._task.differentiable_performance(learner.agent, levels)["return"],
-        )
+        found = exact_alignment(self._task, learner, direction, levels)
         score, error = (x.cpu() for x in bin_scores(found.unflatten(-1, (size, count))))
         if self._scores:
             old = self._smoothing
@@ -153,14 +150,4 @@ class FirstOrderCurriculum(Curriculum):
             variance = old**2 * self._scores["variance"] + (1 - old) ** 2 * error.square()
         else:
             variance = error.square()
-        self._scores = {"score": score, "variance": variance, "target": target.cpu()}
-
-    def _direction(self, learner: PPO, streams: Sequence[Streams]) -> tuple[Tensor, Direction]:
-        """The target's performance R, float [K], and the direction in which it rises."""
-        levels = torch.stack(
-            [self._task.target.sample(self._target_levels, s.generator("target")) for s in streams]
-        )
-        with torch.enable_grad():
-            performance = self._task.differentiable_performance(learner.agent, levels)
-            target = target_performance(performance, self._measure)
-            return target.detach(), target_direction(learner, target)
+        self._scores = {"score": score, "variance": variance, "target": reached.cpu()}

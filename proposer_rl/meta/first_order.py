@@ -42,6 +42,7 @@ from torchrl.objectives.value import GAE
 from proposer_rl.learning.divergence import DivergedError
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.models import ActorCritic
+from proposer_rl.task import DifferentiableTask, Levels
 
 LEAST_SUCCESS = 1e-3
 """Below it, success hardly counts for the logarithm."""
@@ -169,6 +170,33 @@ def alignment(
     with moved(agent, direction, -step):
         behind = worth()
     return (ahead - behind) / (2 * step)
+
+
+def exact_direction(
+    task: DifferentiableTask, learner: PPO, levels: Levels, measure: str
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Performance R of K Solvers on levels [K, E] of the target, float [K], and its direction.
+
+    Raises:
+        DivergedError: as :func:`target_direction`.
+        ValueError: as :func:`target_performance`.
+    """
+    with torch.enable_grad():
+        performance = task.differentiable_performance(learner.agent, levels)
+        reached = target_performance(performance, measure)
+        return reached.detach(), target_direction(learner, reached)
+
+
+def exact_alignment(
+    task: DifferentiableTask, learner: PPO, direction: Direction, levels: Levels
+) -> Tensor:
+    """Alignment of any levels [K, E], by a difference as long as a step of Adam: float [K, E]."""
+    return alignment(
+        learner.agent,
+        direction,
+        learner.settings.learning_rate,
+        lambda: task.differentiable_performance(learner.agent, levels)["return"],
+    )
 
 
 def advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
