@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from proposer_rl.curricula.first_order import FirstOrderCurriculum
-from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes import Level, SpecificationSpace
+from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
+from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.mazes import Level, SpecificationSpace, shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution
 from proposer_rl.streams import Streams
 from tests.meta import test_first_order as exact
@@ -109,7 +109,7 @@ class Mazes(Skills):
 
 
 def mazes(**options: Any) -> FirstOrderCurriculum:
-    return FirstOrderCurriculum(Mazes(), target_levels=8, candidates=3, **options)
+    return FirstOrderCurriculum(Mazes(), **{"target_levels": 8, "candidates": 3, **options})
 
 
 def learner(copies: int = 2) -> PPO:
@@ -213,11 +213,94 @@ def test_a_task_without_gradients_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"every": 0}, "every, target_levels and candidates must be at least 1, got 0, 8, 3"),
-        ({"temperature": 0.0}, "temperature must be above 0 .* got 0.0, 0.9"),
-        ({"smoothing": 1.0}, "smoothing from 0 to below 1, got 0.1, 1.0"),
+        ({"every": 0}, "every must be at least 1, .* got 0, 0.1, 0.9"),
+        ({"temperature": 0.0}, "temperature above 0 .* got 1, 0.0, 0.9"),
+        ({"smoothing": 1.0}, "smoothing from 0 to below 1; got 1, 0.1, 1.0"),
+        ({"candidates": 0}, "target_levels and candidates must be at least 1, got 8, 0"),
     ],
 )
 def test_numbers_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         mazes(**options)
+
+
+def sampled(**options: Any) -> SampledFirstOrderCurriculum:
+    return SampledFirstOrderCurriculum(Mazes(), **options)
+
+
+def train_on(curriculum: Any, solvers: PPO, update: int, *seeds: int) -> Any:
+    own = streams(update, *seeds)
+    proposal = curriculum.propose(solvers, update, own)
+    solvers.env.set_levels(proposal.levels)
+    trained = solvers.update([s.generator("actions") for s in own])
+    curriculum.observe(solvers, proposal.levels, trained)
+    return proposal
+
+
+def test_sampled_scores_are_inner_products_with_the_sampled_direction() -> None:
+    solvers, curriculum = learner(), sampled(smoothing=0.0)
+    own = streams(0, 0, 1)
+    levels = curriculum.propose(solvers, 0, own).levels
+    direction = curriculum.state_dict()["direction"]
+    solvers.env.set_levels(levels)
+    rollout = solvers.collect([s.generator("actions") for s in own])
+    curriculum.observe(solvers, levels, Update(rollout, TensorDict()))
+    found = curriculum.state_dict()["scores"]["score"]
+    advantage = exact.advantages(solvers, rollout)
+    fraction = levels.walls.double().mean((-2, -1))
+    length = shortest_path_length(levels)
+    for n, (wanted, moves) in enumerate(Mazes().space.specifications):
+        own_bin = (fraction - wanted).abs() < 0.05
+        own_bin &= length == moves
+        for k in range(2):
+            if not own_bin[k].any():
+                assert found[k, n] == 0
+                continue
+            worth = exact.surrogate(solvers.agent, rollout, advantage)[k][own_bin[k]].mean()
+            expected = exact.inner(direction, exact.gradient(solvers.agent, worth))[k]
+            torch.testing.assert_close(
+                found[k, n].double(), expected.detach(), rtol=1e-3, atol=1e-6
+            )
+
+
+def test_the_sampled_direction_is_the_policy_gradient_of_the_targets_episodes() -> None:
+    solvers, curriculum = learner(), sampled()
+    own = streams(0, 0, 1)
+    proposal = curriculum.propose(solvers, 0, own)
+    target = torch.stack([Mazes().target.sample(P, s.generator("target")) for s in own])
+    solvers.env.set_levels(target)
+    rollout = solvers.collect([s.generator("target_actions") for s in own])
+    value = exact.surrogate(solvers.agent, rollout, exact.advantages(solvers, rollout)).mean(1)
+    expected = exact.target_direction(solvers, value)
+    found = curriculum.state_dict()["direction"]
+    for name, entry in expected.items():
+        torch.testing.assert_close(found[name], entry)
+    assert (proposal.frames, proposal.evaluations) == (P * solvers.settings.horizon, 0)
+
+
+def test_a_resumed_sampled_curriculum_goes_on_bit_by_bit() -> None:
+    straight, solvers = sampled(every=2), learner()
+    interrupted, others = sampled(every=2), learner()
+    resumed, again = sampled(every=2), learner()
+    expected = [train_on(straight, solvers, update, 0, 1) for update in range(5)]
+    for update in range(3):
+        train_on(interrupted, others, update, 0, 1)
+    resumed.load_state_dict(interrupted.state_dict())
+    again.restore(others.snapshot())
+    for update in range(3, 5):
+        assert (train_on(resumed, again, update, 0, 1).levels == expected[update].levels).all()
+    told = [c.improve(solvers, 5, streams(5, 0, 1)).metrics for c in (straight, resumed)]
+    assert told[0] == told[1]
+    assert "score_error" not in told[0]
+
+
+def test_exploration_is_spread_over_all_bins() -> None:
+    solvers, curriculum = learner(), sampled(exploration=0.3, temperature=1e-3)
+    curriculum.propose(solvers, 0, streams(0, 0, 1))
+    state = curriculum.state_dict()
+    state["scores"]["score"] = torch.eye(BINS)[:2]
+    curriculum.load_state_dict(state)
+    expected = torch.full((2, BINS), 0.3 / BINS) + 0.7 * torch.eye(BINS)[:2]
+    torch.testing.assert_close(curriculum.shares(), expected)
+    with pytest.raises(ValueError, match="exploration must be from 0 to 1, got 2"):
+        sampled(exploration=2)
