@@ -62,8 +62,9 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
             first update on, or ``"return"``.
 
     Raises:
-        ValueError: for another measure, or if no level of the target has any success: nothing is
-            learnt there that could be a direction.
+        DivergedError: if a Solver's success is exactly 0 on every level: then nothing points
+            towards more of it.
+        ValueError: for another measure.
     """
     if measure == "return":
         return performance["return"].mean(1)
@@ -73,7 +74,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     hopeless = (success <= 0).all(1)
     if bool(hopeless.any()):
         which = ", ".join(map(str, torch.nonzero(hopeless).flatten().tolist()))
-        raise ValueError(
+        raise DivergedError(
             f"copy {which}: the probability of success is exactly 0 on each of {success.shape[1]} "
             "levels of the target, so that nothing points towards it; measure=return may"
         )
@@ -178,8 +179,7 @@ def exact_direction(
     """Performance R of K Solvers on levels [K, E] of the target, float [K], and its direction.
 
     Raises:
-        DivergedError: as :func:`target_direction`.
-        ValueError: as :func:`target_performance`.
+        DivergedError: as :func:`target_performance` and :func:`target_direction`.
     """
     with torch.enable_grad():
         performance = task.differentiable_performance(learner.agent, levels)

@@ -288,7 +288,8 @@ def test_a_direction_that_is_none_is_an_error(factor: float, message: str) -> No
 
 def test_a_target_without_any_success_is_told_in_one_line() -> None:
     success = torch.tensor([[0.0, 1e-30], [0.0, 0.0]])
-    with pytest.raises(ValueError, match="copy 1: the probability of success is exactly 0") as info:
+    told = "copy 1: the probability of success is exactly 0 on each of 2 levels"
+    with pytest.raises(DivergedError, match=told) as info:
         target_performance(TensorDict({"success": success}, [2, 2]), "log_success")
     assert "\n" not in str(info.value)
 
