@@ -146,7 +146,10 @@ class DifferentiableTask(Protocol):
     """A task whose performance has gradients: first-order gain without sampling."""
 
     def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """As :meth:`Task.performance`, with gradients towards the agent's parameters."""
+        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
+
+        Where gradients are enabled, with gradients towards the agent's parameters.
+        """
 
 
 class Score(NamedTuple):

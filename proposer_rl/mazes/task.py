@@ -186,6 +186,11 @@ class MazeTask:
         """Return and success of K Solvers on levels [E], [K, E], as the settings ask for it."""
         return self._evaluator(*_with_logits(agent, levels), generator)
 
+    def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
+        """Exact return and success of K Solvers, each on its own levels [K, E], with gradients."""
+        logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
+        return self._sampled.differentiable(levels, logits)
+
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
         copies, logits = _with_logits(agent, levels)
