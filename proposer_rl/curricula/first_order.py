@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
-from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.learning import PPO, Update
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.meta.first_order import (
     advantages,

@@ -12,9 +12,10 @@ from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.first_order import ExactTask, require_gradients
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO
 from proposer_rl.meta.first_order import exact_alignment, exact_direction
 from proposer_rl.models import ActorCritic, draw
+from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
 
 

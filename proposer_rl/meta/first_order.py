@@ -39,8 +39,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
+from proposer_rl.learning import PPO
 from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import PPO
 from proposer_rl.models import ActorCritic
 from proposer_rl.task import DifferentiableTask, Levels
 
