@@ -1,7 +1,11 @@
 """What the Solver trains on."""
 
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
-from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
+from proposer_rl.curricula.first_order import (
+    FirstOrderCurriculum,
+    SampledFirstOrderCurriculum,
+    require_gradients,
+)
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.sampling import SamplingCurriculum
@@ -19,4 +23,5 @@ __all__ = [
     "SampledFirstOrderCurriculum",
     "SamplingCurriculum",
     "ScheduleCurriculum",
+    "require_gradients",
 ]

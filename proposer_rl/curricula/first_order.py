@@ -271,5 +271,5 @@ def require_gradients(task: object) -> None:
     if not isinstance(task, DifferentiableTask):
         raise TypeError(
             f"first-order gain needs gradients: {type(task).__name__} must define "
-            "differentiable_performance(agent, levels)"
+            "differentiable_performance(agent, levels); +method=first_order_sampled needs none"
         )
