@@ -149,9 +149,7 @@ def test_what_a_curriculum_costs_is_counted_written_and_survives(
     cycles = read_jsonl(tmp_path / "cycles.jsonl")
     begun = [(0, 0, 1000, 100), (1, 2, 2020, 202), (2, 4, 3040, 304)]
     keys = ("cycle", "updates", "curriculum_frames", "evaluations", "own")
-    assert cycles == [
-        dict(zip(keys, (*place, [place[1]]), strict=True)) for place in begun
-    ]
+    assert cycles == [dict(zip(keys, (*place, [place[1]]), strict=True)) for place in begun]
 
 
 class After(StopSignals):

@@ -27,7 +27,12 @@ def resident() -> float:
 
 def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
     options = [
-        *("+method=perf_gain", "+scale=smoke", "compute.progress=false", "proposer.meta_episode_length=2"),
+        *(
+            "+method=perf_gain",
+            "+scale=smoke",
+            "compute.progress=false",
+            "proposer.meta_episode_length=2",
+        ),
         *(f"schedule.updates={UPDATES}", f"schedule.cycle_length={UPDATES // CYCLES}"),
         *(f"schedule.evaluate_every={UPDATES // CYCLES}", "schedule.checkpoint_every=20"),
     ]

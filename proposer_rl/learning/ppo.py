@@ -63,6 +63,21 @@ class PPO:
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of copies, or
             the loss reduces what belongs to different copies.
+
+    Example:
+        A linear policy and value for one environment of Gymnasium's:
+
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torchrl.envs import GymEnv
+        >>> layer = TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["outputs"])
+        >>> split = TensorDictModule(
+        ...     lambda x: x.split([2, 1], -1), ["outputs"], ["logits", "state_value"]
+        ... )
+        >>> agent = ActorCritic(TensorDictSequential(layer, split))
+        >>> env = GymEnv("CartPole-v1", categorical_action_encoding=True)
+        >>> rollout, metrics = PPO(env, agent, PPOSettings(horizon=50)).update()
+        >>> rollout.batch_size
+        torch.Size([50])
     """
 
     def __init__(

@@ -131,4 +131,3 @@ def test_every_shape_goes_through_the_network() -> None:
     assert len(scores) == 2 * len(levels)
     assert all(0 <= s.results["success"] <= 1 for s in scores)
     assert {s.results["greedy_success"] for s in scores} <= {0, 1}
-

@@ -111,7 +111,9 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
 
 def test_statistics_and_records_of_what_was_trained_on() -> None:
     ppo = learners(2)
-    levels = TASK.space.generate(torch.tensor([[0, 1, 2, 3]] * 2), [Streams(k).generator() for k in (0, 1)])
+    levels = TASK.space.generate(
+        torch.tensor([[0, 1, 2, 3]] * 2), [Streams(k).generator() for k in (0, 1)]
+    )
     ppo.env.set_levels(levels)
     rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
     statistics = TASK.statistics(levels, rollout)

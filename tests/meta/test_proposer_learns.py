@@ -40,9 +40,7 @@ def problem_choices(*, shuffled: bool = False) -> PPO:
     return _ppo(env, head, categorical, None)
 
 
-def mixtures(
-    *, idle: int = 0, action_repeat: int = 1, shuffled: bool = False, **learning
-) -> PPO:
+def mixtures(*, idle: int = 0, action_repeat: int = 1, shuffled: bool = False, **learning) -> PPO:
     """Mixtures as actions; the other copies tell the advantage."""
     env = ladder_env(
         any_mixture,
@@ -53,7 +51,9 @@ def mixtures(
         meta_episode_length=UPDATES,
         action_repeat=action_repeat,
     )
-    return _ppo(env, MixtureHead(33, SKILLS + idle, hidden=32), normal, LeaveOneOutBaseline(1.0), **learning)
+    return _ppo(
+        env, MixtureHead(33, SKILLS + idle, hidden=32), normal, LeaveOneOutBaseline(1.0), **learning
+    )
 
 
 def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:

@@ -29,15 +29,16 @@ def step(before: TensorDict, after: TensorDict) -> TrainingStep:
 def test_gain_is_the_increase_of_the_mean_return() -> None:
     before = performance(**{"return": [[0.1, 0.3], [0.5, 0.5]]})
     after = performance(**{"return": [[0.5, 0.3], [0.0, 0.5]]})
-    torch.testing.assert_close(
-        performance_gain(step(before, after)), torch.tensor([0.2, -0.25])
-    )
+    torch.testing.assert_close(performance_gain(step(before, after)), torch.tensor([0.2, -0.25]))
 
 
 def test_log_success_gain_is_the_increase_of_the_mean_logarithm() -> None:
     before, after = ([[0.0, 0.009]], [[0.0, 0.999]])
     given = step(
-        *(performance(**{"success": success, "return": [[1.0, 1.0]]}) for success in (before, after))
+        *(
+            performance(**{"success": success, "return": [[1.0, 1.0]]})
+            for success in (before, after)
+        )
     )
     expected = torch.tensor([math.log(100) / 2])
     torch.testing.assert_close(log_success_gain(given), expected)

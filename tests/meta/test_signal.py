@@ -58,9 +58,7 @@ def test_smaller_validation_batches_are_the_first_levels() -> None:
 
 
 def test_copies_of_a_proposal_gain_alike_where_chance_has_no_part() -> None:
-    env = ladder_env(
-        any_mixture, copies=6, problems=64, meta_episode_length=4, action_repeat=2
-    )
+    env = ladder_env(any_mixture, copies=6, problems=64, meta_episode_length=4, action_repeat=2)
     actions = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0))
     start = env.solvers.snapshot()[0]
     before, after = performance_around(env, start, actions, torch.zeros(5), Streams(0))
