@@ -24,7 +24,7 @@ from tests.same_run import assert_same_run, tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
-SMOKE = ["+scale=smoke", "progress=false"]
+SMOKE = ["+scale=smoke", "compute.progress=false"]
 ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))
 
 
@@ -53,10 +53,10 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     assert summary["method"] == method and summary["updates_to_threshold"] == [None]
     assert summary["versions"]["torchrl"]
     assert (folder / "run.png").stat().st_size > 10_000
-    proposes = (folder / "proposer.jsonl").exists()
+    proposes = (folder / "cycles.jsonl").exists()
     assert proposes == (method in ("perf_gain", "task_difficulty"))
     if proposes:
-        cycles = read_jsonl(folder / "proposer.jsonl")
+        cycles = read_jsonl(folder / "cycles.jsonl")
         assert [row["cycle"] for row in cycles] == [0, 1]
         assert all(len(row["total_gain"]) == 2 for row in cycles)
         assert metrics[-1]["meta_frames"] == 2 * 2 * 3 * 4 * 10
@@ -145,7 +145,7 @@ def test_the_module_runs_as_a_program() -> None:
 
 
 def test_a_proposer_goes_on_learning_over_several_lifetimes(train) -> None:
-    arguments = ["+method=perf_gain", *SMOKE, "lifetimes=2", "evaluation.levels=16"]
+    arguments = ["+method=perf_gain", *SMOKE, "lifetimes=2", "task.evaluation.levels=16"]
     assert train(*arguments, "hydra.run.dir=whole") == 0
     first, second = Path("whole/lifetime_0"), Path("whole/lifetime_1")
     # The first is the run that it would be alone; the second has another Solver, and the Proposer.

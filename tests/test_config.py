@@ -29,7 +29,7 @@ from tests.same_run import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
-SMOKE = ["+scale=smoke", "progress=false"]
+SMOKE = ["+scale=smoke", "compute.progress=false"]
 
 # Changes to +method=target, and what the line must say.
 WRONG = [
@@ -87,7 +87,7 @@ WRONG = [
     ("proposer.probe_levels=-1", "probe_levels=-1: input should be greater than or equal to 0"),
     ("threads=0", "threads=0: input should be greater than or equal to 1"),
     ("cores=0", "cores=0: input should be greater than or equal to 1"),
-    ("evaluation.levels=0", "evaluation.levels=0: input should be greater than or equal to 1"),
+    ("task.evaluation.levels=0", "task.evaluation.levels=0: input should be greater than or equal to 1"),
     ("hand_made_until=[0]", "hand_made_until.0=0: input should be greater than or equal to 1"),
     ("distributions.id.specifications=[]", "specifications=[]: list should have at least 1 item"),
     ("distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
@@ -133,8 +133,8 @@ WRONG = [
         "proposer.probe_levels=513",
         "probe_levels=513 must be at most proposer.validation_levels=512",
     ),
-    ("proposer.ppo.horizon=3", "proposer.ppo.horizon=3 must equal proposer.lookahead=50"),
-    ("proposer.updates_per_step=7", "updates_per_step=7 must divide proposer.lookahead=50"),
+    ("proposer.ppo.horizon=3", "proposer.ppo.horizon=3 must equal proposer.meta_episode_length=50"),
+    ("proposer.updates_per_step=7", "updates_per_step=7 must divide proposer.meta_episode_length=50"),
     ("space.path_lengths=[50]", "space: cannot make levels with obstacle_fraction=0, path_len"),
     ("space.path_lengths=[2,2]", "space: path_lengths must be distinct, got [2, 2]"),
     ("distributions.ood.specifications=[[0.9,12]]", "distributions.ood: cannot make levels with"),
@@ -160,7 +160,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=perf_gain", "proposer.advance=best", "schedule.cycle_length=5"],
-        "schedule.cycle_length=5 must equal proposer.lookahead=50",
+        "schedule.cycle_length=5 must equal proposer.meta_episode_length=50",
     ),
     (
         ["+method=perf_gain", "collector=ray", "workers=17"],
@@ -326,7 +326,7 @@ def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> 
 
 def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
     folder = copy_of(finished)
-    free = ["schedule.checkpoint_seconds=null", "schedule.keep_checkpoints=3", "cores=1"]
+    free = ["schedule.checkpoint_seconds=null", "schedule.keep_checkpoints=3", "compute.cores=1"]
     assert train("+method=target", *SMOKE, "hydra.run.dir=run", *free) == 0
     assert train("+method=target", *SMOKE, "hydra.run.dir=whole") == 0
     assert_same_run(Path("whole"), folder)
