@@ -1,4 +1,4 @@
-"""Imports go one way: a module of the package imports only modules of lower layers."""
+"""The rooms of the package and who may know of whom, read from its folders and files."""
 
 from __future__ import annotations
 
@@ -12,54 +12,23 @@ import pytest
 PACKAGE = "proposer_rl"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
-# From low to high. Neighbours in one layer may import each other, as long as that makes no circle.
-LAYERS = [
-    {"capture", "adam"},
-    {
-        *("mazes", "models", "run_folder", "checkpoint", "lock"),
-        *("settings", "streams", "signals", "finite", "machine"),
-    },
-    {"ppo", "evaluation", "rewards", "report", "advantages", "proposals", "solver_view"},
-    {"level_sets"},
-    {"meta_env"},
-    {"copies"},
-    {"workers"},
-    {"curricula", "snr"},
-    {"experiment"},
-    {"task"},
-    {"methods"},
-    {"cli"},
-    {"bench"},
-]
-RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
-
-# In the lowest layer even neighbours are strangers, but for these: all lie in a run's folder.
-NEIGHBOURS = {("checkpoint", "run_folder"), ("lock", "run_folder")}
-
-# These work with any environment and any level: they are reused where there are no mazes.
-KNOW_NO_MAZES = {
-    "ppo",
-    "advantages",
-    "proposals",
-    "solver_view",
-    "meta_env",
-    "snr",
-    "experiment",
-    "copies",
-    "workers",
-}
-
-# Everything but the command line takes plain arguments.
+# Only the command line composes configurations; everything else takes plain arguments.
 CONFIGURATION = {"hydra", "omegaconf", "pydantic"}
+# What reads runs must start at once.
+HEAVY = {"torch", "torchrl", "tensordict"}
+READERS = ("report", "cli.watch", "cli.report")
+# The names of the package itself, and the room that knows mazes.
+KNOW_MAZES = ("mazes", "api")
+MOST_ROOMS = 16
 
 
-def imported_names(source: str, package: tuple[str, ...]) -> Iterator[str]:
-    """Yields the dotted name of everything that a file imports, wherever in the file.
+def imported_names(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+    """Yield the dotted name of everything that a file imports, wherever in the file.
 
     ``from a import b`` yields ``a.b``: whether b is a module does not matter here. ``package`` is
     the package that the file lies in, from which relative imports count.
     """
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -68,116 +37,161 @@ def imported_names(source: str, package: tuple[str, ...]) -> Iterator[str]:
             yield from (".".join([*start, alias.name]) for alias in node.names)
 
 
-def imports_of(root: Path) -> dict[str, set[str]]:
-    """Returns what each top-level module imports; the package's own ``__init__`` may import all."""
-    imports: dict[str, set[str]] = {}
+def modules(root: Path) -> dict[str, ast.Module]:
+    """All modules by their dotted name within the package; that of a package is its folder's."""
+    found = {}
     for path in sorted(root.rglob("*.py")):
-        parts = path.relative_to(root).with_suffix("").parts
-        if parts == ("__init__",):
+        parts = [part for part in path.relative_to(root).with_suffix("").parts]
+        name = ".".join(part for part in parts if part != "__init__")
+        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+def imports(root: Path) -> dict[str, set[str]]:
+    """What each module imports: other packages' names, and the package's own modules with a dot."""
+    trees = modules(root)
+    found: dict[str, set[str]] = {}
+    for name, tree in trees.items():
+        is_package = (root / Path(*name.split(".")) / "__init__.py").exists()
+        package = [PACKAGE, *([] if not name else name.split("."))]
+        names = imported_names(tree, tuple(package if is_package or not name else package[:-1]))
+        found[name] = set()
+        for imported in names:
+            first, _, rest = imported.partition(".")
+            if first != PACKAGE:
+                found[name].add(first)
+                continue
+            # The longest part of it that is a module; the rest is a name in it.
+            while rest and rest not in trees:
+                rest = rest.rpartition(".")[0]
+            found[name].add(f".{rest}")
+    return found
+
+
+def rooms(root: Path) -> dict[str, set[str]]:
+    """The rooms that each room imports; the package's own ``__init__`` and ``api`` see all."""
+    found: dict[str, set[str]] = {}
+    for name, imported in imports(root).items():
+        room = name.partition(".")[0]
+        if room in ("", "api"):
             continue
-        names = imported_names(path.read_text(encoding="utf-8"), (PACKAGE, *parts[:-1]))
-        imports.setdefault(parts[0], set()).update(names)
-    return imports
+        own = {other[1:].partition(".")[0] for other in imported if other.startswith(".")}
+        found.setdefault(room, set()).update(own - {room})
+    return found
 
 
-def internal(module: str, names: set[str]) -> set[str]:
-    """Returns the package's other top-level modules among the imported names."""
-    parts = (name.split(".") for name in names)
-    return {part[1] for part in parts if part[0] == PACKAGE and len(part) > 1} - {module}
-
-
-def problems(root: Path) -> list[str]:
-    """Returns one line for each import that goes the wrong way."""
-    found = []
-    imports = imports_of(root)
-    for module, names in imports.items():
-        if module not in RANK:
-            found.append(f"{module}: unknown; give it its place in LAYERS of {Path(__file__).name}")
-            continue
-        if module != "cli":
-            used = CONFIGURATION & {name.partition(".")[0] for name in names}
-            found += [f"{module}: imports {name}, which only cli may" for name in sorted(used)]
-        found += [
-            f"{module}: imports {other}{reason}"
-            for other in sorted(internal(module, names))
-            if (reason := objection(module, other))
-        ]
-    return found + circles({module: internal(module, names) for module, names in imports.items()})
-
-
-def objection(module: str, other: str) -> str:
-    """Returns why a module must not import another, or nothing."""
-    if other not in RANK:
-        return ", which is no module: import from the module that defines it, not from the package"
-    if module in KNOW_NO_MAZES and other == "mazes":
-        return ", but must work without mazes"
-    if RANK[other] > RANK[module]:
-        return ", which is in a higher layer"
-    if RANK[other] == RANK[module] == 1 and (module, other) not in NEIGHBOURS:
-        return ", its neighbour in the lowest layer"
-    return ""
-
-
-def circles(graph: dict[str, set[str]]) -> list[str]:
+def circle(graph: dict[str, set[str]]) -> list[str]:
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
-        return ["circle: " + " -> ".join(error.args[1])]
+        return list(error.args[1])
     return []
 
 
-def test_imports_go_one_way() -> None:
-    assert problems(ROOT) == []
+def reached(graph: dict[str, set[str]], start: str) -> set[str]:
+    """Everything that is imported when a module is, directly or not."""
+    seen: set[str] = set()
+    waiting = [f".{start}"]
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        if name.startswith("."):
+            waiting += graph[name[1:]]
+            # Importing a module imports the packages that it lies in.
+            above = name[1:].rpartition(".")[0]
+            waiting += [f".{above}"] if above else []
+    return seen
+
+
+def mentions(tree: ast.AST, word: str) -> list[str]:
+    """Names and texts with a word in them, but for docstrings; comments are none of the tree."""
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    # Texts that stand by themselves describe what is above them.
+    docstrings |= {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+    found = []
+    for node in ast.walk(tree):
+        if id(node) in docstrings:
+            continue
+        for field in ("id", "attr", "name", "arg", "module", "asname", "value"):
+            text = getattr(node, field, None)
+            if isinstance(text, str) and word in text.casefold():
+                found.append(f"line {node.lineno}: {text}")
+    return found
+
+
+def test_there_is_no_circle_between_rooms() -> None:
+    graph = rooms(ROOT)
+    assert circle(graph) == []
+    unknown = {other for others in graph.values() for other in others} - graph.keys()
+    assert unknown == set(), "import from the module that defines it, not from the package"
+
+
+def test_there_are_few_rooms() -> None:
+    found = rooms(ROOT)
+    assert len(found) <= MOST_ROOMS, sorted(found)
+
+
+def test_only_the_command_line_sees_configurations() -> None:
+    seen = {name: used & CONFIGURATION for name, used in imports(ROOT).items()}
+    assert {name.partition(".")[0] for name, used in seen.items() if used} == {"cli"}
+
+
+def test_what_reads_runs_needs_no_torch() -> None:
+    graph = imports(ROOT)
+    readers = [name for name in graph if any(f"{name}.".startswith(f"{r}.") for r in READERS)]
+    assert len(readers) > len(READERS)
+    for name in readers:
+        assert not reached(graph, name) & HEAVY, name
+
+
+def test_nothing_but_mazes_knows_mazes() -> None:
+    found = {
+        name: mentions(tree, "maze")
+        for name, tree in modules(ROOT).items()
+        if name.partition(".")[0] not in KNOW_MAZES
+    }
+    assert {name: where for name, where in found.items() if where} == {}
+    graph = imports(ROOT)
+    for name in found.keys() - {""}:
+        assert not any(f"{other}.".startswith(".mazes.") for other in graph[name]), name
 
 
 @pytest.mark.parametrize(
-    ("file", "source", "expected"),
+    ("files", "expected"),
     [
-        ("ppo.py", "from proposer_rl.mazes import Level", "must work without mazes"),
-        ("meta_env.py", "def f():\n    from .mazes.levels import Level", "must work without mazes"),
-        ("experiment.py", "import proposer_rl.mazes as m", "must work without mazes"),
-        ("models/unet.py", "from ..mazes import levels", "neighbour in the lowest layer"),
-        ("mazes/env.py", "from proposer_rl import streams", "neighbour in the lowest layer"),
-        ("evaluation.py", "from . import meta_env", "higher layer"),
-        ("curricula/target.py", "from proposer_rl.experiment import run", "higher layer"),
-        ("curricula/a/b.py", "from ...cli import train", "higher layer"),
-        ("methods/x.py", "import hydra.utils", "only cli may"),
-        ("report/page.py", "from omegaconf import OmegaConf", "only cli may"),
-        ("rewards.py", "import pydantic", "only cli may"),
-        ("ppo.py", "from proposer_rl import MazeEnv", "not from the package"),
-        ("surprise.py", "", "unknown; give it its place"),
+        ({"a.py": "from proposer_rl import b", "b.py": "from .a import f"}, {"a", "b"}),
+        ({"a/x.py": "from ..b.y import f", "b/y.py": "def f():\n    import proposer_rl.a.x"}, None),
+        ({"a/x.py": "from . import y", "a/y.py": "from .x import f"}, set()),  # one room
+        ({"a.py": "import torch\nfrom proposer_rl.b import f", "b.py": ""}, set()),
     ],
 )
-def test_finds(tmp_path: Path, file: str, source: str, expected: str) -> None:
-    _write(tmp_path, {file: source})
-    found = problems(tmp_path)
-    assert len(found) == 1
-    assert expected in found[0]
-
-
-@pytest.mark.parametrize(
-    ("file", "source"),
-    [
-        ("__init__.py", "from proposer_rl.mazes import MazeEnv\nfrom proposer_rl.methods import x"),
-        ("cli/train.py", "import hydra, pydantic\nfrom proposer_rl.methods import x"),
-        ("checkpoint.py", "from proposer_rl.runs.folder import write_atomically"),
-        ("mazes/env.py", "from .levels import Level\nfrom proposer_rl.mazes import distance"),
-        ("meta_env.py", "import torch\nfrom .ppo import PPO\nfrom proposer_rl import models"),
-        ("rewards.py", "from proposer_rl.mazes.evaluation import evaluate"),
-    ],
-)
-def test_allows(tmp_path: Path, file: str, source: str) -> None:
-    _write(tmp_path, {file: source})
-    assert problems(tmp_path) == []
-
-
-def test_finds_circles_within_a_layer(tmp_path: Path) -> None:
-    _write(tmp_path, {"ppo.py": "from . import rewards", "rewards.py": "from . import ppo"})
-    assert problems(tmp_path)[0].startswith("circle: ")
-
-
-def _write(root: Path, files: dict[str, str]) -> None:
+def test_circles_are_found(tmp_path: Path, files: dict[str, str], expected: set | None) -> None:
     for name, source in files.items():
-        path = root / name
+        path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
+        (path.parent / "__init__.py").touch()
         path.write_text(source, encoding="utf-8")
+    assert set(circle(rooms(tmp_path))) == ({"a", "b"} if expected is None else expected)
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("class Maze: ...", 1),
+        ("def f(maze): return maze", 2),
+        ("x = 'a maze'", 1),
+        ("from proposer_rl.mazes import Level", 1),
+        ('"""Such as mazes."""\n\ndef f():\n    """A maze."""\n    x = 1  # a maze', 0),
+        ('X = 1\n"""Of a maze."""', 0),
+    ],
+)
+def test_mentions_are_found(source: str, count: int) -> None:
+    assert len(mentions(ast.parse(source), "maze")) == count
