@@ -27,7 +27,7 @@ def programs() -> dict[str, str]:
     """The module behind every command of bin/ that is a Python program."""
     found = {}
     for file in (ROOT / "bin").iterdir():
-        started = re.search(r"-m (proposer_rl\S*)", file.read_text(encoding="utf-8"))
+        started = re.search(r"-m ((?:proposer_rl|benchmarks)\S*)", file.read_text(encoding="utf-8"))
         if started:
             found[file.name] = started[1]
     return found
@@ -124,7 +124,7 @@ def test_the_config_folder_of_ones_own_works(train) -> None:
     assert own
     for call in own:
         words = ["+scale=smoke" if word == "+scale=quick" else word for word in call]
-        assert train(*words, "progress=false") == 0
+        assert train(*words, "compute.progress=false") == 0
     folders = sorted(path.parent.name for path in Path().glob("outputs/*/*/summary.json"))
     assert len(folders) == sum("-m" not in call for call in own)
     assert len(list(Path().glob("multirun/*/*/summary.json"))) == 2
