@@ -7,8 +7,8 @@ acts in mazes larger than those it was trained on.
 
     python examples/own_solver.py [updates]
 
-The command line has the U-Net's sizes; there, another network is a task of your own: a function with
-MazeTask's arguments that passes `make_network` to it, named as `task._target_`.
+The command line has the U-Net's sizes; there, another network is a task of your own: a function
+with MazeTask's arguments that passes `make_network` to it, named as `task._target_`.
 """
 
 from __future__ import annotations

@@ -52,7 +52,8 @@ def test_the_commands_run(
     if "+scale=smoke" not in small:
         small.append("+scale=smoke")
     if any(word.startswith("+sweep=") for word in small):
-        # Of a sweep one run, in this process: there may be no cluster here. Ablations are perf_gain's.
+        # Of a sweep one run, in this process: there may be no cluster here. An ablation is one of
+        # the sweep's own method.
         small = [word for word in small if "launcher" not in word] + ["seed=0"]
         small += [] if any(word.startswith("+ablation") for word in small) else ["+method=target"]
     monkeypatch.chdir(tmp_path)
