@@ -7,16 +7,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
-
 from benchmarks.meta import MetaStep, StepParts, proposer_curriculum
-from benchmarks.results import Options, Result, Row, Spread, Table
+from benchmarks.results import Options, Result, Row, Spread
 from benchmarks.scales import PAPER, TINY, Scale, Solvers, bf16_in_hardware
 from benchmarks.timing import interleave, synchronise, time_once
 from proposer_rl.curricula import Curriculum, SamplingCurriculum
 from proposer_rl.experiment import Experiment, Schedule
 from proposer_rl.mazes.task import MazeTask
-from proposer_rl.models import Population
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.streams import Streams
 
@@ -62,7 +59,7 @@ def _update(scale: Scale, options: Options, precision: str) -> Result:
 
 
 def _meta_step(scale: Scale, options: Options, precision: str) -> Result:
-    """K Solvers: a step, its parts, and the ways of computing the copies."""
+    """K Solvers: a step and its parts."""
     task = scale.task(options, precision)
     env = proposer_curriculum(task, scale).env
     parts = StepParts(task, env)
@@ -70,18 +67,7 @@ def _meta_step(scale: Scale, options: Options, precision: str) -> Result:
     seconds = interleave(steps, options.repeats, options.device)
     size = f"K = {scale.proposer.rollouts}, {precision}"
     row = _row("a meta-environment step", size, seconds["step"], 50e-3, options)
-    ways = _ways(task, scale.proposer.rollouts, options)
-    return Result([row], [parts.table(f"Parts of a meta-environment step, {size}"), ways])
-
-
-def _ways(task: MazeTask, copies: int, options: Options) -> Table:
-    modules = Solvers(task, copies, batches=1).ppo.agent.modules()
-    population = next(module for module in modules if isinstance(module, Population))
-    maze = task.maze
-    planes = torch.rand(copies, task.solver.problems, 3, maze.height, maze.width)
-    seconds = population.seconds_of_ways(planes.to(task.device))
-    lines = [[name, f"{1e3 * s:.2f}"] for name, s in seconds.items()]
-    return Table(f"Ways of one epoch's passes, K = {copies}", ["way", "ms"], lines)
+    return Result([row], [parts.table(f"Parts of a meta-environment step, {size}")])
 
 
 def _runs(scale: Scale, options: Options, precision: str) -> Result:

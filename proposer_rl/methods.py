@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 from torch import nn
@@ -14,8 +14,11 @@ from torch.distributions import Distribution
 
 from proposer_rl.curricula import (
     Curriculum,
+    FirstOrderCurriculum,
+    FirstOrderProposer,
     ProposerCurriculum,
     ProposerTrainer,
+    SampledFirstOrderCurriculum,
     SamplingCurriculum,
     ScheduleCurriculum,
 )
@@ -173,6 +176,58 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
         meta_episode_length=chosen.meta_episode_length,
         action_repeat=chosen.action_repeat,
         own_action=chosen.own_action,
+    )
+
+
+def first_order_gain(parts: Parts, **numbers: Any) -> FirstOrderCurriculum:
+    """Train on the bins whose levels raise the target's performance most, to first order.
+
+    Args:
+        parts: the task, whose performance must have gradients.
+        numbers: see :class:`FirstOrderCurriculum`.
+    """
+    _no_copies(parts)
+    return FirstOrderCurriculum(parts.task, **numbers)
+
+
+def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurriculum:
+    """The same from episodes, for any task.
+
+    Args:
+        parts: the task.
+        numbers: see :class:`SampledFirstOrderCurriculum`.
+    """
+    _no_copies(parts)
+    return SampledFirstOrderCurriculum(parts.task, **numbers)
+
+
+def first_order_proposer(
+    parts: Parts, target_levels: int, epochs: int, learning_rate: float, entropy_coeff: float
+) -> FirstOrderProposer:
+    """Train on the draws of a policy that is paid for each problem, to first order.
+
+    Args:
+        parts: the task, whose performance must have gradients, and the Proposer's settings: of
+            them the probes, the network and PPO's other numbers.
+        target_levels: see :class:`FirstOrderProposer`.
+        epochs: gradient steps on the draws of each of the Solver's updates.
+        learning_rate: of the policy.
+        entropy_coeff: of the policy.
+    """
+    _no_copies(parts)
+    _one_solver(parts)
+    task, chosen = parts.task, parts.proposer
+    with Streams(parts.seeds[0], "proposer").as_default("weights"):
+        agent = _agent(task, replace(chosen, observes=[], action=ProblemSettings()))
+    numbers = replace(
+        chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
+    )
+    return FirstOrderProposer(
+        task,
+        agent,
+        PPOSettings(horizon=1, **asdict(numbers)),
+        probe_levels=chosen.probe_levels,
+        target_levels=target_levels,
     )
 
 

@@ -98,7 +98,8 @@ class Task(Protocol):
         - ``title``: of its runs, and ``levels``: what levels are called;
         - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
         - ``space``: the axes of the Proposer's bins;
-        - ``about``: texts by their labels, and ``key``: what is to be seen in a picture;
+        - ``about``: texts by their labels; ``key`` and ``text_key``: what is to be seen in a
+          record's picture and in its text;
         - ``measured``: all that must be equal for two runs' measurements to be comparable;
         - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
         """
@@ -145,7 +146,10 @@ class DifferentiableTask(Protocol):
     """A task whose performance has gradients: first-order gain without sampling."""
 
     def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """As :meth:`Task.performance`, with gradients towards the agent's parameters."""
+        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
+
+        Where gradients are enabled, with gradients towards the agent's parameters.
+        """
 
 
 class Score(NamedTuple):

@@ -10,8 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from proposer_rl.cli.config import ConfigError, LoggerSettings
 from proposer_rl.cli.loggers import make_log, require_logger
-from proposer_rl.mazes import Level, draw_grid
-from tests.report.folders import LEVEL, cycle, write_run
+from tests.report.folders import LEVEL, PIXELS, cycle, write_run
 
 
 def test_the_runs_folder_is_enough_for_csv(tmp_path: Path) -> None:
@@ -42,15 +41,16 @@ def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> Non
     folder = write_run(tmp_path / "run", "perf_gain", cycles=cycles)
     log = make_log(LoggerSettings(type="tensorboard"), folder, "run")
     assert log is not None
-    log("proposer", cycles[0], 20)
-    log("curriculum", {"levels": [LEVEL] * 3}, 20)
+    log("cycles", cycles[0], 20)
+    log("curriculum", {"levels": [LEVEL, {"picture": "none"}, *[LEVEL] * 4]}, 20)
     (events_folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
     events = EventAccumulator(str(events_folder)).Reload()
-    assert [event.value for event in events.Scalars("proposer/total_gain_max")] == [0.25]
-    assert [event.value for event in events.Scalars("proposer/total_gain_mean")] == [-0.125]
+    assert [event.value for event in events.Scalars("cycles/return_gain_max")] == [0.25]
+    assert [event.value for event in events.Scalars("cycles/return_gain_mean")] == [-0.125]
     (event,) = events.Images("curriculum/levels")
-    expected = draw_grid(Level.from_text(["..#.\nS..G"] * 3), [LEVEL["path"]] * 3, columns=4)
-    shown = Image.open(BytesIO(event.encoded_image_string))
-    assert np.array_equal(np.asarray(shown), expected.numpy())
-    (event,) = events.Images("proposer/histogram")
+    shown = np.asarray(Image.open(BytesIO(event.encoded_image_string)))
+    assert shown.shape == (2 * 20 + 8, 4 * 40 + 3 * 8, 3)  # five pictures, four in a row
+    assert np.array_equal(shown[:20, 48:88], PIXELS) and np.array_equal(shown[28:, :40], PIXELS)
+    assert (shown[20:28] == 255).all() and (shown[28:, 48:] == 255).all()
+    (event,) = events.Images("cycles/histogram")
     assert event.step == 20 and event.width > 200

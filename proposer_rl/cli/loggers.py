@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torchrl.record.loggers import get_logger
 
 from proposer_rl.cli.config import ConfigError, LoggerSettings
 from proposer_rl.experiment import Log
-from proposer_rl.mazes import Level, draw_grid
 from proposer_rl.report.proposals import last_map
+from proposer_rl.report.records import numbers, picture
+
+COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 
 
 def require_logger(settings: LoggerSettings) -> None:
@@ -60,18 +64,29 @@ def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     for key, value in row.items():
         if isinstance(value, int | float):
             yield key, value
-        elif isinstance(value, list) and value and isinstance(value[0], int | float):
-            yield f"{key}_max", max(value)
-            yield f"{key}_mean", sum(value) / len(value)
+        elif (found := numbers(value)) is not None:
+            yield f"{key}_max", float(found.max())
+            yield f"{key}_mean", float(found.mean())
 
 
-def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, Any]]:
+def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     """What of a row is seen better than read, as uint8 [H, W, 3]."""
-    if "levels" in row:
-        drawings = ["\n".join(item["level"]) for item in row["levels"]]
-        paths = [item["path"] for item in row["levels"]]
-        yield "levels", draw_grid(Level.from_text(drawings), paths, columns=4).numpy()
+    found = [picture(record.get("picture")) for record in row.get("levels", ())]
+    tiles = [tile for tile in found if tile is not None]
+    if tiles:
+        yield "levels", _sheet(tiles)
     if "histogram" in row:
         image = last_map(path)
         if image is not None:
             yield "histogram", image
+
+
+def _sheet(tiles: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Pictures side by side on white, four in a row."""
+    height, width = (max(tile.shape[side] for tile in tiles) + GAP for side in (0, 1))
+    rows = -(-len(tiles) // COLUMNS)
+    sheet = np.full((rows * height, min(len(tiles), COLUMNS) * width, 3), 255, np.uint8)
+    for number, tile in enumerate(tiles):
+        top, left = number // COLUMNS * height, number % COLUMNS * width
+        sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    return sheet[:-GAP, :-GAP]

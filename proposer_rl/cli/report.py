@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-from proposer_rl.report.build import OutputError, write_report
-from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.cli.errors import command
+from proposer_rl.report.build import write_report
 
-BAD_INPUT = 2
-INTERRUPTED = 130
 EPILOG = """\
 examples:
   bin/report outputs                       every run below outputs/, to report/
@@ -25,17 +24,14 @@ far as they got, and the report says so."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: exit code 0, 2 for bad input, 130 when interrupted."""
-    options = _parser().parse_args(arguments)
-    try:
-        page = write_report(
-            options.folder, options.output, options.threshold, progress=not options.quiet
-        )
-    except (UnreadableRun, OutputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    command(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> None:
+    page = write_report(
+        options.folder, options.output, options.threshold, progress=not options.quiet
+    )
     print(f"Report: {page}")
 
 
@@ -54,20 +50,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--threshold",
-        type=_share,
-        help="of sample efficiency, above 0 and at most 1 (default: the runs' own, 0.8)",
+        type=_finite,
+        help="of sample efficiency, such as 0.8 of a success (default: the runs' own)",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser
 
 
-def _share(text: str) -> float:
+def _finite(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = 0.0
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"must be above 0 and at most 1, got {text!r}")
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
     return value
 
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console, RenderableType
 from rich.live import Live
 
+from proposer_rl.cli.errors import command
 from proposer_rl.report.progress import find_progress
-from proposer_rl.report.runs import UnreadableRun
 from proposer_rl.report.terminal import overview, screen
 
-BAD_INPUT = 2
 EPILOG = """\
 examples:
   bin/watch outputs/perf_gain/2026-11-21_00-37-50_seed_0   one run: curves, gains, levels
@@ -24,23 +24,21 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: exit code 0, also when stopped with Ctrl-C; 2 for bad input."""
-    options = _parser().parse_args(arguments)
+    """Entry point; Ctrl-C ends it well, else the exit codes are those of ``cli/errors.py``."""
+    command(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> None:
     console = Console()
-    try:
-        picture = draw(options.folder)
-        if options.once or not console.is_terminal:
-            console.print(picture)
-            return
-        with Live(picture, console=console, auto_refresh=False, screen=True) as live:
-            while True:
-                time.sleep(options.seconds)
-                live.update(draw(options.folder), refresh=True)
-    except UnreadableRun as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
+    picture = draw(options.folder)
+    if options.once or not console.is_terminal:
+        console.print(picture)
         return
+    shown = Live(picture, console=console, auto_refresh=False, screen=True)
+    with suppress(KeyboardInterrupt), shown as live:
+        while True:
+            time.sleep(options.seconds)
+            live.update(draw(options.folder), refresh=True)
 
 
 def draw(folder: Path) -> RenderableType:

@@ -1,6 +1,12 @@
 """What the Solver trains on."""
 
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.first_order import (
+    FirstOrderCurriculum,
+    SampledFirstOrderCurriculum,
+    require_gradients,
+)
+from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.sampling import SamplingCurriculum
 from proposer_rl.curricula.schedule import ScheduleCurriculum
@@ -8,10 +14,14 @@ from proposer_rl.curricula.schedule import ScheduleCurriculum
 __all__ = [
     "Advance",
     "Curriculum",
+    "FirstOrderCurriculum",
+    "FirstOrderProposer",
     "Improvement",
     "Proposal",
     "ProposerCurriculum",
     "ProposerTrainer",
+    "SampledFirstOrderCurriculum",
     "SamplingCurriculum",
     "ScheduleCurriculum",
+    "require_gradients",
 ]

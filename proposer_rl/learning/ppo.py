@@ -20,7 +20,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.adam import CopiesAdam
 from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
@@ -32,7 +31,7 @@ from proposer_rl.learning.losses import (
     make_loss,
 )
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
-from proposer_rl.learning.snapshot import restore_snapshot, take_snapshot
+from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 
@@ -64,6 +63,21 @@ class PPO:
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of copies, or
             the loss reduces what belongs to different copies.
+
+    Example:
+        A linear policy and value for one environment of Gymnasium's:
+
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torchrl.envs import GymEnv
+        >>> layer = TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["outputs"])
+        >>> split = TensorDictModule(
+        ...     lambda x: x.split([2, 1], -1), ["outputs"], ["logits", "state_value"]
+        ... )
+        >>> agent = ActorCritic(TensorDictSequential(layer, split))
+        >>> env = GymEnv("CartPole-v1", categorical_action_encoding=True)
+        >>> rollout, metrics = PPO(env, agent, PPOSettings(horizon=50)).update()
+        >>> rollout.batch_size
+        torch.Size([50])
     """
 
     def __init__(
@@ -93,9 +107,7 @@ class PPO:
         )
         self._loss = make_loss(loss or clipped, agent)
         self._parameters = list(agent.parameters())
-        self._adam = CopiesAdam(
-            self._parameters, agent.copies, settings.learning_rate, settings.adam_eps
-        )
+        self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""

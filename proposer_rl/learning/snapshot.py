@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torch.optim import Adam
 
-from proposer_rl.learning.adam import CopiesAdam
 from proposer_rl.models import ActorCritic
 
 
-def take_snapshot(agent: ActorCritic, adam: CopiesAdam) -> TensorDict:
+def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
+    """Torch's Adam whose state, usually made at the first step, is there from the beginning."""
+    cuda = parameters[0].is_cuda
+    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=True, capturable=cuda)
+    for parameter in parameters:
+        adam.state[parameter] = {
+            "step": torch.zeros((), device=parameter.device),
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+        }
+    return adam
+
+
+def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
     """A copy of weights and Adam's state, batch [K] with copies and [] without."""
     batch = _batch(agent)
     entries: dict[str, TensorDict] = {}
-    for i, (name, parameter) in enumerate(agent.named_parameters()):
-        state = adam.state(i)
+    for name, parameter in agent.named_parameters():
+        state = adam.state[parameter]
         entries[name] = TensorDict(
             {
                 "value": parameter.detach().clone(),
@@ -27,7 +43,7 @@ def take_snapshot(agent: ActorCritic, adam: CopiesAdam) -> TensorDict:
     return TensorDict(entries, batch)
 
 
-def restore_snapshot(agent: ActorCritic, adam: CopiesAdam, snapshot: TensorDictBase) -> None:
+def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> None:
     """Put a snapshot of as many copies back (in place).
 
     Raises:
@@ -48,8 +64,8 @@ def restore_snapshot(agent: ActorCritic, adam: CopiesAdam, snapshot: TensorDictB
     # The one question here that waits for the device.
     if not bool((steps == steps[:, :1]).all()):
         raise ValueError("the snapshot's copies have made different numbers of Adam steps")
-    for i, (name, parameter) in enumerate(parameters.items()):
-        entry, state = snapshot[name], adam.state(i)
+    for name, parameter in parameters.items():
+        entry, state = snapshot[name], adam.state[parameter]
         parameter.data.copy_(entry["value"])
         state["exp_avg"].copy_(entry["exp_avg"])
         state["exp_avg_sq"].copy_(entry["exp_avg_sq"])

@@ -31,7 +31,7 @@ class ExactEvaluator:
         p_T(goal) - step_penalty * sum over t < T of (1 - p_t(goal)),
 
     the sum being the expected number of steps. Rounding errors are those of float32 sums of
-    ``max_steps`` terms, about 1e-6. No gradient is kept.
+    ``max_steps`` terms, about 1e-6.
 
     Attributes:
         max_steps: Step limit of an episode.
@@ -66,8 +66,32 @@ class ExactEvaluator:
             generator: Unused.
 
         Returns:
-            ``"return"`` and ``"success"``, float32 ``[*B]`` each.
+            ``"return"`` and ``"success"``, float32 ``[*B]`` each, without gradients.
         """
+        return self._push(levels, cell_logits)
+
+    def differentiable(self, levels: Level, cell_logits: Tensor) -> TensorDict:
+        """Evaluates one policy in each maze, with gradients to its logits where they are enabled.
+
+        They take the memory of ``max_steps`` distributions over the cells instead of two.
+
+        Args:
+            levels: Levels ``[*B]``.
+            cell_logits: float ``[*B, 4, H, W]``.
+
+        Returns:
+            ``"return"`` and ``"success"``, ``[*B]`` each: float64 of float64 logits, else float32.
+
+        Raises:
+            ValueError: If the policy is greedy, which has no gradient.
+        """
+        if self.greedy:
+            raise ValueError("a greedy policy has no gradient: differentiate the sampled one's")
+        keep = cell_logits.requires_grad and torch.is_grad_enabled()
+        return self._push(levels, cell_logits, keep=keep)
+
+    def _push(self, levels: Level, cell_logits: Tensor, keep: bool = False) -> TensorDict:
+        """Pushes the distribution over cells; ``keep`` writes each step into memory of its own."""
         height, width = levels.walls.shape[-2:]
         goal = cell_index(levels.goal, width).flatten()  # [N]
         stay, leave = _transitions(levels, _policy(cell_logits, self.greedy), goal)
@@ -75,11 +99,14 @@ class ExactEvaluator:
         start = padded_index(cell_index(levels.start, width).flatten(), width)
         here.flatten(0, 1).scatter_(0, start.unsqueeze(0), 1.0)
         after, goal = torch.zeros_like(here), padded_index(goal, width).unsqueeze(0)
-        success, steps = torch.zeros(2, goal.shape[1], device=goal.device)
+        success, steps = here.new_zeros(2, goal.shape[1])
         for _ in range(self.max_steps):
-            steps += 1 - success
+            steps = steps + (1 - success)
             origin = here[1:-1, 1:-1]
-            torch.mul(origin, stay, out=after[1:-1, 1:-1])
+            if keep:
+                after = pad(origin * stay, (0, 0, 1, 1, 1, 1))
+            else:
+                torch.mul(origin, stay, out=after[1:-1, 1:-1])
             for move, chosen in zip(MOVES, leave, strict=True):
                 _shifted(after, move).addcmul_(origin, chosen)
             here, after = after, here
@@ -195,11 +222,12 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
 
 
 def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
-    """Action probabilities, float32 ``[*B, 4, H, W]``."""
+    """Action probabilities ``[*B, 4, H, W]``: float64 of float64 logits, else float32."""
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)
         return torch.zeros(cell_logits.shape, device=best.device).scatter_(-3, best, 1.0)
-    return cell_logits.float().softmax(-3)
+    precise = torch.promote_types(cell_logits.dtype, torch.float32)
+    return cell_logits.softmax(-3, dtype=precise)
 
 
 def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,22 +235,23 @@ def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, T
 
     Args:
         levels: Levels ``[*B]``, N of them.
-        policy: float32 ``[*B, 4, H, W]``.
+        policy: float ``[*B, 4, H, W]``.
         goal: int64 ``[N]``, number of the goal.
 
     Returns:
         The probability of staying at a cell, ``[H, W, N]``, and of leaving it by each action,
         ``[4, H, W, N]``; those of the goal are 1 and 0.
     """
-    free = pad(cells_first(~levels.walls).float(), (0, 0, 1, 1, 1, 1))  # [H+2, W+2, N]
-    leave = policy.reshape(-1, *policy.shape[-3:]).permute(1, 2, 3, 0).contiguous()
+    free = pad(cells_first(~levels.walls).to(policy), (0, 0, 1, 1, 1, 1))  # [H+2, W+2, N]
+    leave = policy.reshape(-1, *policy.shape[-3:]).permute(1, 2, 3, 0)  # [4, H, W, N]
+    leave = leave.clone(memory_format=torch.contiguous_format)
     leave.flatten(1, 2).scatter_(1, goal.expand(len(MOVES), 1, -1), 0.0)
     stay = torch.zeros_like(leave[0])
     stay.flatten(0, 1).scatter_(0, goal.unsqueeze(0), 1.0)
-    for chosen, move in zip(leave, MOVES, strict=True):
+    for action, move in enumerate(MOVES):
         open_ahead = _shifted(free, move)
-        stay += chosen * (1 - open_ahead)
-        chosen *= open_ahead
+        stay += leave[action] * (1 - open_ahead)
+        leave[action].mul_(open_ahead)
     return stay, leave
 
 

@@ -47,6 +47,7 @@ LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 SLACK = 2  # of a named level: steps allowed for each move of its shortest path
+TEXT_KEY = "S start, G goal, • the Solver's episode"
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
@@ -145,6 +146,7 @@ class MazeTask:
                 f"{self._evaluation.levels} fixed levels each",
             },
             "key": KEY,
+            "text_key": TEXT_KEY,
             "measured": {
                 "maze": measured,
                 "distributions": self._measured,
@@ -183,6 +185,11 @@ class MazeTask:
     ) -> TensorDictBase:
         """Return and success of K Solvers on levels [E], [K, E], as the settings ask for it."""
         return self._evaluator(*_with_logits(agent, levels), generator)
+
+    def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
+        """Exact return and success of K Solvers, each on its own levels [K, E], with gradients."""
+        logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
+        return self._sampled.differentiable(levels, logits)
 
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
@@ -237,7 +244,7 @@ class MazeTask:
                     lines[row][column] = "•"
             yield {
                 "picture": png(draw_level(levels[i], path).numpy()),
-                "text": ["".join(line) for line in lines],
+                "text": [" ".join(line) for line in lines],
                 **({} if path is None else {"path": path}),
             }
 

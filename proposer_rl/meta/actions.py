@@ -81,7 +81,7 @@ class Mixture(Actions):
 
     Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]: the zero action
     is the even mixture. Batches of one policy really differ then, and what the Solver gained can be
-    credited to the mixture that it trained on. The draws are :func:`systematic`.
+    credited to the mixture that it trained on. The draws are :func:`systematic_draw`.
 
     Args:
         space: the bins, and the levels in them.
@@ -116,10 +116,10 @@ class Mixture(Actions):
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
         """Systematic draws from the mixture of actions [K, D]."""
-        return systematic(self.shares(action), batch_size, generators)
+        return systematic_draw(self.shares(action), batch_size, generators)
 
 
-def systematic(shares: Tensor, count: int, generators: Sequence[torch.Generator]) -> Tensor:
+def systematic_draw(shares: Tensor, count: int, generators: Sequence[torch.Generator]) -> Tensor:
     """Bins that occur as often as their shares of ``count`` draws say, rounded up or down.
 
     Systematic sampling: one random offset, then a mark in each ``count``-th part of the cumulated
@@ -134,7 +134,7 @@ def systematic(shares: Tensor, count: int, generators: Sequence[torch.Generator]
         int64 [K, P].
 
     Example:
-        >>> choices = systematic(torch.tensor([[0.25, 0.75]]), 8, [torch.Generator()])
+        >>> choices = systematic_draw(torch.tensor([[0.25, 0.75]]), 8, [torch.Generator()])
         >>> choices.sum()  # the second occurs in 3/4 of 8 draws
         tensor(6)
     """

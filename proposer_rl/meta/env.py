@@ -59,7 +59,7 @@ class SolverTrainingEnv(EnvBase):
         actions: Actions,
         reward: Reward,
         meta_episode_length: int,
-        action_repeat: int = 1,
+        action_repeat: int,
         first_copy: int = 0,
         on_update: Callable[[], None] | None = None,
     ) -> None:
@@ -128,7 +128,7 @@ class SolverTrainingEnv(EnvBase):
             self.on_update()
         proposed = _count(torch.cat(choices, -1), self.actions.bins).to(self.device)
         state = self._observation(*self._seen, proposed)
-        return state.set("reward", sum(rewards).unsqueeze(-1))
+        return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))
 
     def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
         """One update of every Solver: its reward [K], and the bins that were chosen [K, P]."""

@@ -8,7 +8,7 @@ which a Proposer can learn from, and that within, which it cannot.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -84,7 +84,6 @@ def variance_components(gains: Tensor) -> Signal:
     )
 
 
-@torch.no_grad()
 def performance_around(
     env: SolverTrainingEnv,
     solver: TensorDictBase,
@@ -92,9 +91,24 @@ def performance_around(
     levels: Levels,
     streams: Streams,
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """Performance of copies of a Solver before and after one episode, level by level.
+    """Performance of copies of a Solver before and after an episode; see :func:`performance_at`."""
+    before, after = performance_at([0, len(actions)], env, solver, actions, levels, streams)
+    return before, after
+
+
+@torch.no_grad()
+def performance_at(
+    steps: Collection[int],
+    env: SolverTrainingEnv,
+    solver: TensorDictBase,
+    actions: Tensor,
+    levels: Levels,
+    streams: Streams,
+) -> list[TensorDictBase]:
+    """Performance of copies of a Solver along one episode, level by level.
 
     Args:
+        steps: of the episode, after which it is measured, ascending from 0 on.
         env: the meta-environment, batch [K] with K = G * R.
         solver: a snapshot of one Solver, batch [].
         actions: those of G proposals in an episode of T steps, [T, G, ...]; R copies follow each.
@@ -102,7 +116,7 @@ def performance_around(
         streams: of all randomness, which is different for every copy.
 
     Returns:
-        Two tensordicts [G, R, E].
+        A tensordict [G, R, E] for each of the steps.
     """
     groups = actions.shape[1]
     replicates = env.batch_size[0] // groups
@@ -114,11 +128,13 @@ def performance_around(
         return performance.clone().unflatten(0, (groups, replicates))
 
     env.fork(solver, streams)
-    before = measured()
+    found = [measured()] if 0 in steps else []
     state = env.reset()
-    for action in actions.repeat_interleave(replicates, 1):
+    for step, action in enumerate(actions.repeat_interleave(replicates, 1), 1):
         _, state = env.step_and_maybe_reset(state.set("action", action))
-    return before, measured()
+        if step in steps:
+            found.append(measured())
+    return found
 
 
 def by_validation_size(gains: Tensor, sizes: Sequence[int]) -> dict[int, Signal]:

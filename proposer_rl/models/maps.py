@@ -68,17 +68,22 @@ def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Ten
     return read[..., :-1], read[..., -1:]
 
 
-@torch.no_grad()
-def cell_logits(agent: ActorCritic, planes: Tensor) -> Tensor:
+def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) -> Tensor:
     """Action logits at every cell of levels: what the agent would do wherever it stood.
 
     Args:
         agent: from :func:`map_actor_critic`.
         planes: the levels without the agent, float [*B, C, H, W], with copies [K, *B, C, H, W].
+        gradients: whether they flow to the agent's parameters.
 
     Returns:
         float [*B, A, H, W].
     """
+    with torch.set_grad_enabled(gradients):
+        return _cell_logits(agent, planes)
+
+
+def _cell_logits(agent: ActorCritic, planes: Tensor) -> Tensor:
     batch = planes.shape[:-3]
     if agent.encoder is not None:
         (planes_key,) = agent.level_keys

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from tqdm import tqdm
 
 from proposer_rl.report import curves, levels, outcomes, page, proposals
 from proposer_rl.report.findings import finding_table, findings
+from proposer_rl.report.records import is_rate
 from proposer_rl.report.runs import find_runs
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, save
@@ -38,12 +38,7 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
 class OutputError(ValueError):
     """The output folder cannot be taken; the message is one line."""
 
-
-class _Content(NamedTuple):
-    """A study's part of the report: its section, and files by their path in the folder."""
-
-    section: page.Section
-    files: dict[str, bytes]
+    exit_code = 2
 
 
 def write_report(
@@ -66,18 +61,21 @@ def write_report(
     """
     _check_output(output)
     studies, notes = read_studies(find_runs(folders), threshold)
-    steps = sum(len(DRAWINGS) + 1 for _ in studies)
-    bar = tqdm(total=steps, desc="Report", disable=not progress, leave=False)
-    with bar:
-        contents = [
-            _content(study, f"{_slug(study.title)}_" if len(studies) > 1 else "", bar)
-            for study in studies
-        ]
-    title = "Curricula for a maze Solver: what the runs show"
+    for study in studies:
+        if threshold is not None and is_rate(study.headline) and not 0 < threshold <= 1:
+            raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
+    files: dict[str, bytes] = {}
+    sections = []
+    with tqdm(
+        total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
+    ) as bar:
+        for study in studies:
+            prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
+            sections.append(_section(study, prefix, files, bar))
+    title = "Curricula: what the runs show"
     command = page.report_command(folders, threshold)
-    html = page.render(title, command, [content.section for content in contents], notes)
-    files = {name: data for content in contents for name, data in content.files.items()}
-    files["report.md"] = _markdown(title, command, contents).encode()
+    html = page.render(title=title, command=command, sections=sections, notes=notes)
+    files["report.md"] = _markdown(title, command, sections).encode()
     _write(output, files)
     write_atomically(output / PAGE, html.encode())
     return output / PAGE
@@ -93,59 +91,42 @@ def _check_output(output: Path) -> None:
         )
 
 
-def _content(study: Study, prefix: str, bar: tqdm) -> _Content:
-    files: dict[str, bytes] = {}
-    bar.set_postfix_str("statistics")
+def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> page.Section:
+    """What the page shows of a study; its files are added to the others."""
     found = findings(study)
-    tables = [
-        outcomes.group_table(study),
-        outcomes.comparison_table(list(outcomes.comparisons(study))),
-        outcomes.run_table(study),
-    ]
-    for table in (*tables, finding_table(found)):
+    claims, methods = finding_table(found), outcomes.group_table(study)
+    tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
+    for table in (methods, *tables, claims):
         files[f"{TABLES}/{prefix}{table.name}.csv"] = table.to_csv().encode()
         files[f"{TABLES}/{prefix}{table.name}.md"] = table.to_markdown().encode()
     for name, tidy in (("metrics", outcomes.tidy_metrics), ("cycles", outcomes.tidy_cycles)):
         header, rows = tidy(study)
         if rows:
             files[f"{TABLES}/{prefix}{name}.csv"] = to_csv(header, rows).encode()
-    bar.update()
     figures = []
     for draw in DRAWINGS:
         bar.set_postfix_str(draw.__name__.replace("_", " "))
         drawing = draw(study)
         if drawing is not None:
-            animations = _animations(study) if draw is proposals.heat_maps else {}
-            figures.append(page.figure(drawing, animations))
-            files |= dict(_figure_files(drawing, animations, prefix))
+            path = f"{FIGURES}/{prefix}{drawing.name}"
+            figures.append(page.figure(drawing))
+            files |= {f"{path}.{suffix}": content for suffix, content in save(drawing).items()}
+            animations = [panel.animation for panel in drawing.panels if panel.animation]
+            files |= {f"{path}_{_slug(name)}.gif": content for name, content in animations}
         bar.update()
-    section = page.Section(
-        study=study,
-        facts=page.facts(study),
-        unfinished=page.unfinished(study),
-        overview=tables[0],
-        finding_note=finding_table(found).note,
-        findings=found,
-        figures=figures,
-        tables=tables[1:],
-        commands=page.commands(study),
-        configs=page.configs(study),
-    )
-    return _Content(section, files)
-
-
-def _animations(study: Study) -> dict[str, bytes]:
-    found = {group.label: proposals.animate(group) for group in proposals.proposers(study)}
-    return {label: content for label, content in found.items() if content is not None}
-
-
-def _figure_files(
-    drawing: Drawing, animations: dict[str, bytes], prefix: str
-) -> Iterator[tuple[str, bytes]]:
-    for suffix, content in save(drawing).items():
-        yield f"{FIGURES}/{prefix}{drawing.name}.{suffix}", content
-    for label, content in animations.items():
-        yield f"{FIGURES}/{prefix}{drawing.name}_{_slug(label)}.gif", content
+    return {
+        "study": study,
+        "facts": page.facts(study),
+        "unfinished": page.unfinished(study),
+        "methods": methods,
+        "claims": claims,
+        "findings": found,
+        "figures": figures,
+        "picture": f"{FIGURES}/{prefix}learning_curves.png",
+        "tables": tables,
+        "commands": page.commands(study),
+        "configs": page.configs(study),
+    }
 
 
 def _write(output: Path, files: dict[str, bytes]) -> None:
@@ -159,22 +140,17 @@ def _write(output: Path, files: dict[str, bytes]) -> None:
         write_atomically(output / name, content)
 
 
-def _markdown(title: str, command: str, contents: Sequence[_Content]) -> str:
+def _markdown(title: str, command: str, sections: Sequence[page.Section]) -> str:
     """The report in short, for where HTML is not shown."""
     parts = [f"# {title}\n", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
     parts += ["It is written by\n", f"```bash\n{command}\n```\n"]
-    for content in contents:
-        section = content.section
-        parts += [f"## {section.study.title}\n"]
-        parts += [
-            f"- {escape_markdown(name)}: {escape_markdown(value)}" for name, value in section.facts
-        ]
-        for name in sorted(content.files):
-            if name.endswith("learning_curves.png"):
-                parts.append(f"\n![Learning curves and updates to the threshold]({name})\n")
-        for table in (finding_table(section.findings), section.overview):
+    for section in sections:
+        parts += [f"## {escape_markdown(section['study'].title)}\n"]
+        parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in section["facts"]]
+        parts.append(f"\n![Learning curves and updates to the threshold]({section['picture']})\n")
+        for table in (section["claims"], section["methods"]):
             parts += [f"### {table.title}\n", f"{table.note}\n", table.to_markdown()]
-        parts += ["### Commands\n", "```bash", *section.commands, "```\n"]
+        parts += ["### Commands\n", "```bash", *section["commands"], "```\n"]
     return "\n".join(parts)
 
 

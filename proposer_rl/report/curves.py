@@ -1,8 +1,8 @@
-"""Curves over training: success against updates, frames and seconds, with intervals over seeds."""
+"""Curves over training: what was measured against updates, frames and seconds, over seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from textwrap import fill
 
@@ -10,28 +10,30 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from proposer_rl.report.outcomes import updates_needed, waiting_outcome, words
-from proposer_rl.report.runs import Column, Run
+from proposer_rl.report.outcomes import updates_needed, waiting_outcome
+from proposer_rl.report.records import Column, is_rate, level_text, words
+from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Panel, axes_of, look, style
+from proposer_rl.report.style import PANEL, Drawing, Panel, axes_of, look, style
 
 GRID_POINTS = 200
+MOST_PANELS = 12
 
 
 def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
-    panels = [_curve_panel(study, f"{name}_success") for name in study.measured]
+    panels = [_curve_panel(study, name) for name in study.measurements[:MOST_PANELS]]
     rows = len(study.groups)
     bars = Panel(
-        "updates",
-        f"Updates until {words(study.headline)} reached {study.threshold:.0%}, by method.",
+        f"Updates until {words(study.headline)} reached "
+        f"{level_text(study.headline, study.threshold)}, by method.",
         partial(_draw_bars, study=study),
-        (panels[0].size[0], max(1.2 + 0.4 * rows, panels[0].size[1])),
+        (PANEL[0], max(1.2 + 0.4 * rows, PANEL[1])),
     )
     return Drawing(
         "learning_curves",
-        "Success during training, and updates needed (the paper's Figure 2)",
+        "The Solver during training, and updates needed (the paper's Figure 2)",
         "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t). Thin: not all "
         "runs of the method are that long. Bars: mean number of updates, cut at the "
         "horizon, with a bootstrap interval; dots are runs, triangles censored runs, which never "
@@ -43,8 +45,8 @@ def learning_curves(study: Study) -> Drawing:
 
 
 def worst_levels(study: Study) -> Drawing | None:
-    """Success on the tenth of the levels where it is lowest; None where that was not measured."""
-    names = [f"{name}_success_worst10" for name in study.measured]
+    """The tenth of the levels where the Solver is worst; None where that was not measured."""
+    names = [f"{name}_worst10" for name in study.measurements[:MOST_PANELS]]
     panels = [
         _curve_panel(study, name) for name in names if any(name in r.metrics for r in study.runs)
     ]
@@ -52,68 +54,50 @@ def worst_levels(study: Study) -> Drawing | None:
         return None
     return Drawing(
         "worst_levels",
-        "Success on the worst tenth of the levels (CVaR)",
-        "Mean success over the 10 % of the levels where it is lowest at that moment: a policy that "
-        "gives up on hard levels shows here first.",
+        f"The worst tenth of the {study.example.task.levels} (CVaR)",
+        f"Mean over the 10 % of the {study.example.task.levels} where the Solver is worst at that "
+        "moment: a policy that gives up on hard ones shows here first.",
         panels,
         labels=[group.label for group in study.groups],
     )
 
 
 def cost_curves(study: Study) -> Drawing:
-    """The headline against what was paid for it, the copies' training counted."""
-    label = words(study.headline)
-    axes: list[tuple[str, str, Callable[[Run], Column]]] = [
-        ("frames", "environment frames, millions (copies' counted)", _million_frames),
-        ("seconds", "wall-clock minutes (copies' counted)", _minutes),
-    ]
+    """The headline against what was paid for it, the curriculum's part counted."""
+    costs: dict[str, Callable[[Run], Column]] = {
+        "environment frames, millions": lambda run: run.total_frames / 1e6,
+        "wall-clock minutes": lambda run: (run.own_seconds - run.own_seconds[0]) / 60,
+    }
     return Drawing(
         "cost",
-        "The same success against its whole cost",
-        "Frames: the Solver's own plus those of the K copies on which the Proposer learnt. "
+        f"The same {words(study.headline)} against its whole cost",
+        "Frames: the Solver's own plus those that the curriculum spent, on copies or on scoring. "
         "Minutes: of the whole process, evaluation included; where seeds were trained together, "
         "an even share. Minutes can be compared only between runs on equal machines.",
         [
             Panel(
-                name,
-                f"{label} against {axis}, by method.",
-                partial(
-                    _draw_against_cost, groups=study.groups, name=study.headline, axis=axis, x=cost
-                ),
+                f"{words(study.headline)} against {axis} (the curriculum's counted), by method.",
+                partial(_draw_against_cost, study=study, axis=f"{axis} (all)", x=cost),
             )
-            for name, axis, cost in axes
+            for axis, cost in costs.items()
         ],
         labels=[group.label for group in study.groups],
     )
 
 
 def difficulty(study: Study) -> Drawing | None:
-    """What the Solver trained on, for every method."""
-    columns = {
-        "path_length": "mean shortest path (moves)",
-        "obstacle_fraction": "mean share of obstacle cells",
-        "train_success": "success rate on the batch",
-    }
-    groups = [
-        group for group in study.groups if all("path_length" in r.training for r in group.runs)
-    ]
-    if not groups:
+    """What the Solver trained on, by the task's own statistics."""
+    names = list(dict.fromkeys(name for run in study.runs for name in run.statistics))
+    if not names:
         return None
     return Drawing(
         "difficulty",
         "What the Solver trained on",
-        "Means over the batch of each evaluated update: its shortest paths, its obstacles, and the "
-        "Solver's first episodes on it. Lines and bands as above.",
-        [
-            Panel(
-                name,
-                f"{text}, by method.",
-                partial(_draw_training, groups=groups, name=name, axis=text),
-            )
-            for name, text in columns.items()
-        ],
+        "Statistics of the task over the batch of each evaluated update: means, or where a name "
+        "says so standard deviations (sd). Lines and bands as above.",
+        [_curve_panel(study, name, "training") for name in names[:MOST_PANELS]],
         3,
-        [group.label for group in groups],
+        [group.label for group in study.groups],
     )
 
 
@@ -129,105 +113,84 @@ def draw_curve(axes: Axes, x: Column, rows: Column, label: str) -> Column:
     Returns:
         The mean, float [n].
     """
-    present = (~np.isnan(rows)).sum(0)
-    mean = np.array(
-        [
-            values[~np.isnan(values)].mean() if n else np.nan
-            for values, n in zip(rows.T, present, strict=True)
-        ]
-    )
-    whole = present == len(rows)
+    mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
+    whole = ~np.isnan(rows).any(0)
     axes.plot(x, mean, alpha=0.5, linewidth=0.8, **style(label))
-    axes.plot(x, np.where(whole, mean, np.nan), **style(label))
+    axes.plot(x, np.where(whole, mean, np.nan), **style(label), marker="." if len(x) == 1 else "")
     if len(rows) > 1 and whole.any():
-        bounds = np.array([mean_interval(values) for values in rows.T[whole]])
-        axes.fill_between(
-            x[whole], bounds[:, 1], bounds[:, 2], color=look(label).colour, alpha=0.15, linewidth=0
-        )
+        _, low, high = np.array([mean_interval(values) for values in rows.T[whole]]).T
+        axes.fill_between(x[whole], low, high, color=look(label).colour, alpha=0.15, linewidth=0)
     return mean
 
 
-def focus(axes: Axes, means: Sequence[Column], *, zero: bool = False) -> None:
-    """Limit the ordinate to the means with some margin: intervals of few runs can be huge.
+def finish(
+    axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
+) -> None:
+    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge.
 
     Args:
         axes: where they are drawn.
+        x: name of the abscissa.
+        y: name of the ordinate.
         means: of all methods.
-        zero: whether the ordinate begins at zero.
+        rate: whether the ordinate goes from 0 to 1.
+        zero: whether it begins at zero, where nothing is less.
     """
-    values = np.concatenate(means) if means else np.empty(0)
+    axes.set(xlabel=x, ylabel=y)
+    axes.margins(x=0.01)
+    values = np.concatenate([[], *means])
     values = values[np.isfinite(values)]
-    if len(values):
-        low, high = (0.0 if zero else float(values.min())), float(values.max())
-        margin = 0.3 * (high - low) or 0.1 * abs(high) or 1.0
-        axes.set_ylim(low - (0 if zero else margin), high + margin)
+    if rate or not len(values):
+        axes.set_ylim(0, 1)
+        return
+    low, high = float(values.min()), float(values.max())
+    zero = zero and low >= 0
+    margin = 0.3 * (high - (0 if zero else low)) or 0.1 * abs(high) or 1.0
+    axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
-def _curve_panel(study: Study, name: str) -> Panel:
-    return Panel(
-        name,
-        f"{words(name)} against Solver updates, by method.",
-        partial(_draw_curves, groups=study.groups, name=name),
-    )
+def _curve_panel(study: Study, name: str, table: str = "metrics") -> Panel:
+    trained = table == "training"
+    text = name.replace("_", " ") if trained else words(name)
+    draw = partial(_draw_curves, groups=study.groups, name=name, table=table)
+    return Panel(f"{text} against Solver updates, by method.", draw)
 
 
-def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str) -> None:
-    axes = axes_of(figure)
-    for group in groups:
-        runs = [run for run in group.runs if name in run.metrics]
-        if runs:
-            x = np.unique(np.concatenate([run.metrics["updates"] for run in runs]))
-            rows = np.array([[run.at(name, updates) for updates in x] for run in runs])
-            draw_curve(axes, x, rows, group.label)
-    _finish(axes, "Solver updates", f"{words(name).replace('worst10', 'on the worst 10 %')} rate")
-    axes.set_ylim(0, 1)
-
-
-def _draw_training(figure: FigureBase, groups: Sequence[Group], name: str, axis: str) -> None:
+def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: str) -> None:
     axes = axes_of(figure)
     means = []
     for group in groups:
-        x = np.unique(np.concatenate([run.training["updates"] for run in group.runs]))
-        rows = np.array([_values_at(run.training, name, x) for run in group.runs])
-        means.append(draw_curve(axes, x, rows, group.label))
-    _finish(axes, "Solver updates", axis)
-    if "success" in name:
-        axes.set_ylim(0, 1)
-    else:
-        focus(axes, means, zero=True)
-
-
-def _values_at(columns: Mapping[str, Column], name: str, x: Column) -> Column:
-    values = dict(zip(columns["updates"], columns[name], strict=True))
-    return np.array([values.get(updates, np.nan) for updates in x])
+        columns = [getattr(run, table) for run in group.runs if name in getattr(run, table)]
+        if columns:
+            x = np.unique(np.concatenate([own["updates"] for own in columns]))
+            rows = np.full((len(columns), len(x)), np.nan)
+            for row, own in zip(rows, columns, strict=True):
+                row[np.searchsorted(x, own["updates"])] = own[name]
+            means.append(draw_curve(axes, x, rows, group.label))
+    trained = table == "training"
+    text = name.replace("_", " ") if trained else _axis(name)
+    finish(axes, "Solver updates", text, means, rate=is_rate(name), zero=trained)
 
 
 def _draw_against_cost(
-    figure: FigureBase,
-    groups: Sequence[Group],
-    name: str,
-    axis: str,
-    x: Callable[[Run], Column],
+    figure: FigureBase, study: Study, axis: str, x: Callable[[Run], Column]
 ) -> None:
     """Runs stand at different costs when they are measured, so they are interpolated in between."""
-    axes = axes_of(figure)
-    for group in groups:
+    axes, name = axes_of(figure), study.headline
+    means = []
+    for group in study.groups:
         grid = np.linspace(0, max(x(run)[-1] for run in group.runs), GRID_POINTS)
         rows = [
             np.interp(grid, x(run), run.metrics[name], left=np.nan, right=np.nan)
             for run in group.runs
         ]
-        draw_curve(axes, grid, np.array(rows), group.label)
-    _finish(axes, axis, f"{words(name)} rate")
-    axes.set_ylim(0, 1)
+        means.append(draw_curve(axes, grid, np.array(rows), group.label))
+    finish(axes, axis, _axis(name), means, rate=is_rate(name))
 
 
-def _million_frames(run: Run) -> Column:
-    return run.total_frames / 1e6
-
-
-def _minutes(run: Run) -> Column:
-    return (run.own_seconds - run.own_seconds[0]) / 60
+def _axis(name: str) -> str:
+    rate = " rate" if is_rate(name) else ""
+    return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
 
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:
@@ -259,8 +222,3 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
     axes.set_xlabel(waiting_outcome(study, study.threshold).name)
-
-
-def _finish(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    axes.margins(x=0.01)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from proposer_rl.report.runs import COST, Run
+from proposer_rl.report import records
+from proposer_rl.report.records import LONGEST_TEXT, level_text, words
+from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     Interval,
     Values,
@@ -24,9 +26,10 @@ from proposer_rl.report.statistics import (
     seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.tables import Cell, Columns, Table, adaptive, number
+from proposer_rl.report.tables import Cell, Table
 
 MILLION = 1e6
+MOST_COLUMNS, DEEPEST = 200, 8
 
 
 class Comparison(NamedTuple):
@@ -72,35 +75,36 @@ def outcomes(study: Study) -> list[Outcome]:
 
     def plain(name: str, value: Callable[[Run], float]) -> Outcome:
         def values(group: Group) -> list[float]:
-            found = [value(run) for run in group.runs]
-            return [one for one in found if not math.isnan(one)]
+            return [one for run in group.runs if not math.isnan(one := value(run))]
 
         return Outcome(name, values, lambda a, b: mean_difference(values(a), values(b)), 1)
 
-    finals = [f"{name}_success" for name in study.measured]
+    mean = f"{words(headline)}, mean over {horizon} updates"
     return [
         waiting_outcome(study, study.threshold),
-        plain(
-            f"{words(headline)}, mean over {horizon} updates",
-            lambda run: run.mean_until(headline, horizon),
-        ),
+        plain(mean, lambda run: run.mean_until(headline, horizon)),
         *(
-            plain(f"{words(name)} after {horizon} updates", partial(_at, name, horizon))
-            for name in finals
+            plain(
+                f"{words(name)} after {horizon} updates",
+                partial(Run.at, measurement=name, updates=horizon),
+            )
+            for name in study.measurements
         ),
     ]
 
 
 def waiting_outcome(study: Study, threshold: float) -> Outcome:
     """Restricted updates to a threshold of the headline measurement."""
-    headline, limit = study.headline, study.restricted_to(threshold)
+    name, limit = study.headline, study.restricted_to(threshold)
+
+    def difference(one: Group, other: Group) -> Interval:
+        waiting = [group.waiting(name, threshold) for group in (one, other)]
+        return restricted_difference(waiting[0], waiting[1], limit)
 
     return Outcome(
-        f"updates to {threshold:.0%} {words(headline)} (at most {limit:.0f})",
-        lambda group: pseudo_values(group.waiting(headline, threshold), limit),
-        lambda a, b: restricted_difference(
-            a.waiting(headline, threshold), b.waiting(headline, threshold), limit
-        ),
+        f"updates to {level_text(name, threshold)} {words(name)} (at most {limit:.0f})",
+        lambda group: pseudo_values(group.waiting(name, threshold), limit),
+        difference,
         -1,
     )
 
@@ -130,127 +134,100 @@ def compare(outcome: Outcome, one: Group, other: Group) -> Comparison:
     )
 
 
-def comparisons(study: Study) -> Iterator[Comparison]:
+def comparisons(study: Study) -> list[Comparison]:
     """Every pair of groups by every outcome."""
-    for outcome in outcomes(study):
-        for one, other in combinations(study.compared, 2):
-            yield compare(outcome, one, other)
+    pairs = list(combinations(study.compared, 2))
+    return [compare(outcome, *pair) for outcome in outcomes(study) for pair in pairs]
 
 
-def comparison_table(rows: Sequence[Comparison]) -> Table:
-    """Pairs of groups; written with enough decimals for success rates."""
-    return Table(
-        "comparisons",
-        "Pairwise comparisons",
-        "Difference: first minus second, with a 95 % interval: percentile bootstrap over the runs "
-        "for updates, Welch's for success. P(first better): over all pairs of runs, ties count "
-        "half. Seeds needed: per method, for a power of 80 % at 5 % if the true difference is the "
-        "one seen. No correction for the number of comparisons.",
+def comparison_table(study: Study) -> Table:
+    """Every pair of groups by every outcome."""
+    rows: list[dict[str, Cell]] = [
         {
-            "outcome": str,
-            "first": str,
-            "second": str,
-            "difference": adaptive,
-            "better": str,
-            "P(first better)": number(2),
-            "seeds needed": number(0),
-        },
-        [
-            [
-                row.outcome,
-                row.one,
-                row.other,
-                row.difference,
-                row.better or "undecided",
-                row.improvement,
-                row.seeds,
-            ]
-            for row in rows
-        ],
+            "outcome": row.outcome,
+            "first": row.one,
+            "second": row.other,
+            "difference": row.difference,
+            "better": row.better or "undecided",
+            "P(first better)": row.improvement,
+            "seeds needed": row.seeds,
+        }
+        for row in comparisons(study)
+    ]
+    note = (
+        "Difference: first minus second, with a 95 % interval: percentile bootstrap over the runs "
+        "for updates, Welch's for the others. P(first better): over all pairs of runs, ties count "
+        "half. Seeds needed: per method, for a power of 80 % at 5 % if the true difference is the "
+        "one seen. No correction for the number of comparisons."
     )
+    return Table("comparisons", "Pairwise comparisons", note, rows)
 
 
 def group_table(study: Study) -> Table:
     """One row per group."""
-    waiting, headline = waiting_outcome(study, study.threshold).name, study.headline
-    horizon = study.horizon
-    finals = [f"{name}_success" for name in study.measured]
-    worst = f"{headline}_worst10"
-    columns: Columns = {
-        "method": str,
-        "seeds": number(0),
-        f"reached {study.threshold:.0%}": str,
-        waiting: number(0),
-        **{f"{words(name)} after {horizon} updates": number(3) for name in finals},
-        f"IQM of {words(headline)}": number(3),
-        f"{words(headline)}, worst 10 % of levels": number(3),
-        "frames (M)": number(2),
-        "with the copies' (M)": number(2),
-        "seconds per run": number(0),
-    }
-    rows: list[list[Cell]] = []
+    headline, horizon, threshold = study.headline, study.horizon, study.threshold
+    waiting, worst = waiting_outcome(study, threshold).name, f"{headline}_worst10"
+    rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        runs = group.runs
-        final = _known(runs, headline, horizon)
-        reached = sum(run.reached for run in group.waiting(headline, study.threshold))
-        rows.append(
-            [
-                group.label,
-                len(runs),
-                f"{reached} of {len(runs)}",
-                updates_needed(study, group, study.threshold) if group in study.compared else None,
-                *(_mean(_known(runs, name, horizon)) for name in finals),
-                interquartile_mean(final) if final else None,
-                _mean(_known(runs, worst, horizon)),
-                float(np.mean([run.metrics["frames"][-1] for run in runs])) / MILLION,
-                float(np.mean([run.total_frames[-1] for run in runs])) / MILLION,
-                float(np.mean([run.own_seconds[-1] for run in runs])),
-            ]
-        )
+        runs, final = group.runs, _known(group.runs, headline, horizon)
+        reached = sum(run.reached for run in group.waiting(headline, threshold))
+        needed = updates_needed(study, group, threshold) if group in study.compared else None
+        row: dict[str, Cell] = {
+            "method": group.label,
+            "seeds": len(runs),
+            f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
+            waiting: needed,
+        }
+        for name in study.measurements:
+            row[f"{words(name)} after {horizon} updates"] = _mean(_known(runs, name, horizon))
+        row[f"IQM of {words(headline)}"] = interquartile_mean(final) if final else None
+        if any(worst in run.metrics for run in study.runs):
+            row[f"{words(headline)}, worst 10 %"] = _mean(_known(runs, worst, horizon))
+        cost: dict[str, Callable[[Run], float]] = {
+            "frames (M)": lambda run: run.metrics["frames"][-1] / MILLION,
+            "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
+            "evaluations": lambda run: run.metrics["evaluations"][-1],
+            "seconds per run": lambda run: run.own_seconds[-1],
+        }
+        row |= {name: float(np.mean([paid(run) for run in runs])) for name, paid in cost.items()}
+        rows.append(row)
     note = (
-        f"Updates: mean of min(updates, {study.restricted_to(study.threshold):.0f}) by "
-        "Kaplan-Meier, so that "
-        "censored runs count; measured every few updates, so never exact. Brackets: 95 % interval."
+        f"Updates: mean of min(updates, {study.restricted_to(threshold):.0f}) by Kaplan-Meier, so "
+        "that censored runs count; measured every few updates, so never exact. Frames: the "
+        "Solver's own, and with all that the curriculum spent. Evaluations: of levels, asked for "
+        "by the curriculum. Brackets: 95 % interval."
     )
-    return Table("methods", "Methods", note, columns, rows)
+    return Table("methods", "Methods", note, rows)
 
 
 def run_table(study: Study) -> Table:
     """One row per run."""
-    headline = study.headline
-    measured = [f"{name}_success" for name in study.measured]
-    rows: list[list[Cell]] = []
+    rows: list[dict[str, Cell]] = []
     for group in study.groups:
         for run in group.runs:
-            waiting = run.waiting(headline, study.threshold)
+            waiting = run.waiting(study.headline, study.threshold)
+            last = {name: float(values[-1]) for name, values in run.metrics.items()}
             rows.append(
-                [
-                    group.label,
-                    run.seed,
-                    run.folder.name,
-                    "finished" if run.finished else "unfinished",
-                    run.updates,
-                    waiting.updates if waiting.reached else None,
-                    "reached" if waiting.reached else f"censored at {waiting.updates:.0f}",
-                    *(float(run.metrics[name][-1]) for name in measured),
-                    *(float(run.metrics[name][-1]) for name in COST[1:3]),
-                    float(run.own_seconds[-1]),
-                ]
+                {
+                    "method": group.label,
+                    "seed": str(run.seed),
+                    "folder": run.folder.name,
+                    "state": "finished" if run.finished else "unfinished",
+                    "updates": run.updates,
+                    f"updates to {level_text(study.headline, study.threshold)}": (
+                        int(waiting.updates) if waiting.reached else None
+                    ),
+                    "threshold": (
+                        "reached" if waiting.reached else f"censored at {waiting.updates:.0f}"
+                    ),
+                    **{f"last {words(name)}": last[name] for name in study.measurements},
+                    "frames": int(last["frames"]),
+                    "the curriculum's frames": int(last["curriculum_frames"]),
+                    "evaluations": int(last["evaluations"]),
+                    "seconds": float(run.own_seconds[-1]),
+                }
             )
-    columns: Columns = {
-        "method": str,
-        "seed": str,
-        "folder": str,
-        "state": str,
-        "updates": number(0),
-        f"updates to {study.threshold:.0%}": number(0),
-        "threshold": str,
-        **{f"last {words(name)}": number(3) for name in measured},
-        "frames": number(0),
-        "frames of copies": number(0),
-        "seconds": number(0),
-    }
-    return Table("runs", "Runs", "Success is that at the run's last evaluation.", columns, rows)
+    return Table("runs", "Runs", "Measurements are the run's last.", rows)
 
 
 def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
@@ -259,52 +236,32 @@ def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
     rows: list[list[Cell]] = []
     for group in study.groups:
         for run in group.runs:
-            for i in range(len(run.metrics["updates"])):
-                values = [
-                    float(run.metrics[name][i]) if name in run.metrics else math.nan
-                    for name in names
-                ]
-                rows.append([group.label, run.seed, *values])
+            none = np.full(len(run.metrics["updates"]), math.nan)
+            columns = [run.metrics.get(name, none) for name in names]
+            rows += [[group.label, run.seed, *map(float, row)] for row in np.transpose(columns)]
     return ["method", "seed", *names], rows
 
 
 def tidy_cycles(study: Study) -> tuple[list[str], list[list[Cell]]]:
-    """Every cycle of every Proposer: its scalars, its gains, its proposals."""
-    records = [
-        (group.label, run.seed, cycle)
-        for group in study.groups
-        for run in group.runs
+    """Every cycle of every curriculum: whatever it recorded, lists as numbers with spaces."""
+    found = [(group.label, run) for group in study.groups for run in group.logs]
+    names = list(dict.fromkeys(name for _, run in found for cycle in run.cycles for name in cycle))
+    names = names[:MOST_COLUMNS]
+    rows: list[list[Cell]] = [
+        [label, run.seed, *(_cell(cycle.get(name)) for name in names)]
+        for label, run in found
         for cycle in run.cycles
     ]
-    scalars = list(
-        dict.fromkeys(
-            name
-            for *_, cycle in records
-            for name, value in cycle.items()
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        )
-    )
-    rows: list[list[Cell]] = [
-        [
-            label,
-            seed,
-            *(cycle.get(name) for name in scalars),
-            " ".join(f"{gain:.6g}" for gain in cycle["total_gain"]),
-            " ".join(str(count) for line in cycle.get("histogram", []) for count in line),
-        ]
-        for label, seed, cycle in records
-    ]
-    return ["method", "seed", *scalars, "total_gain", "histogram"], rows
+    return ["method", "seed", *names], rows
 
 
-def words(name: str) -> str:
-    """A column of the metrics in words: ``id_success`` is ID success."""
-    first, _, rest = name.partition("_")
-    return f"{first.upper()} {rest.replace('_', ' ')}".strip()
-
-
-def _at(name: str, updates: float, run: Run) -> float:
-    return run.at(name, updates)
+def _cell(value: Any, depth: int = 0) -> Cell:
+    if isinstance(value, str):
+        return value[:LONGEST_TEXT]
+    if isinstance(value, list) and depth < DEEPEST:
+        cells = [_cell(item, depth + 1) for item in value]
+        return " ".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in cells)
+    return records.number(value)
 
 
 def _known(runs: Sequence[Run], name: str, updates: float) -> list[float]:

@@ -2,102 +2,83 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from proposer_rl.report.findings import Finding
-from proposer_rl.report.outcomes import words
 from proposer_rl.report.proposals import ANIMATION
-from proposer_rl.report.runs import Run
+from proposer_rl.report.records import level_text, words
+from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Panel, data_uri, look, save_panel
-from proposer_rl.report.tables import Table
+from proposer_rl.report.style import Drawing, look, save_panel
 
 PIXELS = 78  # of an inch of a figure
+LONGEST_WORD = 2000  # of a command
 WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
 
 
-class Section(NamedTuple):
-    """All that the page shows of a study."""
-
-    study: Study
-    facts: Sequence[tuple[str, str]]
-    unfinished: Sequence[str]
-    overview: Table
-    finding_note: str
-    findings: Sequence[Finding]
-    figures: Sequence[Mapping[str, Any]]
-    tables: Sequence[Table]
-    commands: Sequence[str]
-    configs: Sequence[tuple[str, str]]
+Section = dict[str, Any]  # all that the page shows of a study, as the template names it
 
 
-def render(title: str, command: str, sections: Sequence[Section], notes: Sequence[str]) -> str:
+def render(**content: Any) -> str:
     """The page as HTML; whatever comes from a run is escaped."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
-    page = environment.from_string(source)
-    return page.render(title=title, command=command, sections=sections, notes=notes)
+    return environment.from_string(source).render(content)
 
 
-def figure(drawing: Drawing, animations: Mapping[str, bytes]) -> dict[str, Any]:
+def figure(drawing: Drawing) -> Section:
     """A figure as the page shows it: each panel an image of its own, so that they can wrap."""
     images = []
     for panel in drawing.panels:
-        images.append(_image(panel))
-        if panel.name in animations:
-            images.append(_animation(animations[panel.name], panel))
+        images.append(_image(save_panel(panel), "image/svg+xml", panel.description, panel.size))
+        if panel.animation is not None:
+            height = panel.size[1] * 1.2
+            size = (height * ANIMATION[0] / ANIMATION[1], height)
+            text = f"{panel.description} As an animation over the cycles."
+            images.append(_image(panel.animation[1], "image/gif", text, size))
+    legend = [(label, *look(label)) for label in drawing.labels]
     return {
         "title": drawing.title,
         "caption": drawing.caption,
         "images": images,
-        "legend": [
-            {"label": label, "colour": look(label).colour, "dash": DASHES[look(label).dash]}
-            for label in drawing.labels
-        ],
+        "legend": [{"label": n, "colour": c, "dash": DASHES[dash]} for n, c, dash in legend],
     }
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
     """What, with which versions, where, and how long."""
     runs = study.runs
-    config = study.example.config
-    measured = ", ".join(
-        f"{name.upper()} {_specification(config['distributions'][name])}" for name in study.measured
+    own, spent, evaluations = (
+        sum(float(run.metrics[name][-1]) for run in runs) for name in COST[1:4]
     )
     seconds = sum(float(run.own_seconds[-1]) for run in runs)
-    copies = sum(float(run.metrics["meta_frames"][-1]) for run in runs)
-    own = sum(float(run.metrics["frames"][-1]) for run in runs)
+    threshold = level_text(study.headline, study.threshold)
     return [
         (
             "Runs",
             f"{len(runs)}, of {len(study.groups)} methods or variants, compared at "
             f"{study.horizon} updates of the Solver",
         ),
-        (
-            "Mazes",
-            f"{config['maze']['height']}×{config['maze']['width']}, at most "
-            f"{config['maze'].get('max_steps', '?')} steps",
-        ),
-        ("Measured on", f"{measured}; {config['evaluation'].get('levels', '?')} fixed levels each"),
-        ("Threshold", f"{study.threshold:.0%} {words(study.headline)}"),
+        *study.example.task.about.items(),
+        ("Threshold", f"{threshold} {words(study.headline)}"),
         ("Versions", _distinct(runs, _versions)),
         ("Hardware", _distinct(runs, _hardware)),
         *((group.label, group.setting) for group in study.groups if group.setting),
         (
             "Cost of all runs",
-            f"{(own + copies) / 1e6:.1f} million environment frames "
-            f"({copies / 1e6:.1f} of copies), {seconds:,.0f} s",
+            f"{(own + spent) / 1e6:.1f} million environment frames ({spent / 1e6:.1f} of the "
+            f"curricula), {evaluations:,.0f} evaluations of levels, {seconds:,.0f} s",
         ),
     ]
 
@@ -125,25 +106,13 @@ def configs(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _image(panel: Panel) -> dict[str, Any]:
-    width, height = panel.size
+def _image(content: bytes, kind: str, description: str, size: tuple[float, float]) -> Section:
     return {
-        "address": data_uri(save_panel(panel), "image/svg+xml"),
-        "description": panel.description,
-        "width": round(width * PIXELS),
-        "height": round(height * PIXELS),
-        "wide": width >= WIDE,
-    }
-
-
-def _animation(content: bytes, panel: Panel) -> dict[str, Any]:
-    height = round(panel.size[1] * PIXELS * 1.2)
-    return {
-        "address": data_uri(content, "image/gif"),
-        "description": f"{panel.description} As an animation over all cycles.",
-        "width": round(height * ANIMATION[0] / ANIMATION[1]),
-        "height": height,
-        "wide": False,
+        "address": f"data:{kind};base64,{base64.b64encode(content).decode()}",
+        "description": description,
+        "width": round(size[0] * PIXELS),
+        "height": round(size[1] * PIXELS),
+        "wide": size[0] >= WIDE,
     }
 
 
@@ -154,33 +123,39 @@ def report_command(folders: Sequence[Path], threshold: float | None) -> str:
 
 
 def _commands(group: Group) -> list[str]:
-    own = ("seed=", "seeds=", "hydra.", "+sweep=", "progress=")
-    seeds: dict[tuple[str, ...], list[int]] = {}
+    seeds: dict[str, list[int]] = {}
     for run in group.runs:
-        overrides = run.facts.get("overrides")
-        if not isinstance(overrides, list):
-            return [f"# {group.label}: the command was not recorded"]
-        words = [_anywhere(str(word)[:200]) for word in overrides if not str(word).startswith(own)]
-        seeds.setdefault(tuple(words), []).append(run.seed)
+        seeds.setdefault(_command(run) or "", []).append(run.seed)
     return [
-        " ".join(
-            ["bin/train -m", *map(shlex.quote, words), f"seed={','.join(map(str, with_them))}"]
-        )
-        for words, with_them in seeds.items()
+        f"{command} seed={','.join(map(str, with_them))}"
+        if command
+        else f"# {group.label}: the command was not recorded"
+        for command, with_them in seeds.items()
     ]
+
+
+def _command(run: Run) -> str | None:
+    """What started a run, but for its seed; None where that is not known in full."""
+    overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
+    if not isinstance(overrides, list) or not isinstance(arguments, dict):
+        return None
+    paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
+    own = ("seed=", "seeds=", "hydra.", "+sweep=", "progress=")
+    words = [word for word in overrides if not (isinstance(word, str) and word.startswith(own))]
+    if not all(
+        isinstance(word, str) and word.isprintable() and len(word) <= LONGEST_WORD
+        for word in (*words, paths or "", config or "")
+    ):
+        return None
+    before = [f"PYTHONPATH={shlex.quote(_anywhere(paths))}"] if paths else []
+    options = ["--config-dir", config, "-m"] if config else ["-m"]
+    quoted = [shlex.quote(_anywhere(word)) for word in [*options, *words]]
+    return " ".join([*before, "bin/train", *quoted])
 
 
 def _anywhere(text: str) -> str:
     """Text without the folders of the machine it comes from: of a whole path the last part."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
-
-
-def _specification(distribution: Mapping[str, Any]) -> str:
-    pairs = [
-        f"{fraction:g} obstacles, path of {length}"
-        for fraction, length in distribution["specifications"][:4]
-    ]
-    return f"({'; '.join(pairs)}; {distribution.get('mechanism', '?')})"
 
 
 def _versions(run: Run) -> str:

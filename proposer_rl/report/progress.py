@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from proposer_rl.report.runs import LONGEST_NAME, Run, UnreadableRun, read_run
-
-FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
-DEEPEST = 4
+from proposer_rl.report.records import LONGEST_TEXT, printable
+from proposer_rl.report.runs import FAILURE as FAILURE
+from proposer_rl.report.runs import Run, UnreadableRun, begun, read_run
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ def read_progress(folder: Path) -> Progress:
     except UnreadableRun as error:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
-            failure = str(error).removeprefix(f"{folder}: ")
+            failure = printable(str(error).removeprefix(f"{folder}: "))
     return Progress(folder, runs, failure, _age(folder))
 
 
@@ -59,23 +57,10 @@ def find_progress(folder: Path) -> list[Progress]:
     Raises:
         UnreadableRun: if there is no such folder, or no run in it.
     """
-    if not folder.is_dir():
-        raise UnreadableRun(f"{folder}: there is no such folder")
-    found = [read_progress(path) for path in _folders(folder)]
+    found = [read_progress(path) for path, _ in begun(folder)]
     if not found:
         raise UnreadableRun(f"{folder}: no run in it, finished or begun")
     return found
-
-
-def _folders(folder: Path) -> Iterable[Path]:
-    for root, names, files in os.walk(folder):
-        path = Path(root)
-        names.sort()
-        begun = {"config.json", FAILURE} & set(files)
-        if begun or len(path.relative_to(folder).parts) >= DEEPEST:
-            names.clear()
-        if begun:
-            yield path
 
 
 def _failure(folder: Path) -> str:
@@ -83,8 +68,8 @@ def _failure(folder: Path) -> str:
     if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**20:
         return ""
     try:
-        return " ".join(str(json.loads(path.read_text())["message"]).split())[: 4 * LONGEST_NAME]
-    except (OSError, ValueError, KeyError, TypeError):
+        return printable(str(json.loads(path.read_text())["message"]))[:LONGEST_TEXT]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return f"{FAILURE} cannot be read"
 
 

@@ -12,24 +12,38 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from proposer_rl.report.records import (
+    LARGEST,
+    Column,
+    Name,
+    Record,
+    SampleRecord,
+    TaskFacts,
+    checked,
+    is_rate,
+    number,
+    printable,
+)
 from proposer_rl.report.statistics import Waiting
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
-LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes less than one MiB
+LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
 DEEPEST = 4  # folders between the one that was named and a run's
 MOST_FOLDERS = 20_000
-LONGEST_NAME = 80
-WIDEST_GRID = 64
+FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
+ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
-COST = ("updates", "frames", "meta_frames", "seconds")
+COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
+# Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
+OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
 _LIFETIME = re.compile(r"lifetime_(\d{1,9})")
-Column = NDArray[np.float64]
 
 
 class UnreadableRun(ValueError):
     """A folder looks like a run's but cannot be read; the message is one line."""
+
+    exit_code = 2
 
 
 @dataclass(frozen=True)
@@ -42,9 +56,10 @@ class Run:
         shared_by: seeds that were trained side by side in the folder's process.
         config: the settings, as in ``config.json``.
         facts: versions, device, command and length, from ``run.json`` and ``summary.json``.
+        task: what ``run.json`` says of the task.
         finished: whether it got to the end of its schedule.
         metrics, training: columns of the tables, equally long within a table.
-        cycles: the Proposer's records, one per cycle; empty without a Proposer.
+        cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
     """
 
@@ -53,11 +68,12 @@ class Run:
     shared_by: int
     config: Mapping[str, Any]
     facts: Mapping[str, Any]
+    task: TaskFacts
     finished: bool
     metrics: Mapping[str, Column]
     training: Mapping[str, Column]
-    cycles: Sequence[Mapping[str, Any]]
-    samples: Sequence[Mapping[str, Any]]
+    cycles: Sequence[Record]
+    samples: Sequence[SampleRecord]
 
     @property
     def method(self) -> str:
@@ -80,7 +96,18 @@ class Run:
     @property
     def headline(self) -> str:
         """The measurement that runs are summed up by."""
-        return str(self.config["schedule"]["headline"])
+        return _headline(self.config)
+
+    @property
+    def measurements(self) -> list[str]:
+        """A column for each distribution measured on: success or, where that is none, return."""
+        return _measurements(self.task, self.metrics)
+
+    @property
+    def statistics(self) -> list[str]:
+        """Columns of the training's table that are the task's statistics."""
+        own = {"updates", *OF_PPO}
+        return [n for n in self.training if n not in own and not n.startswith("loss_")]
 
     @property
     def updates(self) -> int:
@@ -95,8 +122,8 @@ class Run:
 
     @property
     def total_frames(self) -> Column:
-        """Environment frames at each evaluation, those of the copies included."""
-        return self.metrics["frames"] + self.metrics["meta_frames"]
+        """Environment frames at each evaluation, those that the curriculum spent included."""
+        return self.metrics["frames"] + self.metrics["curriculum_frames"]
 
     @property
     def own_seconds(self) -> Column:
@@ -123,20 +150,32 @@ class Run:
         x, y = self.metrics["updates"][inside], self.metrics[measurement][inside]
         return float(np.trapezoid(y, x) / (x[-1] - x[0])) if len(x) > 1 else float(y[0])
 
+    def shares(self, cycle: Record) -> Column | None:
+        """Shares of a cycle's proposals, a dimension for each axis; None if not recorded."""
+        sides = tuple(len(values) for values in self.task.space.values())
+        try:
+            counts = np.asarray(cycle.get("histogram"), float)
+        except (ValueError, TypeError, OverflowError):
+            return None
+        if not sides or counts.shape != sides or not (counts >= 0).all():
+            return None
+        return counts / counts.sum() if 0 < counts.sum() < math.inf else None
+
+
+def share_map(shares: Column) -> Column:
+    """Shares over the first axis (rows) and the second (columns); of one axis a single row."""
+    return np.atleast_2d(shares.sum(tuple(range(2, shares.ndim))))
+
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Folders of runs: those given, or else those found within them.
-
-    Links to folders are not followed.
 
     Raises:
         UnreadableRun: if a folder is none, or there is no run in it.
     """
     found: list[Path] = []
     for folder in folders:
-        if not folder.is_dir():
-            raise UnreadableRun(f"{folder}: there is no such folder")
-        inside = [path for path in _walk(folder) if is_run(path)]
+        inside = [path for path, files in begun(folder) if {"config.json", "metrics.csv"} <= files]
         if not inside:
             raise UnreadableRun(
                 f"{folder}: no run in it: a run's folder has config.json and metrics.csv, as "
@@ -146,20 +185,23 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     return sorted({path.resolve(): path for path in found}.values())
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder looks like a run's."""
-    return (folder / "config.json").is_file() and (folder / "metrics.csv").is_file()
+def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
+    """Folders of runs in a folder, or itself, with names of their files; links are not followed.
 
-
-def _walk(folder: Path) -> Iterator[Path]:
-    for seen, (root, names, _) in enumerate(os.walk(folder)):
+    Raises:
+        UnreadableRun: if there is no such folder, or there are too many in it.
+    """
+    if not folder.is_dir():
+        raise UnreadableRun(f"{folder}: there is no such folder")
+    for seen, (root, names, files) in enumerate(os.walk(folder)):
         if seen > MOST_FOLDERS:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
         path = Path(root)
         names.sort()
-        if is_run(path) or len(path.relative_to(folder).parts) >= DEEPEST:
+        if "config.json" in files or len(path.relative_to(folder).parts) >= DEEPEST:
             names.clear()
-        yield path
+        if {"config.json", FAILURE} & set(files):
+            yield path, set(files)
 
 
 def read_run(folder: Path) -> list[Run]:
@@ -173,25 +215,30 @@ def read_run(folder: Path) -> list[Run]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
-        raise UnreadableRun(f"{folder}: {' '.join(reason.split())[:300]}") from error
+        raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
 
 
 def _read_run(folder: Path) -> list[Run]:
     config = _read_config(folder)
     summary = _read_json(folder, "summary.json") or {}
     facts = {**(_read_json(folder, "run.json") or {}), **summary}
+    task = checked(TaskFacts, facts["task"], "run.json: task")
     rows = read_csv(_checked(folder, "metrics.csv"))
     seeds = sorted({int(row["seed"]) for row in rows})
     if not seeds:
         raise ValueError("metrics.csv has no rows yet")
-    measured = [f"{name}_success" for name in config["evaluation"]["distributions"]]
-    needed = (*COST, *measured, config["schedule"]["headline"])
     training = _optional(folder, "training.csv", read_csv)
-    samples = [_checked_sample(row) for row in _optional(folder, "curriculum.jsonl", read_jsonl)]
+    if training and "updates" not in training[0]:
+        raise ValueError("training.csv has no column 'updates'")
+    cycles = _optional(folder, "cycles.jsonl", read_jsonl)
+    if any(math.isnan(number(row["updates"])) for row in cycles):
+        raise ValueError("cycles.jsonl: updates is no number")
+    recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
+    samples = checked(list[SampleRecord], recorded, "curriculum.jsonl")
     runs = []
     for seed in seeds:
         metrics = _columns(rows, seed)
-        _check_metrics(metrics, needed)
+        _check_metrics(metrics, {*COST, *_measurements(task, metrics), _headline(config)})
         runs.append(
             Run(
                 folder=folder,
@@ -199,11 +246,12 @@ def _read_run(folder: Path) -> list[Run]:
                 shared_by=len(seeds),
                 config=config,
                 facts=facts,
+                task=task,
                 finished=summary.get("updates") == int(metrics["updates"][-1]),
                 metrics=metrics,
                 training=_columns(training, seed),
-                cycles=_checked_cycles(_optional(folder, "proposer.jsonl", read_jsonl)),
-                samples=[row for row in samples if row["seed"] == seed],
+                cycles=cycles,
+                samples=[sample for sample in samples if sample.seed == seed],
             )
         )
     return runs
@@ -236,57 +284,43 @@ def _read_config(folder: Path) -> dict[str, Any]:
     if config is None:
         raise ValueError("there is no config.json")
     for name in ("method", "scale", "ablation"):
-        value = config.get(name, "none")
-        if not isinstance(value, str) or len(value) > LONGEST_NAME or not value.isprintable():
-            raise ValueError(f"config.json: {name} is no name")
-    measured = config["evaluation"]["distributions"]
-    if not isinstance(measured, list) or not all(isinstance(name, str) for name in measured):
-        raise ValueError("config.json: evaluation.distributions is no list of names")
-    height, width = config["maze"]["height"], config["maze"]["width"]
-    if not all(isinstance(n, int) and 0 < n <= WIDEST_GRID for n in (height, width)):
-        raise ValueError(f"config.json: a maze of {height} x {width} cells cannot be drawn")
-    threshold = config["schedule"]["threshold"]
-    if isinstance(threshold, bool) or not isinstance(threshold, int | float):
+        checked(Name, config.get(name, "none"), f"config.json: {name}")
+    checked(Name, config["schedule"]["headline"], "config.json: schedule.headline")
+    if math.isnan(number(config["schedule"]["threshold"])):
         raise ValueError("config.json: schedule.threshold is no number")
     return config
 
 
+def _headline(config: Mapping[str, Any]) -> str:
+    headline: str = config["schedule"]["headline"]
+    return headline
+
+
+def _measurements(task: TaskFacts, metrics: Mapping[str, Column]) -> list[str]:
+    columns = [[f"{name}_success", f"{name}_return"] for name in task.distributions]
+    found = [next((name for name in pair if name in metrics), None) for pair in columns]
+    return [name for name in found if name is not None]
+
+
 def _columns(rows: Sequence[Mapping[str, float]], seed: int) -> dict[str, Column]:
     own = [row for row in rows if row["seed"] == seed]
-    names = [name for name in (own[0] if own else {}) if name != "seed"]
-    return {name: np.array([row[name] for row in own], dtype=float) for name in names}
+    columns = {}
+    for name in own[0] if own else ():
+        values = np.array([row[name] for row in own], dtype=float)
+        if is_rate(name):  # a sum of probabilities is rounded, to 1.0000001 too
+            inside = values.clip(0, 1)
+            values = np.where(np.abs(values - inside) < ROUNDING, inside, values)
+        checked(Name, name, "the name of a column")
+        columns[name] = np.where(np.abs(values) < LARGEST, values, np.nan)
+    columns.pop("seed", None)
+    return columns
 
 
-def _check_metrics(metrics: Mapping[str, Column], needed: Sequence[str]) -> None:
-    for name in needed:
+def _check_metrics(metrics: Mapping[str, Column], needed: set[str]) -> None:
+    for name in sorted(needed):
         if name not in metrics:
             raise ValueError(f"metrics.csv has no column {name!r}")
         if not np.isfinite(metrics[name]).all():
             raise ValueError(f"metrics.csv: {name} is not always a number")
     if (np.diff(metrics["updates"]) <= 0).any():
         raise ValueError("metrics.csv: updates do not grow from row to row")
-
-
-def _checked_cycles(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Records with what the report reads of them in the right form."""
-    for row in rows:
-        gains, counts = np.asarray(row["total_gain"], float), row.get("histogram")
-        if gains.ndim != 1 or not len(gains) or not np.isfinite(gains).all():
-            raise ValueError("proposer.jsonl: total_gain is no list of numbers")
-        if counts is not None and np.asarray(counts, float).ndim != 2:
-            raise ValueError("proposer.jsonl: histogram is no table of counts")
-        float(row["updates"])
-    return [dict(row) for row in rows]
-
-
-def _checked_sample(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A record of levels, each at most as large as can be drawn, with the path inside of it."""
-    for item in row["levels"]:
-        lines, path = item["level"], np.asarray(item["path"])
-        if not (0 < len(lines) <= WIDEST_GRID and all(isinstance(line, str) for line in lines)):
-            raise ValueError("curriculum.jsonl: a level is no drawing")
-        width = len(lines[0])
-        inside = path.ndim == 2 and path.shape[1] == 2 and (path >= 0).all()
-        if not inside or width > WIDEST_GRID or (path >= (len(lines), width)).any():
-            raise ValueError("curriculum.jsonl: a path leaves its level")
-    return {**row, "updates": int(row["updates"]), "seed": int(row["seed"])}

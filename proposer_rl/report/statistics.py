@@ -142,7 +142,8 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
     replicates = np.full(1, math.nan)
     if min(map(len, data)) > 1:
         replicates = _bootstrap(data, share, 0, vectorized=True)
-    return _percentiles(float(share(data[0], data[1])), replicates)
+    found = _percentiles(float(share(data[0], data[1])), replicates)
+    return Interval(*(float(np.clip(value, 0, 1)) for value in found))
 
 
 def pseudo_values(group: Sequence[Waiting], horizon: float) -> NDArray[np.float64]:

@@ -41,7 +41,12 @@ class Group:
     @property
     def proposes(self) -> bool:
         """Whether a Proposer was trained."""
-        return any(run.cycles for run in self.runs)
+        return any(map(_proposes, self.runs))
+
+    @property
+    def logs(self) -> list[Run]:
+        """A run of each folder: seeds that were trained together have one curriculum's cycles."""
+        return list({run.folder: run for run in self.runs if run.cycles}.values())
 
     def waiting(self, measurement: str, threshold: float) -> list[Waiting]:
         """Updates of each run until a measurement reached a threshold."""
@@ -50,10 +55,10 @@ class Group:
 
 @dataclass(frozen=True)
 class Study:
-    """Groups that were measured on the same levels of the same mazes.
+    """Groups that were measured alike on the same task.
 
     Attributes:
-        title: the scale and the mazes.
+        title: the scale and the task.
         groups: what is compared, by label.
         threshold: of the headline measurement.
     """
@@ -78,9 +83,9 @@ class Study:
         return self.example.headline
 
     @property
-    def measured(self) -> list[str]:
-        """Names of the distributions that were measured on."""
-        return list(self.example.config["evaluation"]["distributions"])
+    def measurements(self) -> list[str]:
+        """Columns of the distributions that were measured on, one for each."""
+        return self.example.measurements
 
     @property
     def horizon(self) -> int:
@@ -135,7 +140,11 @@ def read_studies(folders: Iterable[Path], threshold: float | None) -> tuple[list
     for run in runs:
         sorted_runs[_key(_setting(run))].append(run)
     studies = [
-        Study(_title(members[0]), _groups(members), threshold or _threshold(members[0]))
+        Study(
+            _title(members[0]),
+            _groups(members),
+            _threshold(members[0]) if threshold is None else threshold,
+        )
         for members in sorted_runs.values()
     ]
     return sorted(studies, key=lambda study: -len(study.runs)), notes + doubles
@@ -147,29 +156,28 @@ def _threshold(run: Run) -> float:
 
 def _setting(run: Run) -> dict[str, Any]:
     """All that must be equal for two runs to be measured alike."""
-    config = run.config
-    measured = config["evaluation"]["distributions"]
     return {
-        "scale": config.get("scale"),
-        "maze": {key: value for key, value in config["maze"].items() if key != "observe_agent"},
-        "levels": {name: config["distributions"][name] for name in measured},
-        "measured": [config["evaluation"][key] for key in ("distributions", "levels", "seed")],
-        "target": config.get("target"),
-        "headline": [config["schedule"][key] for key in ("headline", "threshold")],
+        "scale": run.config.get("scale"),
+        "measured": run.task.measured,
+        "columns": run.measurements,
+        "headline": [run.config["schedule"][key] for key in ("headline", "threshold")],
     }
+
+
+def _proposes(run: Run) -> bool:
+    return any("total_reward" in cycle for cycle in run.cycles)
 
 
 def _variant(run: Run) -> dict[str, Any]:
     """All that the outcome of a run depends on, but for the seed."""
-    ignored = {"seed", "seeds", "evaluation", "schedule", "hand_made_until", "precision"}
-    ignored |= {"checkpoint"}  # the curriculum has it
-    ignored |= set() if run.cycles else {"proposer"}  # it had none
+    curriculum, proposes = run.config.get("curriculum"), _proposes(run)
+    ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the last
+    reused = isinstance(curriculum, Mapping) and curriculum.get("checkpoint") is not None
+    ignored |= set() if proposes or reused else {"proposer"}  # it had none
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
     kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
     kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
     kept["lifetime"] = run.lifetime
-    kept["precision"] = run.config.get("precision", "fp32")
-    kept["reward"] = run.config["evaluation"].get("reward") if run.cycles else None
     return kept
 
 
@@ -190,8 +198,8 @@ def _key(value: Mapping[str, Any]) -> str:
 
 
 def _title(run: Run) -> str:
-    maze, scale = run.config["maze"], str(run.config.get("scale", "unnamed"))
-    return f"{scale.capitalize()} scale, {maze['height']}×{maze['width']} mazes"
+    scale = str(run.config.get("scale", "unnamed"))
+    return f"{scale.capitalize()} scale, {run.task.title}"
 
 
 def _without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
@@ -263,6 +271,7 @@ def _short_names(keys: Sequence[str]) -> dict[str, str]:
 def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from _leaves(item, f"{prefix}.{key}" if prefix else str(key))
+            name = json.dumps(key)[1:-1]  # it may hold whatever JSON can
+            yield from _leaves(item, f"{prefix}.{name}" if prefix else name)
     else:
         yield prefix, json.dumps(value)

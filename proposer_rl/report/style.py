@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import zlib
 from collections.abc import Callable, Sequence
@@ -40,6 +39,7 @@ SETTINGS: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.8,
+    "text.parse_math": False,  # a dollar sign in a name is no formula
     "svg.hashsalt": "proposer_rl",
     "savefig.dpi": 130,
     "figure.facecolor": "white",
@@ -58,16 +58,16 @@ class Panel(NamedTuple):
     """A part of a figure that can stand alone.
 
     Attributes:
-        name: of the part.
         description: what is to be seen, for those who cannot see it.
         draw: draws it.
         size: width and height in inches.
+        animation: a GIF of the same, with a name for its file; None without one.
     """
 
-    name: str
     description: str
     draw: Callable[[FigureBase], None]
     size: tuple[float, float] = PANEL
+    animation: tuple[str, bytes] | None = None
 
 
 class Drawing(NamedTuple):
@@ -127,7 +127,8 @@ def save(drawing: Drawing) -> dict[str, bytes]:
         for panel, part in zip(drawing.panels, parts, strict=False):
             panel.draw(part)
         if drawing.labels:
-            _draw_legend(figure, drawing.labels, 2 * columns)
+            handles = [Line2D([], [], label=label, **style(label)) for label in drawing.labels]
+            figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
         return {suffix: _render(figure, suffix) for suffix in ("svg", "png")}
 
 
@@ -137,16 +138,6 @@ def save_panel(panel: Panel) -> bytes:
         figure = Figure(figsize=panel.size, layout="constrained")
         panel.draw(figure)
         return _render(figure, "svg")
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """A file's content as an address that a page can hold."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _draw_legend(figure: Figure, labels: Sequence[str], columns: int) -> None:
-    handles = [Line2D([], [], label=label, **style(label)) for label in labels]
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
 
 
 def _render(figure: Figure, suffix: str) -> bytes:

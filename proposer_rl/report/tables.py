@@ -5,117 +5,97 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from proposer_rl.report.statistics import Interval
 
-# How the cells of each column are written, by its title.
-Columns = Mapping[str, Callable[[Any], str]]
 Cell = str | int | float | Interval | None
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under named columns.
+    """Rows of equally named cells.
 
     Attributes:
         name: of its files.
         title: above it.
         note: what must be known to read it.
-        columns: from a column's title to how its cells are written.
-        rows: cells in the order of the columns; None for an empty one.
+        rows: each from a column's title to the cell; None for an empty one.
     """
 
     name: str
     title: str
     note: str
-    columns: Columns
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Mapping[str, Cell]]
+
+    @property
+    def columns(self) -> list[str]:
+        """Titles of the columns."""
+        return list(self.rows[0]) if self.rows else []
 
     def texts(self) -> list[list[str]]:
         """The cells as a reader sees them."""
-        writers = self.columns.values()
-        return [
-            ["–" if _empty(cell) else write(cell) for write, cell in zip(writers, row, strict=True)]
-            for row in self.rows
-        ]
+        return [[write(cell) for cell in row.values()] for row in self.rows]
 
     def to_markdown(self) -> str:
         """A table of GitHub's Markdown."""
-        lines = [list(self.columns), ["---"] * len(self.columns), *self.texts()]
+        lines = [self.columns, ["---"] * len(self.columns), *self.texts()]
         return "".join(f"| {' | '.join(map(escape_markdown, line))} |\n" for line in lines)
 
     def to_csv(self) -> str:
         """The numbers behind the cells; an interval takes three columns."""
-        spread = [any(isinstance(row[i], Interval) for row in self.rows) for i in self._indices]
+        spread = {
+            name: any(isinstance(row[name], Interval) for row in self.rows) for name in self.columns
+        }
         header = [
-            text
-            for name, wide in zip(self.columns, spread, strict=True)
-            for text in ([name, f"{name}, low", f"{name}, high"] if wide else [name])
+            name + part
+            for name in spread
+            for part in (("", ", low", ", high") if spread[name] else ("",))
         ]
         rows = [
             [
                 value
-                for cell, wide in zip(row, spread, strict=True)
-                for value in (_three(cell) if wide else [cell])
+                for name, cell in row.items()
+                for value in (
+                    cell if isinstance(cell, Interval) else [cell, *([None] * 2 * spread[name])]
+                )
             ]
             for row in self.rows
         ]
         return to_csv(header, rows)
 
-    @property
-    def _indices(self) -> range:
-        return range(len(self.columns))
-
 
 def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """CSV as spreadsheets and pandas read it; floats with six significant digits."""
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(map(_csv_cell, header))
-    writer.writerows([_csv_cell(cell) for cell in row] for row in rows)
+    csv.writer(file, lineterminator="\n").writerows(
+        [_csv_cell(cell) for cell in row] for row in (header, *rows)
+    )
     return file.getvalue()
 
 
-def number(digits: int) -> Callable[[Any], str]:
-    """Write a number, or an estimate with its interval, with that many decimals."""
+def write(cell: Cell, digits: int | None = None) -> str:
+    """A cell as a reader sees it.
 
-    def write(value: Any) -> str:
-        if not isinstance(value, Interval):
-            return _decimals(value, digits)
-        estimate = _decimals(value.estimate, digits)
-        if math.isnan(value.low):
-            return estimate
-        return f"{estimate} [{_decimals(value.low, digits)}, {_decimals(value.high, digits)}]"
-
-    return write
-
-
-def adaptive(value: Interval) -> str:
-    """Write an estimate with its interval: rates with three decimals, counts with one."""
-    return number(1 if max(map(abs, value)) >= 2 else 3)(value)
-
-
-def _decimals(value: float, digits: int) -> str:
-    text = f"{value:,.{digits}f}"
+    Args:
+        cell: text, a number, or an estimate with its interval.
+        digits: decimals of a number; None for as many as its size asks for.
+    """
+    if isinstance(cell, Interval):
+        if digits is None:
+            digits = 1 if max(map(abs, cell)) >= 2 else 3
+        estimate, low, high = (write(value, digits) for value in cell)
+        return estimate if math.isnan(cell.low) else f"{estimate} [{low}, {high}]"
+    if cell is None or cell == "" or cell != cell:
+        return "–"
+    if isinstance(cell, str):
+        return cell
+    if digits is None:
+        digits = 0 if isinstance(cell, int) else 1 if abs(cell) >= 2 else 3
+    text = f"{cell:,.{digits}f}"
     return text.replace("-", "−") if float(text.replace(",", "")) else text.lstrip("-")
-
-
-def _empty(cell: Cell) -> bool:
-    return cell is None or cell == "" or (isinstance(cell, float) and math.isnan(cell))
-
-
-def _three(cell: Cell) -> Sequence[Cell]:
-    return list(cell) if isinstance(cell, Interval) else [cell, None, None]
-
-
-def _csv_cell(cell: Any) -> Any:
-    if isinstance(cell, float):
-        return "" if math.isnan(cell) else f"{cell:.6g}"
-    # A spreadsheet takes text that begins like this for a formula.
-    return f"'{cell}" if isinstance(cell, str) and cell[:1] in "=+-@\t\r" and cell else cell
 
 
 def escape_markdown(text: str) -> str:
@@ -123,3 +103,10 @@ def escape_markdown(text: str) -> str:
     for character in "\\|<>`*_[]":
         text = text.replace(character, f"\\{character}")
     return " ".join(text.split())
+
+
+def _csv_cell(cell: Any) -> Any:
+    if isinstance(cell, float):
+        return "" if math.isnan(cell) else f"{cell:.6g}"
+    # A spreadsheet takes text that begins like this for a formula.
+    return f"'{cell}" if isinstance(cell, str) and cell[:1] in "=+-@\t\r" and cell else cell

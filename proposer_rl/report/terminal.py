@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Sequence
 
@@ -13,16 +14,26 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from proposer_rl.report.outcomes import words
 from proposer_rl.report.progress import Progress
-from proposer_rl.report.proposals import proposal_shares
-from proposer_rl.report.runs import Run
+from proposer_rl.report.records import (
+    GAINS,
+    PLACE,
+    Column,
+    is_rate,
+    number,
+    numbers,
+    printable,
+    words,
+)
+from proposer_rl.report.runs import Run, share_map
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"
 COLOURS = {"finished": "green", "failed": "red", "unfinished": "yellow", "starting": "blue"}
 WIDTH = 30  # characters of a curve
 LEVELS = 3
+NUMBERS = 8  # of a curriculum that is shown by its own
+WIDEST_MAP = 20
 
 
 def screen(progress: Progress) -> RenderableType:
@@ -33,7 +44,7 @@ def screen(progress: Progress) -> RenderableType:
     run = progress.runs[0]
     parts: list[RenderableType] = [head, _bar(progress), _curves(progress.runs)]
     if run.cycles:
-        parts.append(_cycle(run))
+        parts += _cycles(run)
     if run.samples:
         parts.append(_levels(run))
     if progress.failure:
@@ -44,7 +55,7 @@ def screen(progress: Progress) -> RenderableType:
 def overview(found: Sequence[Progress]) -> RenderableType:
     """Several runs: one line each, and how many are in which state."""
     parent = os.path.commonpath([progress.folder.parent for progress in found])
-    names = [str(progress.folder.relative_to(parent)) for progress in found]
+    names = [printable(str(progress.folder.relative_to(parent))) for progress in found]
     table = Table(box=None, pad_edge=False)
     table.add_column("run", overflow="fold")
     for name, width in (("state", 10), ("updates", 7), ("last", 16), ("written", 10)):
@@ -76,7 +87,7 @@ def sparkline(values: Iterable[float], low: float, high: float) -> str:
 
 def _name(progress: Progress) -> Text:
     if not progress.runs:
-        return Text(progress.folder.name)
+        return Text(printable(progress.folder.name))
     run = progress.runs[0]
     seeds = ", ".join(str(run.seed) for run in progress.runs)
     ablation = "" if run.ablation == "none" else f", {run.ablation}"
@@ -87,9 +98,9 @@ def _bar(progress: Progress) -> RenderableType:
     run = progress.runs[0]
     total = run.planned or run.updates
     frames = f"{run.metrics['frames'][-1]:,.0f} frames"
-    copies = run.metrics["meta_frames"][-1]
-    if copies:
-        frames += f" + {copies:,.0f} of the copies"
+    spent = run.metrics["curriculum_frames"][-1]
+    if spent:
+        frames += f" + {spent:,.0f} of the curriculum"
     grid = Table.grid(padding=(0, 1))
     bar = ProgressBar(total=max(total, 1), completed=run.updates, width=WIDTH)
     grid.add_row(bar, f"{_updates(progress)} updates")
@@ -98,53 +109,65 @@ def _bar(progress: Progress) -> RenderableType:
 
 def _curves(runs: Sequence[Run]) -> RenderableType:
     grid = Table.grid(padding=(0, 1))
-    for name in [f"{name}_success" for name in runs[0].config["evaluation"]["distributions"]]:
+    for name in runs[0].measurements:
         values = np.mean([run.metrics[name] for run in runs], 0)
-        if len(values) > WIDTH:
-            values = values[np.linspace(0, len(values) - 1, WIDTH).round().astype(int)]
-        grid.add_row(words(name), Text(sparkline(values, 0, 1)), f"{values[-1]:.1%}")
+        rate = is_rate(name)
+        low, high = (0, 1) if rate else (float(values.min()), float(values.max()))
+        last = f"{values[-1]:.1%}" if rate else f"{values[-1]:.4g}"
+        grid.add_row(Text(words(name)), Text(sparkline(_some(values), low, high)), last)
     return grid
 
 
-def _cycle(run: Run) -> RenderableType:
-    cycle = run.cycles[-1]
-    gains = [float(np.mean(cycle["total_gain"])) for cycle in run.cycles]
-    best = [float(np.max(cycle["total_gain"])) for cycle in run.cycles]
-    low, high = min(0.0, *gains), max(*best, 0.0)
-    grid = Table.grid(padding=(0, 1))
-    grid.add_row("maximum gain", Text(sparkline(best, low, high)), f"{best[-1]:+.3f}")
-    grid.add_row("mean gain", Text(sparkline(gains, low, high)), f"{gains[-1]:+.3f}")
-    shares = proposal_shares(run, cycle)
-    if shares is None:
-        return grid
-    return Group(grid, Text("proposals (rows: obstacles, columns: path length)"), _map(run, shares))
+def _cycles(run: Run) -> list[RenderableType]:
+    """The gains of the copies or, where there are none, the curriculum's numbers; its proposals."""
+    cycle, grid = run.cycles[-1], Table.grid(padding=(0, 1))
+    for name, text in GAINS.items():
+        gains = [found for c in run.cycles if (found := numbers(c.get(name))) is not None]
+        best, mean = [float(each.max()) for each in gains], [float(each.mean()) for each in gains]
+        for kind, values in (("maximum", best), ("mean", mean)) if gains else ():
+            drawn = sparkline(_some(values), min(0, *mean), max(0, *best))
+            grid.add_row(f"{kind} gain in {text}", Text(drawn), f"{values[-1]:+.3f}")
+    names = [n for n in cycle if n not in PLACE and n not in GAINS and n.isprintable()]
+    for name in names[:NUMBERS] if not grid.row_count else ():
+        values = [value for c in run.cycles if not math.isnan(value := number(c.get(name)))]
+        if values:
+            drawn = sparkline(_some(values), min(values), max(values))
+            grid.add_row(Text(words(name)), Text(drawn), f"{values[-1]:.4g}")
+    shares = run.shares(cycle)
+    return [grid] if shares is None else [grid, *_map(run, share_map(shares))]
 
 
-def _map(run: Run, shares: np.ndarray) -> RenderableType:
-    space = run.config["space"]
+def _map(run: Run, shares: Column) -> list[RenderableType]:
+    *above, (across, columns) = list(run.task.space.items())[:2]
+    if max(shares.shape) > WIDEST_MAP:
+        return []
+    rows = [f"{value:g}" for _, values in above for value in values] or [""]
     grid = Table.grid(padding=(0, 1))
     largest = max(float(shares.max()), 2 / shares.size)
-    for fraction, row in reversed(list(zip(space["obstacle_fractions"], shares, strict=True))):
+    for label, row in reversed(list(zip(rows, shares, strict=True))):
         cells = [SHADES[round(share / largest * (len(SHADES) - 1))] * 3 for share in row]
-        grid.add_row(f"{fraction:g}", *map(Text, cells))
-    grid.add_row("", *(f"{length:3g}" for length in space["path_lengths"]))
-    return grid
+        grid.add_row(label, *map(Text, cells))
+    grid.add_row("", *(f"{value:3g}" for value in columns))
+    named = [f"rows: {name}" for name, _ in above] + [f"columns: {across}"]
+    return [Text(f"proposals ({', '.join(named)})"), grid]
 
 
 def _levels(run: Run) -> RenderableType:
-    """The first levels of the last recorded batch, with the cells that the Solver walked on."""
+    """The first levels of the last recorded batch that can be drawn in characters."""
     sample = run.samples[-1]
-    drawn = []
-    for item in sample["levels"][:LEVELS]:
-        lines = [list(line) for line in item["level"]]
-        for row, column in item["path"]:
-            if lines[row][column] == ".":
-                lines[row][column] = "•"
-        drawn.append(Text("\n".join(" ".join(line) for line in lines)))
-    return Group(
-        Text(f"levels at update {sample['updates']} (S start, G goal, • the Solver's episode)"),
-        Columns(drawn, padding=(0, 3)),
-    )
+    drawn = [Text("\n".join(level.text)) for level in sample.levels[:LEVELS] if level.text]
+    if not drawn:
+        return Text("")
+    key = f" ({run.task.text_key})" if run.task.text_key else ""
+    title = f"{run.task.levels} at update {sample.updates}{key}"
+    return Group(Text(title), Columns(drawn, padding=(0, 3)))
+
+
+def _some(values: Sequence[float] | Column) -> Sequence[float] | Column:
+    """Values, or as many of them as a curve has characters."""
+    if len(values) <= WIDTH:
+        return values
+    return np.asarray(values)[np.linspace(0, len(values) - 1, WIDTH).round().astype(int)]
 
 
 def _updates(progress: Progress) -> str:

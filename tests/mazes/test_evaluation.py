@@ -205,3 +205,43 @@ def test_the_worst_mean_of_one_row_is_that_of_the_row_in_a_batch() -> None:
     values = torch.tensor([[0.5, 0.1, 0.9], [0.3, 0.2, 0.0]])
     alone = torch.stack([worst_mean(row, 0.5) for row in values])
     torch.testing.assert_close(alone, worst_mean(values, 0.5))
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    levels = random_levels(3, 3, 4, 0.2, 1)
+    logits = random_logits(3, 4, 3, 4, seed=1).double().requires_grad_()
+    evaluator = ExactEvaluator(max_steps=7, step_penalty=0.1)
+
+    def evaluate(logits: Tensor) -> tuple[Tensor, Tensor]:
+        result = evaluator.differentiable(levels, logits)
+        return result["return"], result["success"]
+
+    assert torch.autograd.gradcheck(evaluate, logits, eps=1e-6, atol=1e-8, rtol=1e-6)
+
+
+def test_what_is_differentiated_is_what_is_evaluated() -> None:
+    levels, logits = random_levels(5, 4, 4, 0.2, 2), random_logits(5, 4, 4, 4).requires_grad_()
+    evaluator = ExactEvaluator(max_steps=9)
+    found, expected = evaluator.differentiable(levels, logits), evaluator(levels, logits)
+    assert found["return"].requires_grad
+    for key in ("return", "success"):
+        assert torch.equal(found[key].detach(), expected[key])
+    with torch.no_grad():
+        assert torch.equal(evaluator.differentiable(levels, logits)["return"], expected["return"])
+
+
+def test_double_precision_is_kept() -> None:
+    levels, logits = random_levels(2, 3, 3, 0.2, 3), random_logits(2, 4, 3, 3).double()
+    result = ExactEvaluator(max_steps=8, step_penalty=0.05)(levels, logits)
+    for i, level in enumerate(levels):
+        expected = by_dense_matrix(level, logits[i].softmax(0), 8, 0.05)
+        assert (result["return"][i].item(), result["success"][i].item()) == pytest.approx(
+            expected, abs=1e-14
+        )
+
+
+def test_a_greedy_policy_is_not_differentiated() -> None:
+    with pytest.raises(ValueError, match="a greedy policy has no gradient"):
+        ExactEvaluator(greedy=True).differentiable(
+            random_levels(1, 3, 3, 0.0, 0), random_logits(1, 4, 3, 3)
+        )

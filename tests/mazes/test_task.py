@@ -10,51 +10,20 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from benchmarks.results import Options
-from benchmarks.scales import TINY, Solvers
+from benchmarks.scales import TINY
 from proposer_rl.mazes.task import EvaluationSettings, MazeTask, SpaceSettings, faster_precision
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.rewards import performance_gain, task_difficulty
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
 from proposer_rl.streams import Streams
-from tests.graphs import NoHostReads, Tapes
+from tests.graphs import NoHostReads
 
 OPTIONS = Options(size="tiny", precision="fp32")
 
 
 def task(observe_agent: bool = False) -> MazeTask:
     return replace(TINY, maze=replace(TINY.maze, observe_agent=observe_agent)).task(OPTIONS)
-
-
-def one_thread(solvers: Solvers) -> Solvers:
-    """Copies in turn: operations in other threads are not seen by what watches this one."""
-    for module in solvers.ppo.agent.modules():
-        if isinstance(module, Population):
-            module.way = "in turn"
-    return solvers
-
-
-def test_recorded_measurements_follow_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    tapes = Tapes()
-    monkeypatch.setattr("proposer_rl.mazes.task.recorder", lambda *_: tapes)
-    recorded = task()
-    monkeypatch.undo()
-    plain = task()
-    several = [one_thread(Solvers(plain, copies)) for copies in (1, 2)]
-    levels = plain.sample_target(5, Streams(0).generator())
-    generator = torch.Generator()
-    with torch.no_grad():
-        for _ in range(5):
-            for solvers in several:
-                agent = solvers.ppo.agent
-                assert (recorded.measure(agent) == plain.measure(agent)).all()
-                rated = recorded.evaluate(agent, levels, generator)
-                assert (rated == plain.evaluate(agent, levels, generator)).all()
-                seen = recorded.probe(agent, levels)
-                assert torch.equal(seen, plain.probe(agent, levels))
-                with torch.enable_grad():
-                    solvers.update()
-    assert tapes.recorded == 3 * 2
 
 
 def test_another_network_takes_the_unets_place() -> None:
@@ -115,7 +84,7 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
     env = proposer(Parts(maze, every_update, seed=0), reward).env
     for module in env.solvers.agent.modules():
         if isinstance(module, Population):
-            module.way = "4 streams"
+            module.batched = True
 
     def on_the_host(function):
         def call(*arguments):

@@ -1,31 +1,67 @@
-"""Folders as runs leave them, with outcomes of our choice."""
+"""Folders as runs leave them, with outcomes of our choice, of two tasks."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from proposer_rl.runs.folder import RunFolder
 
 EVERY = 10  # updates between two evaluations
-LEVEL = {"level": ["..#.", "S..G"], "path": [[1, 0], [1, 1], [1, 2], [1, 3]]}
+
+
+def png(pixels: Any, **options: Any) -> str:
+    """An array of uint8 [H, W, 3] as a record holds it."""
+    file = io.BytesIO()
+    Image.fromarray(np.asarray(pixels, np.uint8)).save(file, format="PNG", **options)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (20, 40, 3), np.uint8)
+LEVEL = {"picture": png(PIXELS), "text": [". . # .", "S • • G"], "path": [[1, 0], [1, 1]]}
+TASK: dict[str, Any] = {
+    "title": "2×4 mazes",
+    "distributions": ["id", "ood"],
+    "space": {"obstacle fraction": [0.0, 0.2], "path length": [2, 3, 4]},
+    "about": {"Mazes": "2×4, at most 9 steps"},
+    "measured": {"id": [[0.1, 3]], "levels": 8},
+    "samples": {"id": [LEVEL] * 2, "ood": [LEVEL]},
+    "levels": "mazes",
+    "key": "Blue: start.",
+    "text_key": "S start, G goal",
+}
+# Of another kind: one axis, no success, no text, pictures of another size.
+ROCKETS: dict[str, Any] = {
+    "title": "rockets",
+    "distributions": ["target"],
+    "space": {"thrust": [1, 2, 4, 8]},
+    "measured": 3,
+    "samples": {"target": [{"picture": png(np.full((8, 8, 3), 99))}]},
+    "levels": "rockets",
+}
 
 
 def config(method: str, seed: int, **changes: Any) -> dict[str, Any]:
-    specification = {"specifications": [[0.1, 3]], "mechanism": "uniform"}
     return {
         "method": method,
         "scale": "tiny",
         "ablation": "none",
+        "curriculum": {"_target_": "some.factory"},
         "seed": seed,
-        "maze": {"height": 2, "width": 4, "max_steps": 9},
-        "distributions": {"id": specification, "ood": specification},
-        "target": "id",
-        "space": {"obstacle_fractions": [0.0, 0.2], "path_lengths": [2, 3, 4]},
+        "seeds": [seed],
+        "task": {"_target_": "some.task", "size": 2},
+        "solver": {"batch_size": 8},
         "proposer": {"rollouts": 2},
         "schedule": {"headline": "id_success", "threshold": 0.8, "cycle_length": 20},
-        "evaluation": {"distributions": ["id", "ood"], "levels": 8, "seed": 0},
+        "lifetimes": 1,
+        "checkpoint": None,
+        "precision": "fp32",
         **changes,
     }
 
@@ -39,49 +75,72 @@ def write_run(
     finished: bool = True,
     cycles: Sequence[dict[str, Any]] = (),
     copies: int = 0,
+    task: dict[str, Any] = TASK,
+    facts: dict[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """A run whose success on every distribution is ``curve``, one value per evaluation."""
+    """A run whose measurement on every distribution is ``curve``, one value per evaluation."""
     run = RunFolder(folder)
-    run.write_json("config.json", config(method, seeds[0], **changes))
-    for i, success in enumerate(curve):
+    settings = config(method, seeds[0], **changes)
+    run.write_json("config.json", settings)
+    kind = settings["schedule"]["headline"].rpartition("_")[2]
+    level = LEVEL if task is TASK else {"picture": png(np.full((8, 8, 3), 7))}
+    for i, value in enumerate(curve):
         updates = EVERY * i
         for seed in seeds:
-            cost = {"frames": 100 * updates, "meta_frames": copies * updates, "seconds": 2.0 * i}
-            measured = {f"{name}_success": float(success) for name in ("id", "ood")}
-            measured |= {f"{name}_worst10": value / 2 for name, value in measured.items()}
+            cost = {
+                "frames": 100 * updates,
+                "curriculum_frames": copies * updates,
+                "evaluations": 3 * updates,
+                "seconds": 2.0 * i,
+            }
+            measured = {f"{name}_{kind}": float(value) for name in task["distributions"]}
+            if kind == "success":
+                measured |= {f"{name}_worst10": value / 2 for name, value in measured.items()}
             run.append("metrics.csv", {"seed": seed, "updates": updates, **cost, **measured})
             if i:
-                batch = {"obstacle_fraction": 0.1, "path_length": 3.0, "train_success": success}
-                run.append("training.csv", {"seed": seed, "updates": updates, **batch})
-                run.append(
-                    "curriculum.jsonl", {"updates": updates, "seed": seed, "levels": [LEVEL] * 3}
-                )
+                batch = {"path_length": 3.0, "train_success": value} if task is TASK else {}
+                training = {**batch, "fuel": -float(i), "loss_critic": 0.5, "entropy": 1.0}
+                run.append("training.csv", {"seed": seed, "updates": updates, **training})
+                row = {"updates": updates, "seed": seed, "levels": [level] * 3}
+                run.append("curriculum.jsonl", row)
     for cycle in cycles:
-        run.append("proposer.jsonl", cycle)
+        run.append("cycles.jsonl", cycle)
     updates = EVERY * (len(curve) - 1)
-    facts = {
+    identity = {
         "versions": {"python": "3.11"},
         "device": "cpu",
         "overrides": [f"+method={method}", f"seed={seeds[0]}", "hydra.run.dir=x"],
+        "arguments": {"config_dir": None, "pythonpath": None},
+        "task": task,
+        **(facts or {}),
     }
-    run.write_json("run.json", {**facts, "planned_updates": updates})
+    run.write_json("run.json", {**identity, "planned_updates": updates})
     if finished:
-        run.write_json("summary.json", {**facts, "updates": updates})
+        run.write_json("summary.json", {"updates": updates})
     return folder
 
 
+def write_rockets(folder: Path, method: str, seed: int, **options: Any) -> Path:
+    """A run of the other task, summed up by a return."""
+    schedule = {"headline": "target_return", "threshold": 12.5, "cycle_length": 20}
+    curve = [-3.0, 10.0 + seed, 20.0]
+    return write_run(folder, method, [seed], curve, task=ROCKETS, schedule=schedule, **options)
+
+
 def cycle(
-    number: int, gains: Sequence[float], histogram: Sequence[Sequence[int]], every: int = 20
+    number: int, gains: Sequence[float], histogram: Sequence[Any], every: int = 20
 ) -> dict[str, Any]:
     """A record of a Proposer's cycle."""
     return {
         "cycle": number,
         "updates": every * number,
-        "meta_frames": 100 * (number + 1),
-        "total_gain": list(gains),
+        "curriculum_frames": 100 * (number + 1),
+        "evaluations": 7,
+        "return_gain": list(gains),
+        "log_success_gain": [2 * gain for gain in gains],
+        "total_reward": list(gains),
         "entropy": 1.5,
         "kl_approx": 0.01,
-        "signal_to_noise": 0.3,
-        "histogram": [list(row) for row in histogram],
+        "histogram": list(histogram),
     }

@@ -7,15 +7,18 @@ import html
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image, ImageSequence
 
 from proposer_rl.cli.report import main
+from proposer_rl.cli.watch import main as watch
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.curves import cost_curves
-from tests.report.folders import cycle, write_run
+from proposer_rl.report.levels import along_training, draw_run, side_by_side
+from tests.report.folders import LEVEL, TASK, cycle, write_rockets, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
 
@@ -53,7 +56,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600)
         write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0)
     write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up")
-    write_run(runs / "large", "target", maze={"height": 5, "width": 5})
+    write_run(runs / "large", "target", task={**TASK, "title": "5×5 mazes", "measured": 5})
     return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
 
 
@@ -154,9 +157,9 @@ def test_wrong_folders_get_one_line(tmp_path: Path, capsys) -> None:
 
 def test_a_wrong_threshold_is_refused(runs: Path, capsys) -> None:
     with pytest.raises(SystemExit) as end:
-        main([str(runs), "--threshold", "80"])
+        main([str(runs), "--threshold", "nan"])
     assert end.value.code == 2
-    assert "must be above 0 and at most 1, got '80'" in capsys.readouterr().err
+    assert "must be a number, got 'nan'" in capsys.readouterr().err
 
 
 def refused(capsys, *arguments: str) -> str:
@@ -166,3 +169,77 @@ def refused(capsys, *arguments: str) -> str:
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     return line
+
+
+DEEP: list[Any] = []
+for _ in range(300):
+    DEEP = [DEEP]
+ANYTHING = [
+    {
+        "updates": 0,
+        "scores": [[1, 2], [3]],
+        "note": "x",
+        "deep": DEEP,
+        "rate": 0.25,
+        "buffer": [3, 4],
+        "ok": True,
+    },
+    {"updates": 20, "rate": None, "staleness": 1e300, "histogram": "no", "return_gain": ["a"]},
+    {"updates": 40, "rate": float("nan"), "buffer": {}, "total": 10**400, "$\\bad{": 1, "\x07": 2},
+    {"updates": 40, "histogram": [[[]]], "log_success_gain": [], "return_gain": 3, "buffer": [5]},
+]
+
+
+def test_the_report_is_built_for_any_task(tmp_path: Path, capsys) -> None:
+    """One axis, no success, a return as headline, curricula that record what they like."""
+    for seed in range(2):
+        cycles = [cycle(i, [0.1, -0.1], [9 - i, 1, 1, 1], every=10) for i in range(3)]
+        for record in cycles:
+            del record["log_success_gain"]  # there is none without success
+        write_rockets(tmp_path / "runs" / f"p{seed}", "perf_gain", seed, cycles=cycles)
+        write_rockets(tmp_path / "runs" / f"a{seed}", "plr", seed, cycles=ANYTHING)
+        write_rockets(tmp_path / "runs" / f"t{seed}", "target", seed)
+    page = write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
+    figures = {path.name for path in (page.parent / "figures").iterdir()}
+    for name in ("learning_curves", "cost", "difficulty", "gains", "proposals", "levels"):
+        assert f"{name}.svg" in figures
+    assert {"samples.svg", "diagnostics.svg", "proposals_perf_gain.gif"} <= figures
+    assert "worst_levels.svg" not in figures and "proposals_plr.gif" not in figures
+    text = Tags(page.read_text(encoding="utf-8")).text
+    assert "Tiny scale, rockets" in text and "updates to 12.5 target return" in text
+    assert "Total gain in return" in text and "Proposals over thrust" in text
+    assert not re.search("success of|log success|maze|obstacle|path length", text)
+    rows = list(csv.DictReader((page.parent / "tables" / "cycles.csv").open(encoding="utf-8")))
+    assert [row["rate"] for row in rows if row["method"] == "plr"] == ["0.25", "", "", ""] * 2
+    for folder in ("a0", "p0", "t0", "."):
+        watch([str(tmp_path / "runs" / folder), "--once"])
+    screen = capsys.readouterr().out
+    assert "columns: thrust" in screen and "buffer" in screen and "\x07" not in screen
+
+
+def test_gains_name_their_measure(report: Path) -> None:
+    text = Tags(report.read_text(encoding="utf-8")).text
+    assert "Total gain in log success" in text and "Total gain in return" not in text
+    assert "the maximum gain in return is positive in 6 of 6 cycles" in text
+
+
+def test_a_threshold_of_a_success_is_a_share(runs: Path, tmp_path: Path, capsys) -> None:
+    out = str(tmp_path / "out")
+    assert "must be above 0 and at most 1" in refused(
+        capsys, str(runs), "-o", out, "--threshold=80"
+    )
+
+
+def test_pictures_that_cannot_be_shown_leave_their_place_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [along_training, side_by_side])
+    broken = {"picture": LEVEL["picture"][:-40]}
+    task = {**TASK, "samples": {"id": [broken, {}], "ood": []}}
+    folder = write_run(tmp_path / "runs" / "a", task=task)
+    lines = (folder / "curriculum.jsonl").read_text().replace(LEVEL["picture"], "no picture")
+    (folder / "curriculum.jsonl").write_text(lines)
+    page = write_report([folder], tmp_path / "report", progress=False)
+    assert (page.parent / "figures" / "samples.png").is_file()
+    with Image.open(draw_run(folder, "$\\bad{")) as image:
+        assert image.width > 500

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from proposer_rl.report import runs
-from proposer_rl.report.runs import UnreadableRun, find_runs, read_run
+from proposer_rl.report.proposals import axis_means
+from proposer_rl.report.runs import UnreadableRun, find_runs, read_run, share_map
 from proposer_rl.report.statistics import Waiting
-from tests.report.folders import cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 
 def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -86,26 +90,59 @@ def set_key(*keys: str, value: object):
     return change
 
 
+def in_levels(key: str, value: object):
+    def change(text: str) -> str:
+        row = json.loads(text.splitlines()[0])
+        row["levels"][0][key] = value
+        return json.dumps(row) + "\n"
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
         ("config.json", lambda text: "[]", "not a JSON object"),
         ("config.json", lambda text: "[" * 100_000, "recursion"),
-        ("config.json", lambda text: text[:-5], "delimiter"),
-        ("config.json", set_key("maze", "height", value=10**9), "cannot be drawn"),
-        ("config.json", set_key("maze", value={}), "'height' is missing"),
-        ("config.json", set_key("method", value="x" * 1000), "method is no name"),
-        ("config.json", set_key("method", value="a\nb"), "method is no name"),
+        ("config.json", lambda text: text[:-5], "Unterminated"),
+        ("config.json", set_key("schedule", value={}), "'headline' is missing"),
+        ("config.json", set_key("method", value="x" * 1000), "method: String should have at most"),
+        ("config.json", set_key("method", value="a\nb"), "method: Value error, must be printable"),
         ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),
         ("metrics.csv", lambda text: text.replace("0.5", "nan"), "id_success is not always a"),
         ("metrics.csv", lambda text: text.replace("0.5", "half"), "is not a number"),
         ("metrics.csv", lambda text: text.replace("id_success", "x"), "no column 'id_success'"),
         ("metrics.csv", lambda text: text.splitlines()[0] + "\n", "no rows yet"),
         ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
-        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[1, 4]"), "leaves its level"),
-        ("curriculum.jsonl", lambda text: text.replace("[1, 3]", "[-1, 3]"), "leaves its level"),
-        ("proposer.jsonl", lambda text: text.replace("0.1", '"x"'), "could not convert"),
-        ("proposer.jsonl", lambda text: text.replace("[[1], [1]]", "[1]"), "histogram is no table"),
+        ("metrics.csv", lambda text: text.replace("0.5", "1e300"), "id_success is not always a"),
+        ("training.csv", lambda text: text.replace("updates", "x"), "no column 'updates'"),
+        (
+            "training.csv",
+            lambda text: text.replace("fuel", "\x1b[2J"),
+            "name of a column: Value error",
+        ),
+        ("curriculum.jsonl", in_levels("picture", 1), "0.levels.0.picture: Input should be a"),
+        ("curriculum.jsonl", in_levels("picture", "A" * 2**21), "String should have at most"),
+        ("curriculum.jsonl", in_levels("text", "S G"), "text: Input should be a valid list"),
+        ("curriculum.jsonl", in_levels("text", ["x"] * 65), "at most 64 items"),
+        ("curriculum.jsonl", in_levels("text", ["x" * 401]), "at most 400 characters"),
+        ("curriculum.jsonl", in_levels("text", ["\x1b[2J"]), "must be printable"),
+        ("cycles.jsonl", lambda text: text.replace('"updates": 0', '"updates": "x"'), "no number"),
+        ("cycles.jsonl", lambda text: text.replace('"updates"', '"x"'), "'updates' is missing"),
+        ("run.json", lambda text: "{}", "'task' is missing"),
+        ("run.json", set_key("task", value=[]), "task: Input should be"),
+        ("run.json", set_key("task", "title", value="\x07"), "task: title: Value error"),
+        ("run.json", set_key("task", "distributions", value=[]), "at least 1 item"),
+        ("run.json", set_key("task", "distributions", value=[[]]), "distributions.0: Input"),
+        ("run.json", set_key("task", "space", value={"a": ["x"]}), "space.a.0: Input"),
+        ("run.json", set_key("task", "space", value={"a": [0] * 257}), "at most 256 items"),
+        (
+            "run.json",
+            set_key("task", "space", value={key: [0] for key in "abcdefghi"}),
+            "at most 8 items",
+        ),
+        ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a: Value error"),
+        ("run.json", set_key("task", "samples", value={"id": [1]}), "samples.id.0: Input"),
     ],
 )
 def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
@@ -133,3 +170,49 @@ def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(runs, "LARGEST_FILE", 100)
     with pytest.raises(UnreadableRun, match="is larger than"):
         read_run(folder)
+
+
+def test_a_share_is_never_more_than_all(tmp_path: Path) -> None:
+    """What float32 sums to 1.0000001 is 1; a success of 1.1 is left to be seen."""
+    (run,) = read_run(write_run(tmp_path / "run", curve=[-1e-7, 1.0000001, 1.1]))
+    assert run.metrics["id_success"].tolist() == [0, 1, 1.1]
+
+
+def test_the_reader_is_independent_of_training() -> None:
+    """Folders are read where no torch is, and bin/watch starts at once."""
+    code = (
+        "import sys, types, importlib\n"
+        "package = types.ModuleType('proposer_rl')\n"
+        f"package.__path__ = [{str(Path(runs.__file__).parents[1])!r}]\n"
+        "sys.modules['proposer_rl'] = package\n"
+        "for name in ('cli.report', 'cli.watch', 'report.build'):\n"
+        "    importlib.import_module('proposer_rl.' + name)\n"
+        "loaded = {name.split('.')[0] for name in sys.modules}\n"
+        "assert not loaded & {'torch', 'torchrl', 'tensordict', 'hydra'}, loaded\n"
+        "rooms = {name.split('.')[1] for name in sys.modules if name.startswith('proposer_rl.')}\n"
+        "assert rooms == {'cli', 'report', 'runs'}, rooms\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_proposals_are_counted_along_every_axis(tmp_path: Path) -> None:
+    """The map is the sum over the third axis and the fourth; means are over all."""
+    space = {"a": [0, 1], "b": [1, 2, 4], "c": [5, 7], "d": [9]}
+    counts = np.random.default_rng(0).integers(0, 9, (2, 3, 2, 1))
+    cycles = [{"updates": 0, "histogram": counts.tolist()}]
+    (run,) = read_run(write_run(tmp_path / "a", cycles=cycles, task={**TASK, "space": space}))
+    shares = run.shares(run.cycles[0])
+    assert shares is not None
+    assert share_map(shares) == pytest.approx(counts[..., 0].sum(2) / counts.sum())
+    drawn = [
+        values
+        for place, values in zip(
+            np.ndindex(2, 3, 2, 1), itertools.product(*space.values()), strict=True
+        )
+        for _ in range(counts[place])
+    ]
+    assert axis_means(run, run.cycles[0]) == pytest.approx(np.mean(drawn, 0))
+    assert run.shares({"histogram": counts[:1].tolist()}) is None
+    assert run.shares({"histogram": (0 * counts).tolist()}) is None
+    assert run.shares({"histogram": (-counts).tolist()}) is None
+    assert share_map(np.array([0.25, 0.75])).tolist() == [[0.25, 0.75]]

@@ -191,3 +191,16 @@ def test_seeds_needed_have_the_power_in_a_simulation() -> None:
         axis=1,
     ).pvalue
     assert np.mean(p_values < 0.05) == pytest.approx(0.82, abs=0.03)
+
+
+values = st.lists(st.floats(-1, 1, width=16), min_size=2, max_size=5)
+
+
+@settings(max_examples=20)
+@given(values, values)
+def test_a_probability_is_within_its_bounds(one: list[float], other: list[float]) -> None:
+    for estimate in (
+        probability_of_improvement(one, other),
+        probability_of_improvement(other, one),
+    ):
+        assert all(0 <= value <= 1 for value in estimate)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from proposer_rl.report.page import commands
 from proposer_rl.report.runs import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
-from tests.report.folders import config, cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 CYCLES = [cycle(0, [0.1, 0.2], [[1, 1, 1], [1, 1, 1]])]
 
@@ -81,11 +80,8 @@ def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> Non
 
 def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> None:
     for seed, override in [(0, "cores=1"), (1, "cores=1"), (2, "cores=2")]:
-        run = write_run(tmp_path / str(seed), "target", [seed])
-        facts = json.loads((run / "summary.json").read_text())
-        facts["overrides"].append(override)
-        for name in ("run.json", "summary.json"):
-            (run / name).write_text(json.dumps({**facts, "planned_updates": facts["updates"]}))
+        overrides = ["+method=target", f"seed={seed}", override, "progress=false"]
+        write_run(tmp_path / str(seed), "target", [seed], facts={"overrides": overrides})
     (study,), _ = read(tmp_path)
     assert commands(study) == [
         "bin/train -m +method=target cores=1 seed=0,1",
@@ -93,12 +89,40 @@ def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> 
     ]
 
 
+def test_a_command_is_complete_without_the_folders_of_its_machine(tmp_path: Path) -> None:
+    arguments = {"config_dir": "/home/somebody/my conf", "pythonpath": "/home/x/code:/srv/y/lib"}
+    overrides = ["+method=mine", "task.file=/data/z/levels.txt"]
+    write_run(tmp_path / "a", facts={"arguments": arguments, "overrides": overrides})
+    (study,), _ = read(tmp_path)
+    (command,) = commands(study)
+    assert command == (
+        "PYTHONPATH=code:lib bin/train --config-dir 'my conf' -m +method=mine "
+        "task.file=levels.txt seed=0"
+    )
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"overrides": None},
+        {"overrides": [1]},
+        {"overrides": ["a=1\n```"]},
+        {"overrides": ["a=" + "1" * 9999]},
+        {"arguments": []},
+        {"arguments": {"config_dir": 1}},
+    ],
+)
+def test_a_command_that_is_not_known_in_full_is_not_given(facts, tmp_path: Path) -> None:
+    write_run(tmp_path / "a", facts=facts)
+    (study,), _ = read(tmp_path)
+    assert commands(study) == ["# target: the command was not recorded"]
+
+
 def test_other_levels_make_another_study(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target", [0])
     write_run(tmp_path / "b", "target", [1])
-    write_run(tmp_path / "c", "target", [0], maze={"height": 3, "width": 4})
-    evaluation = {**config("target", 0)["evaluation"], "seed": 1}
-    write_run(tmp_path / "d", "target", [0], evaluation=evaluation)
+    write_run(tmp_path / "c", "target", [0], task={**TASK, "measured": 1})
+    write_run(tmp_path / "d", "target", [0], scale="other")
     studies, _ = read(tmp_path)
     assert sorted(len(study.runs) for study in studies) == [1, 1, 2]
     assert len(studies[0].runs) == 2
@@ -136,3 +160,30 @@ def test_the_threshold_can_be_chosen(tmp_path: Path) -> None:
     write_run(tmp_path / "a")
     assert read_studies([tmp_path / "a"], 0.5)[0][0].threshold == 0.5
     assert read_studies([tmp_path / "a"], None)[0][0].threshold == 0.8
+
+
+def test_a_label_is_one_line_whatever_settings_are_called(tmp_path: Path) -> None:
+    for i in range(2):
+        write_run(tmp_path / str(i), facts={"overrides": None}, solver={"a\n```\n": i})
+    (study,), _ = read(tmp_path)
+    assert len(study.groups) == 2
+    assert all(line.isprintable() for line in [*labels(study), *commands(study)])
+
+
+def test_seeds_trained_together_have_one_curriculum(tmp_path: Path) -> None:
+    """Its cycles would else count once for every seed, and an interval be of nothing."""
+    write_run(tmp_path / "a", "plr", [0, 1], cycles=[{"updates": 0, "score": 1}])
+    write_run(tmp_path / "b", "plr", [2], cycles=[{"updates": 0, "score": 2}])
+    (study,), _ = read(tmp_path)
+    (group,) = study.groups
+    assert group.seeds == [0, 1, 2] and not group.proposes
+    assert sorted(run.folder.name for run in group.logs) == ["a", "b"]
+
+
+def test_a_reused_proposers_settings_tell_runs_apart(tmp_path: Path) -> None:
+    curriculum = {"checkpoint": "runs/seed_0"}
+    for i in range(2):
+        proposer = {"rollouts": i}
+        write_run(tmp_path / str(i), "frozen", curriculum=curriculum, proposer=proposer)
+    (study,), _ = read(tmp_path)
+    assert len(study.groups) == 2

@@ -54,7 +54,7 @@ def test_a_figure_is_the_same_file_every_time() -> None:
     def draw(figure) -> None:
         axes_of(figure).plot([0, 1], [1, 0], **style("plr"))
 
-    drawing = Drawing("d", "D", "", [Panel("p", "P", draw)], labels=["plr"])
+    drawing = Drawing("d", "D", "", [Panel("P", draw)], labels=["plr"])
     one, two = save(drawing), save(drawing)
     assert one == two and set(one) == {"svg", "png"}
     assert b"<dc:date>" not in one["svg"]

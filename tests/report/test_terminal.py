@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from proposer_rl.cli.watch import main
 from proposer_rl.report.progress import find_progress, read_progress
 from proposer_rl.report.terminal import BLOCKS, sparkline
-from tests.report.folders import cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 
 def listing(folder: Path) -> dict[str, tuple[int, int]]:
@@ -32,9 +32,11 @@ def test_one_run_is_a_screen(tmp_path: Path, capsys) -> None:
     text = watch(capsys, str(folder))
     assert listing(tmp_path) == before
     assert "perf_gain, seed 7" in text and "finished" in text and "20/20 updates" in text
-    assert "2,000 frames + 12,000 of the copies" in text
-    assert "90.0%" in text and "+0.250" in text and "-0.125" in text
+    assert "2,000 frames + 12,000 of the curriculum" in text
+    assert "90.0%" in text and "+0.500" in text and "-0.250" in text
     assert "███" in text  # all proposals are of one kind
+    assert "rows: obstacle fraction, columns: path length" in text
+    assert "mazes at update 20 (S start, G goal)" in text
     assert "S • • G" in text  # the path of the level that was recorded
 
 
@@ -44,13 +46,13 @@ def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "config.json").write_text("{}")
     (tmp_path / "broken").mkdir()
-    failure = {"message": "no such [level]", "kind": "E", "exit_code": 2}
+    failure = {"message": "no such [level]\x1b", "kind": "E", "exit_code": 2}
     (tmp_path / "broken" / "error.json").write_text(json.dumps(failure))
     states = {p.folder.name: p.state for p in find_progress(tmp_path)}
     expected = {"done": "finished", "going": "unfinished", "begun": "starting", "broken": "failed"}
     assert states == expected
     text = watch(capsys, str(tmp_path))
-    assert "failed: broken: no such [level]" in text
+    assert "failed: broken: no such [level]?" in text
     assert "4 runs: 1 finished, 1 failed, 1 unfinished, 1 starting" in text
 
 
@@ -86,3 +88,14 @@ def test_a_sparkline_rises_with_its_values(values: list[float]) -> None:
     heights = [BLOCKS.index(block) for block in drawn]
     assert len(drawn) == len(values) and heights == sorted(heights)
     assert sparkline([0, 1, -5, 5, 0.5], 0, 1) == " █ █▄"
+
+
+def test_names_are_no_markup_and_steer_no_terminal(tmp_path: Path, capsys) -> None:
+    task = {**TASK, "distributions": ["[/red]"], "space": {"[b]x[/b]": [0, 1], "y": [2, 3, 4]}}
+    cycles = [{"updates": 0, "[/b]": 1, "\x1b[2J": 2, "histogram": [[1, 0, 0], [0, 0, 0]]}]
+    schedule = {"headline": "[/red]_success", "threshold": 0.8}
+    write_run(tmp_path / "a", "[/x]", cycles=cycles, task=task, schedule=schedule)
+    write_run(tmp_path / "b\x1b[2J")
+    text = watch(capsys, str(tmp_path / "a"))
+    assert "[/x], seed 0" in text and "[/red] success" in text and "rows: [b]x[/b]" in text
+    assert "\x1b" not in text + watch(capsys, str(tmp_path))

@@ -1,0 +1,275 @@
+"""Curricula in closed form: train on what raises the target's performance to first order."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.learning import PPO, Update
+from proposer_rl.meta.actions import systematic_draw
+from proposer_rl.meta.first_order import (
+    advantages,
+    alignment,
+    bin_scores,
+    exact_alignment,
+    exact_direction,
+    surrogate,
+    target_direction,
+)
+from proposer_rl.streams import Streams
+from proposer_rl.task import DifferentiableTask, Task
+
+
+class ExactTask(Task, DifferentiableTask, Protocol):
+    """A task whose performance has gradients."""
+
+
+class BinCurriculum(Curriculum):
+    """Draws each Solver's batch from bins by their scores.
+
+    With s_n the exponential moving average of the n-th bin's score, its share of the batch is
+
+        q_n  proportional to  exp( s_n / (temperature * max over n of |s_n|) ).
+
+    Args:
+        task: whose space has the bins.
+        every: updates between two looks at the Solvers.
+        temperature: of the shares.
+        smoothing: share of the old score in the average.
+
+    Raises:
+        ValueError: if a number is out of range.
+    """
+
+    def __init__(self, task: Task, *, every: int, temperature: float, smoothing: float) -> None:
+        if every < 1 or not temperature > 0 or not 0 <= smoothing < 1:
+            raise ValueError(
+                "every must be at least 1, temperature above 0 and smoothing from 0 to below 1; "
+                f"got {every}, {temperature}, {smoothing}"
+            )
+        self.task = task
+        self.smoothing = smoothing
+        self._every = every
+        self._temperature = temperature
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the last Solver's scores."""
+        self.scores: dict[str, Tensor] = {}  # by name: "score" float [K, N], on the CPU, and others
+        self._proposed = torch.zeros(self.task.space.size, dtype=torch.int64)
+
+    @abstractmethod
+    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
+        """Look at the Solvers; return the frames and evaluations that it took for each."""
+
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
+        """Levels [K, P], drawn systematically from the shares."""
+        first = not self.scores
+        cost = self.look(learner, streams) if first or updates % self._every == 0 else (0, 0)
+        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
+        self._choices = systematic_draw(self.shares(), self.task.batch_size, draws)
+        self._proposed += self._choices.flatten().bincount(minlength=len(self._proposed))
+        return Proposal(self.task.space.generate(self._choices, levels), *cost)
+
+    def shares(self) -> Tensor:
+        """Of the bins in the next batch, float [K, N]."""
+        score = self.scores["score"]
+        largest = score.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(score.dtype).tiny)
+        return (score / (self._temperature * largest)).softmax(-1)
+
+    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
+        """Tell of the last cycle: counts, and of each Solver scores and how even its shares are."""
+        if not self.scores:
+            return Improvement()
+        shape = [len(values) for values in self.task.space.axes.values()]
+        shares = self.shares()
+        metrics = {
+            "histogram": self._proposed.view(shape).tolist(),
+            "score": self.scores["score"].unflatten(-1, shape).tolist(),
+            "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
+            "effective_bins": (1 / shares.square().sum(-1)).tolist(),
+        }
+        self._proposed = torch.zeros_like(self._proposed)
+        return Improvement(metrics)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The scores, and how often each bin was proposed in the cycle."""
+        return {"scores": dict(self.scores), "proposed": self._proposed.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        self.scores = dict(state["scores"])
+        self._proposed = state["proposed"].clone()
+
+
+class FirstOrderCurriculum(BinCurriculum):
+    """Scores each bin with the mean alignment of fresh levels of it, which nobody plays.
+
+    The alignments are exact (:mod:`proposer_rl.meta.first_order`): no frames are spent.
+
+    Args:
+        task: whose target is to be mastered.
+        every, temperature, smoothing: see :class:`BinCurriculum`.
+        target_levels: fresh levels E of the target that the direction is taken from.
+        candidates: levels C of each bin.
+        measure: of the target's performance; see :func:`target_performance`.
+
+    Raises:
+        TypeError: if the task's performance has no gradients.
+        ValueError: if a number is out of range.
+    """
+
+    def __init__(
+        self,
+        task: ExactTask,
+        *,
+        every: int = 1,
+        target_levels: int = 256,
+        candidates: int = 16,
+        temperature: float = 0.1,
+        smoothing: float = 0.9,
+        measure: str = "log_success",
+    ) -> None:
+        require_gradients(task)
+        if min(target_levels, candidates) < 1:
+            raise ValueError(
+                "target_levels and candidates must be at least 1, got "
+                f"{target_levels}, {candidates}"
+            )
+        super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
+        self._exact = task
+        self._target_levels = target_levels
+        self._candidates = candidates
+        self._measure = measure
+
+    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
+        """Score every bin."""
+        task, size, count = self._exact, self.task.space.size, self._candidates
+        target = torch.stack(
+            [task.target.sample(self._target_levels, s.generator("target")) for s in streams]
+        )
+        reached, direction = exact_direction(task, learner, target, self._measure)
+        bins = torch.arange(size).repeat_interleave(count).expand(len(streams), -1)
+        levels = task.space.generate(bins, [s.generator("candidates") for s in streams])
+        found = exact_alignment(task, learner, direction, levels).unflatten(-1, (size, count))
+        score, error = (x.cpu() for x in bin_scores(found))
+        old = self.smoothing if self.scores else 0.0
+        before = self.scores or {"score": score, "variance": error.square()}
+        self.scores = {
+            "score": old * before["score"] + (1 - old) * score,
+            "variance": old**2 * before["variance"] + (1 - old) ** 2 * error.square(),
+            "target": reached.cpu(),
+        }
+        return 0, self._target_levels + 2 * count * size  # a candidate counts on either side
+
+    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
+        """... and the scores' standard errors, and the target's performance at the last look."""
+        told = super().improve(learner, updates, streams)
+        if told.metrics:
+            told.metrics["target_performance"] = self.scores["target"].tolist()
+        if told.metrics and self._candidates > 1:
+            shape = [len(values) for values in self.task.space.axes.values()]
+            error = self.scores["variance"].sqrt()
+            told.metrics["score_error"] = error.unflatten(-1, shape).tolist()
+        return told
+
+
+class SampledFirstOrderCurriculum(BinCurriculum):
+    """The same from episodes, with any environment.
+
+    The direction is the policy gradient of episodes that are played on the target, whose frames
+    count; it is averaged as the scores are. The score of a bin is the mean alignment of the
+    Solver's own training episodes on it, which cost nothing, so that a part of each batch goes to
+    all bins alike.
+
+    Where there is no success on the target there is no direction, but noise.
+
+    Args:
+        task: whose target is to be mastered.
+        every, temperature, smoothing: see :class:`BinCurriculum`.
+        exploration: part of each batch that is drawn evenly.
+
+    Raises:
+        ValueError: if a number is out of range.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        every: int = 1,
+        temperature: float = 0.1,
+        smoothing: float = 0.9,
+        exploration: float = 0.2,
+    ) -> None:
+        if not 0 <= exploration <= 1:
+            raise ValueError(f"exploration must be from 0 to 1, got {exploration}")
+        super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
+        self._exploration = exploration
+
+    def begin(self) -> None:
+        """Forget the last Solver's scores and direction."""
+        super().begin()
+        self._direction: dict[str, Tensor] = {}
+
+    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
+        """Play a batch of the target."""
+        task = self.task
+        levels = [task.target.sample(task.batch_size, s.generator("target")) for s in streams]
+        learner.env.set_levels(torch.stack(levels))
+        rollout = learner.collect(
+            [s.generator("target_actions", device=task.device) for s in streams]
+        )
+        with torch.enable_grad():
+            worth = surrogate(learner.agent, rollout, advantages(learner, rollout)).mean(1)
+            found = target_direction(learner, worth)
+        old = self.smoothing if self._direction else 0.0
+        before = self._direction or found
+        self._direction = {name: old * before[name] + (1 - old) * found[name] for name in found}
+        if not self.scores:
+            self.scores = {"score": torch.zeros(len(streams), task.space.size)}
+        return rollout[0].numel(), 0
+
+    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
+        """Score the bins that were trained on."""
+        rollout, score = update.rollout, self.scores["score"]
+        advantage = advantages(learner, rollout)
+        found = alignment(
+            learner.agent,
+            self._direction,
+            learner.settings.learning_rate,
+            lambda: surrogate(learner.agent, rollout, advantage),
+        ).to(score)
+        counts = torch.zeros_like(score).scatter_add_(1, self._choices, torch.ones_like(found))
+        means = torch.zeros_like(score).scatter_add_(1, self._choices, found) / counts
+        averaged = self.smoothing * score + (1 - self.smoothing) * means
+        self.scores = {"score": torch.where(counts > 0, averaged, score)}
+
+    def shares(self) -> Tensor:
+        """Of the bins in the next batch, float [K, N]."""
+        shares = super().shares()
+        return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The direction too."""
+        return {**super().state_dict(), "direction": dict(self._direction)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with it."""
+        super().load_state_dict(state)
+        # A checkpoint's tensors are on the CPU.
+        self._direction = {k: v.to(self.task.device) for k, v in state["direction"].items()}
+
+
+def require_gradients(task: object) -> None:
+    """Raise a TypeError if the task's performance has none."""
+    if not isinstance(task, DifferentiableTask):
+        raise TypeError(
+            f"first-order gain needs gradients: {type(task).__name__} must define "
+            "differentiable_performance(agent, levels); +method=first_order_sampled needs none"
+        )

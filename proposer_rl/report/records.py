@@ -1,0 +1,153 @@
+"""Numbers, texts and pictures of a run's records. They may come from anybody and be anything."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import warnings
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
+
+PICTURE_BYTES = PICTURE_PIXELS = 2**20
+LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
+LONGEST_TEXT = 400
+
+# Total gains of copies, by their name in the records of cycles; the first that is there is shown.
+GAINS = {"log_success_gain": "log success", "return_gain": "return"}
+# What of a cycle's record is not a number of the curriculum's own.
+PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}
+
+Column = NDArray[np.float64]
+Record = Mapping[str, Any]
+T = TypeVar("T")
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("must be printable, on one line")
+    return text
+
+
+Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_one_line)]
+Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_one_line)]
+
+
+class LevelRecord(BaseModel):
+    """A level as its task recorded it: a PNG in base64, and lines of text."""
+
+    picture: Annotated[str, Field(max_length=PICTURE_BYTES * 4 // 3 + 4)] | None = None
+    text: Annotated[list[Text], Field(max_length=64)] = []
+
+
+class SampleRecord(BaseModel):
+    """Levels that a seed trained on."""
+
+    updates: int
+    seed: int
+    levels: list[LevelRecord]
+
+
+class TaskFacts(BaseModel):
+    """What a run says of its task, for a reader.
+
+    Attributes:
+        title: what it is, as ``6×6 mazes``.
+        levels: what a level is called, plural.
+        distributions: names of what was measured on.
+        space: of the levels that are chosen from: the values along each axis, by its name.
+        about: further facts, by their label.
+        measured: all that must be equal for two runs to be comparable.
+        samples: levels of each distribution.
+        key: what is to be seen in pictures.
+        text_key: what is to be seen in levels drawn in characters.
+    """
+
+    title: Name
+    levels: Name = "levels"
+    distributions: Annotated[list[Name], Field(min_length=1)]
+    space: Annotated[
+        dict[Name, Annotated[list[FiniteFloat], Field(min_length=1, max_length=256)]],
+        Field(max_length=8),
+    ] = {}
+    about: dict[Name, Text] = {}
+    measured: Any
+    samples: dict[Name, list[LevelRecord]] = {}
+    key: Text = ""
+    text_key: Text = ""
+
+
+def checked(kind: type[T], value: Any, where: str) -> T:
+    """A value from a file as it should be.
+
+    Raises:
+        ValueError: with the place of the first thing that is not so.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{where}: {place}{': ' * bool(place)}{first['msg']}") from error
+
+
+def printable(text: str) -> str:
+    """A text as one line that can do nothing to a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def picture(encoded: Any) -> NDArray[np.uint8] | None:
+    """A picture that was recorded, uint8 [H, W, 3]; None where it is none that can be shown."""
+    try:
+        content = base64.b64decode(encoded, validate=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
+                if not 0 < image.width * image.height <= PICTURE_PIXELS:
+                    return None
+                image.verify()
+            # Verified, a file must be opened again.
+            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
+                return np.asarray(image.convert("RGB"))
+    except Exception:  # whatever a decoder makes of foreign bytes, it is no picture
+        return None
+
+
+def number(value: Any) -> float:
+    """A recorded number, of a list of numbers the mean; NaN where it is neither."""
+    if isinstance(value, list):
+        found = numbers(value)
+        return math.nan if found is None else float(found.mean())
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    return float(value) if abs(value) < LARGEST else math.nan
+
+
+def numbers(value: Any) -> Column | None:
+    """A list of finite numbers; None where it is none."""
+    if not isinstance(value, list) or not value or any(isinstance(one, list) for one in value):
+        return None
+    found = np.array([number(one) for one in value])
+    return found if np.isfinite(found).all() else None
+
+
+def is_rate(name: str) -> bool:
+    """Whether a column holds shares from 0 to 1, as success is."""
+    return "success" in name.split("_")
+
+
+def words(name: str) -> str:
+    """A column in words: ``id_success`` is ID success."""
+    first, _, rest = name.partition("_")
+    first = first.upper() if len(first) <= 3 else first
+    return f"{first} {rest.replace('_', ' ')}".strip()
+
+
+def level_text(name: str, value: float) -> str:
+    """A value of a column as a reader wants it: 80% of a success, 0.8 of anything else."""
+    return f"{value:.0%}" if is_rate(name) else f"{value:g}"

@@ -1,0 +1,117 @@
+"""The Proposer that is paid for each problem, on Solvers whose best batch is known."""
+
+from __future__ import annotations
+
+import copy
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
+from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.models import (
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    draw,
+    proposer_actor_critic,
+)
+from proposer_rl.models.actor_critic import ActorCritic
+from proposer_rl.streams import Streams
+from tests.curricula.test_first_order import BINS, P, Skills
+
+WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
+
+
+class Seen(Skills):
+    """Skills that a Proposer looks at."""
+
+    def probe(self, agent: nn.Module, levels: Tensor) -> Tensor:  # type: ignore[override]
+        return torch.ones(1, len(levels), 3)
+
+
+def agent() -> ActorCritic:
+    torch.manual_seed(0)
+    head = ProblemHead(8, P, BINS, hidden=16, bands=4)
+    network = ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
+    return proposer_actor_critic(network, categorical)
+
+
+def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
+    chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
+    return FirstOrderProposer(
+        task, agent(), PPOSettings(**chosen), probe_levels=2, target_levels=3, measure="return"
+    )
+
+
+def test_it_learns_to_choose_what_the_target_needs() -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task)
+    for update in range(60):
+        proposal = curriculum.propose(task, update, [Streams(0, update)])
+    assert proposal.levels.shape == (1, P)
+    assert (proposal.frames, proposal.evaluations) == (0, 3 + 2 * P)
+    assert (proposal.levels == 2).float().mean() > 0.8
+
+
+def test_every_problem_is_credited_with_its_own_alignment() -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
+    expected = copy.deepcopy(curriculum.agent)
+    choices = curriculum.propose(task, 0, [Streams(0)]).levels[0]
+
+    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
+    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
+    noise = torch.rand(1, P, generator=Streams(0).generator("choices"))
+    assert torch.equal(choices, draw(policy, noise[0]))
+    paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
+    advantage = (paid - paid.mean()) / paid.std()
+    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
+    by_hand = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
+    loss.backward()
+    by_hand.step()
+    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_a_resumed_proposer_goes_on_bit_by_bit() -> None:
+    def run(curriculum: FirstOrderProposer, updates: range) -> list[Tensor]:
+        return [curriculum.propose(task, u, [Streams(0, u)]).levels for u in updates]
+
+    task = Seen(1, WANTED)
+    straight, interrupted, resumed = (proposer(task) for _ in range(3))
+    expected = run(straight, range(6))[3:]
+    run(interrupted, range(3))
+    resumed.load_state_dict(interrupted.state_dict())
+    found = run(resumed, range(3, 6))
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+    told = [c.improve(task, 6, [Streams(0)]).metrics for c in (straight, resumed)]
+    assert json.dumps(told[0]) == json.dumps(told[1])
+    assert int(torch.tensor(told[0]["histogram"]).sum()) == 6 * P
+    one, other = straight.agent.state_dict(), resumed.agent.state_dict()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_proposer_that_has_not_begun_resumes_too() -> None:
+    task = Seen(1, WANTED)
+    one, other = proposer(task), proposer(task)
+    other.load_state_dict(one.state_dict())
+    assert one.improve(task, 0, [Streams(0)]).metrics == {}
+    levels = [c.propose(task, 0, [Streams(0)]).levels for c in (one, other)]
+    assert torch.equal(*levels)
+
+
+def test_several_solvers_are_refused() -> None:
+    task = Seen(2, WANTED)
+    with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
+        proposer(task).propose(task, 0, [Streams(0), Streams(1)])
+
+
+def test_a_task_without_gradients_is_refused() -> None:
+    with pytest.raises(TypeError, match="must define differentiable_performance"):
+        FirstOrderProposer(SimpleNamespace(), agent(), PPOSettings())

@@ -1,0 +1,307 @@
+"""First-order gain against derivatives that are taken in other ways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.nn.functional import unfold
+
+from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.mazes import Level, MazeEnv, generate_levels, planes
+from proposer_rl.mazes.evaluation import ExactEvaluator
+from proposer_rl.meta.first_order import (
+    advantages,
+    alignment,
+    bin_scores,
+    moved,
+    root_mean_square,
+    surrogate,
+    target_direction,
+    target_performance,
+)
+from proposer_rl.models import ActorCritic, Population, UNet, categorical
+from proposer_rl.models.maps import cell_logits, read_maps
+
+EVALUATE = ExactEvaluator(max_steps=8)
+RATE = 1e-3
+
+
+class Small(nn.Module):
+    """K policies of what is next to a cell, in double precision; values are zero."""
+
+    def __init__(self, copies: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        weight = torch.randn(copies, 4, 27, generator=generator, dtype=torch.float64)
+        self.weight = nn.Parameter(0.5 * weight)
+        self.bias = nn.Parameter(torch.zeros(copies, 4, 1, dtype=torch.float64))
+
+    def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
+        neighbours = unfold(planes.flatten(0, 1).double(), 3, padding=1)  # [K * P, 27, H * W]
+        logits = self.weight.unsqueeze(1) @ neighbours.unflatten(0, planes.shape[:2])
+        logits = (logits + self.bias.unsqueeze(1)).unflatten(-1, planes.shape[-2:])
+        return logits, torch.zeros_like(logits[..., :1, :, :])
+
+
+def learner(levels: Level, copies: int = 2, network: nn.Module | None = None) -> PPO:
+    """Solvers in the environment of levels [K, P], whose Adam has made a step or two."""
+    network = Small(copies) if network is None else network
+    maps = TensorDictModule(network, ["planes"], ["policy_map", "value_map"])
+    keys = ["policy_map", "value_map", "agent"]
+    head = TensorDictModule(read_maps, keys, ["logits", "state_value"])
+    agent = ActorCritic(head, maps, distribution_class=categorical, copies=copies)
+    settings = PPOSettings(
+        horizon=8, epochs=1, learning_rate=RATE, gamma=1.0, lmbda=1.0, normalize_advantage=False
+    )
+    ppo = PPO(MazeEnv(levels, max_steps=8), agent, settings)
+    snapshot, generator = ppo.snapshot(), torch.Generator().manual_seed(1)
+    for name in snapshot.keys():
+        square = snapshot[name, "exp_avg_sq"]
+        square.copy_(1e-4 * torch.rand(square.shape, generator=generator, dtype=torch.float64))
+        snapshot[name, "step"].fill_(3)
+    ppo.restore(snapshot)
+    return ppo
+
+
+def some_levels(copies: int, count: int) -> Level:
+    generator = torch.Generator().manual_seed(0)
+    fraction = torch.full((copies, count), 0.2)
+    return generate_levels(fraction, 3, 4, 4, generator=generator)
+
+
+def performance(agent: ActorCritic, levels: Level) -> TensorDict:
+    logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
+    return EVALUATE.differentiable(levels, logits)
+
+
+def exact_direction(ppo: PPO, levels: Level, measure: str = "log_success") -> dict[str, Tensor]:
+    return target_direction(ppo, target_performance(performance(ppo.agent, levels), measure))
+
+
+def inner(one: dict[str, Tensor], other: dict[str, Tensor]) -> Tensor:
+    return torch.stack([(one[name] * other[name]).flatten(1).sum(1) for name in one]).sum(0)
+
+
+def gradient(agent: ActorCritic, value: Tensor) -> dict[str, Tensor]:
+    names, parameters = zip(*agent.named_parameters(), strict=True)
+    found = torch.autograd.grad(value, parameters, materialize_grads=True)
+    return dict(zip(names, found, strict=True))
+
+
+@pytest.mark.parametrize("measure", ["log_success", "return"])
+def test_the_direction_is_the_preconditioned_slope_of_the_targets_performance(measure: str) -> None:
+    levels = some_levels(2, 5)
+    ppo = learner(levels)
+    found = exact_direction(ppo, levels, measure)
+    expected = {}
+    for name, parameter in ppo.agent.named_parameters():
+        slope = torch.zeros_like(parameter)
+        for i in range(parameter[0].numel()):  # the same number of both Solvers at once
+            values = []
+            for change in (1e-6, -1e-6):
+                one = {n: torch.zeros_like(p) for n, p in ppo.agent.named_parameters()}
+                one[name].flatten(1)[:, i] = change
+                with torch.no_grad(), moved(ppo.agent, one, 1.0):
+                    result = EVALUATE(levels, cell_logits(ppo.agent, planes(levels)))
+                worth = result["return"] if measure == "return" else result["success"] + 1e-3
+                values.append((worth if measure == "return" else worth.log()).mean(1))
+            slope.flatten(1)[:, i] = (values[0] - values[1]) / 2e-6
+        second = ppo.snapshot()[name, "exp_avg_sq"] / (1 - 0.999**3)
+        expected[name] = slope.detach() / (second.sqrt() + 1e-5)
+    for k in range(2):
+        flat = torch.cat([x[k].flatten() for x in expected.values()])
+        scale = flat.square().mean().sqrt()
+        for name, entry in found.items():
+            torch.testing.assert_close(entry[k], expected[name][k] / scale, rtol=1e-5, atol=1e-7)
+
+
+def test_before_the_first_step_it_is_the_gradients_direction() -> None:
+    levels = some_levels(2, 5)
+    ppo = learner(levels)
+    fresh = ppo.snapshot()
+    for name in fresh.keys():
+        fresh[name, "exp_avg_sq"].zero_()
+        fresh[name, "step"].zero_()
+    ppo.restore(fresh)
+    found = exact_direction(ppo, levels, "return")
+    value = performance(ppo.agent, levels)["return"].mean(1).sum()
+    slope = gradient(ppo.agent, value)
+    torch.testing.assert_close(root_mean_square(found), torch.ones(2, dtype=torch.float64))
+    cosine = inner(found, slope) / (inner(found, found) * inner(slope, slope)).sqrt()
+    torch.testing.assert_close(cosine, torch.ones(2, dtype=torch.float64))
+
+
+def test_an_alignment_tells_what_a_small_step_changes() -> None:
+    target, levels = some_levels(2, 5), some_levels(2, 7)
+    ppo = learner(target)
+    direction = exact_direction(ppo, target)
+
+    def returns() -> Tensor:
+        return performance(ppo.agent, levels)["return"]
+
+    slope = alignment(ppo.agent, direction, RATE, returns)
+    before = returns().detach()
+    remainder = []
+    for step in (1e-3, 1e-4):
+        with torch.no_grad(), moved(ppo.agent, direction, step):
+            remainder.append((returns() - before - step * slope).abs().max())
+    assert remainder[0] < 0.01 * (1e-3 * slope).abs().max()
+    # Of second order: a tenth of the step leaves a hundredth of it.
+    assert remainder[1] < 0.02 * remainder[0]
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_an_alignment_is_the_inner_product_with_the_levels_gradient(double: bool) -> None:
+    target, levels = some_levels(2, 5), some_levels(2, 4)
+    torch.manual_seed(0)
+    network = None if double else Population(lambda: UNet(channels=(8, 8)), copies=2, cores=1)
+    ppo = learner(target, network=network)
+    direction, step = exact_direction(ppo, target), RATE if double else 1e-5
+    found = alignment(ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"])
+    for p in range(4):
+        returns = performance(ppo.agent, levels)["return"][:, p]
+        expected = inner(direction, gradient(ppo.agent, returns.sum()))
+        # In single precision the difference of two returns is rounded at about 1e-7 / step; a
+        # network with kinks, as this one has them, needs a step as short as that.
+        torch.testing.assert_close(
+            found[:, p], expected, rtol=1e-4 if double else 0.02, atol=1e-9 if double else 1e-2
+        )
+
+
+def test_a_solvers_numbers_do_not_depend_on_those_beside_it() -> None:
+    target, levels = some_levels(2, 5), some_levels(2, 4)
+    both, alone = learner(target), learner(target[1:], 1)
+    alone.restore(both.snapshot()[1:])
+
+    def scores(ppo: PPO, which: slice) -> Tensor:
+        direction = exact_direction(ppo, target[which])
+        return alignment(
+            ppo.agent, direction, RATE, lambda: performance(ppo.agent, levels[which])["return"]
+        )
+
+    torch.testing.assert_close(scores(both, slice(0, 2))[1:], scores(alone, slice(1, 2)))
+
+
+def first_episodes(ppo: PPO, generators: list[torch.Generator]) -> tuple[TensorDict, Tensor]:
+    """A rollout and its advantages, of which those behind the first episode do not count."""
+    rollout = ppo.collect(generators)
+    done = rollout["next", "done"].squeeze(-1).long()
+    return rollout, advantages(ppo, rollout) * (done.cumsum(-1) - done == 0)
+
+
+def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -> None:
+    levels, episodes = some_levels(2, 6), 2048
+    ppo = learner(levels.unsqueeze(1).expand(2, episodes, 6).reshape(2, -1))
+    steps = ppo.settings.horizon
+    rollout, advantage = first_episodes(ppo, [torch.Generator().manual_seed(k) for k in range(2)])
+    exact = exact_direction(ppo, levels, "return")
+    expected = alignment(ppo.agent, exact, RATE, lambda: performance(ppo.agent, levels)["return"])
+    each = steps * alignment(
+        ppo.agent, exact, RATE, lambda: surrogate(ppo.agent, rollout, advantage)
+    ).unflatten(1, (episodes, 6))
+    error = {n: float((each[:, :n].mean(1) - expected).square().mean().sqrt()) for n in (32, 2048)}
+    spread = float(each.std(1).square().mean().sqrt())
+    for n in error:
+        assert error[n] < 2 * spread / n**0.5  # twelve numbers: about 1 on average
+    together = torch.stack([each.mean(1).flatten(), expected.flatten()])
+    assert torch.corrcoef(together)[0, 1] > 0.98
+
+    sampled = target_direction(ppo, surrogate(ppo.agent, rollout, advantage).mean(1))
+    cosine = inner(sampled, exact) / (inner(sampled, sampled) * inner(exact, exact)).sqrt()
+    few = rollout[:, : 6 * 32], advantage[:, : 6 * 32]
+    rough = target_direction(ppo, surrogate(ppo.agent, *few).mean(1))
+    cosine_of_few = inner(rough, exact) / (inner(rough, rough) * inner(exact, exact)).sqrt()
+    assert (cosine > 0.95).all()
+    assert (cosine_of_few < cosine).all()
+
+
+def test_alignments_of_problems_add_up_to_the_batchs() -> None:
+    levels = some_levels(2, 6)
+    ppo = learner(levels)
+    rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
+    advantage = advantages(ppo, rollout)
+    direction = exact_direction(ppo, levels)
+    each = alignment(ppo.agent, direction, 1e-4, lambda: surrogate(ppo.agent, rollout, advantage))
+    batch = surrogate(ppo.agent, rollout, advantage).mean(1).sum()
+    torch.testing.assert_close(
+        each.mean(1), inner(direction, gradient(ppo.agent, batch)), rtol=1e-4, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("standardised", [False, True])
+def test_advantages_are_those_that_training_uses(standardised: bool) -> None:
+    ppo = learner(some_levels(2, 6))
+    ppo.settings = PPOSettings(horizon=8, gamma=1.0, lmbda=1.0, normalize_advantage=standardised)
+    rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
+    found = advantages(ppo, rollout)
+    assert "advantage" not in rollout.keys()
+    ppo.optimise(rollout)
+    expected = rollout["advantage"].squeeze(-1).numpy()
+    if standardised:
+        mean, deviation = (
+            f(expected, axis=(1, 2), keepdims=True, **options)
+            for f, options in ((np.mean, {}), (np.std, {"ddof": 1}))
+        )
+        expected = (expected - mean) / deviation
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_moved_weights_come_back_bit_by_bit(fails: bool) -> None:
+    ppo = learner(some_levels(2, 3), network=Population(lambda: UNet(channels=(8, 8)), 2, cores=1))
+    before = {name: p.detach().clone() for name, p in ppo.agent.named_parameters()}
+    places = {name: p.data_ptr() for name, p in ppo.agent.named_parameters()}
+    direction = {name: torch.randn_like(p) for name, p in before.items()}
+
+    def worth() -> Tensor:
+        for name, parameter in ppo.agent.named_parameters():
+            assert not torch.equal(parameter, before[name])
+        if fails:
+            raise KeyError("no such level")
+        return torch.zeros(2, 1)
+
+    if fails:
+        with pytest.raises(KeyError):
+            alignment(ppo.agent, direction, 0.1, worth)
+    else:
+        alignment(ppo.agent, direction, 0.1, worth)
+    for name, parameter in ppo.agent.named_parameters():
+        assert parameter.data_ptr() == places[name]  # still what Adam moves
+        assert torch.equal(parameter.view(torch.int32), before[name].view(torch.int32))
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"), [(0.0, "copy 1: .* length 0.0"), (float("nan"), "copy 1: .* length nan")]
+)
+def test_a_direction_that_is_none_is_an_error(factor: float, message: str) -> None:
+    levels = some_levels(2, 3)
+    ppo = learner(levels)
+    returns = performance(ppo.agent, levels)["return"].mean(1)
+    with pytest.raises(DivergedError, match=message):
+        target_direction(ppo, returns * torch.tensor([1.0, factor]))
+
+
+def test_a_target_without_any_success_is_told_in_one_line() -> None:
+    success = torch.tensor([[0.0, 1e-30], [0.0, 0.0]])
+    told = "copy 1: the probability of success is exactly 0 on each of 2 levels"
+    with pytest.raises(DivergedError, match=told) as info:
+        target_performance(TensorDict({"success": success}, [2, 2]), "log_success")
+    assert "\n" not in str(info.value)
+
+
+def test_an_unknown_measure_is_refused() -> None:
+    with pytest.raises(ValueError, match="measure must be log_success or return, got 'regret'"):
+        target_performance(TensorDict({}), "regret")
+
+
+def test_scores_are_means_with_standard_errors() -> None:
+    values = torch.randn(2, 3, 16, generator=torch.Generator().manual_seed(0))
+    score, error = bin_scores(values)
+    np.testing.assert_allclose(score, values.numpy().mean(-1), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(error, values.numpy().std(-1, ddof=1) / 4, rtol=1e-5)
+    assert bin_scores(values[..., :1])[1].isinf().all()
