@@ -35,8 +35,7 @@ def python(tmp_path: Path) -> dict[str, str]:
 
 
 def test_they_are_all_there() -> None:
-    commands = {"bench", "eval", "look", "report", "snr", "train", "watch"}
-    assert MODULES.keys() == commands
+    assert {"bench", "eval", "look", "report", "snr", "train", "watch"} <= MODULES.keys()
     assert all(os.access(file, os.X_OK) for file in BIN.iterdir() if file.name != "_environment")
 
 
