@@ -117,7 +117,8 @@ class FirstOrderCurriculum(BinCurriculum):
         every, temperature, smoothing: see :class:`BinCurriculum`.
         target_levels: fresh levels E of the target that the direction is taken from.
         candidates: levels C of each bin.
-        measure: of the target's performance; see :func:`target_performance`.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
 
     Raises:
         TypeError: if the task's performance has no gradients.

@@ -35,7 +35,8 @@ class FirstOrderProposer(Curriculum):
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
         target_levels: fresh levels E of the target that the direction is taken from.
-        measure: of the target's performance; see :func:`target_performance`.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
 
     Raises:
         TypeError: if the task's performance has no gradients.
