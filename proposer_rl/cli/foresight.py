@@ -46,7 +46,7 @@ def main() -> None:
 def _run(arguments: argparse.Namespace) -> None:
     check_output("--output", arguments.output, (".json",))
     found = [(folder, file) for folder in arguments.folders for file in checkpoints(folder)]
-    rows = []
+    rows: list[dict[str, Any]] = []
     try:
         for folder, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
             rows += _measure(folder, file, arguments)

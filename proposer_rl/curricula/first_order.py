@@ -127,7 +127,7 @@ class FirstOrderCurriculum(BinCurriculum):
 
     def __init__(
         self,
-        task: ExactTask,
+        task: Task,
         *,
         every: int = 1,
         target_levels: int = 256,
@@ -136,14 +136,13 @@ class FirstOrderCurriculum(BinCurriculum):
         smoothing: float = 0.9,
         measure: str = "log_success",
     ) -> None:
-        require_gradients(task)
         if min(target_levels, candidates) < 1:
             raise ValueError(
                 "target_levels and candidates must be at least 1, got "
                 f"{target_levels}, {candidates}"
             )
         super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
-        self._exact = task
+        self._exact = require_gradients(task)
         self._target_levels = target_levels
         self._candidates = candidates
         self._measure = measure
@@ -267,10 +266,12 @@ class SampledFirstOrderCurriculum(BinCurriculum):
         self._direction = {k: v.to(self.task.device) for k, v in state["direction"].items()}
 
 
-def require_gradients(task: object) -> None:
-    """Raise a TypeError if the task's performance has none."""
+def require_gradients(task: Task) -> ExactTask:
+    """The task, if its performance has gradients; else a TypeError."""
     if not isinstance(task, DifferentiableTask):
         raise TypeError(
             f"first-order gain needs gradients: {type(task).__name__} must define "
             "differentiable_performance(agent, levels); +method=first_order_sampled needs none"
         )
+    exact: Any = task
+    return exact
