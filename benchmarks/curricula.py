@@ -10,7 +10,7 @@ from proposer_rl.streams import Streams
 REFERENCE = "domain_randomization"
 # Those that train no copies of the Solver.
 COMPARED = ("hand_made", "first_order_gain", "first_order_sampled", "first_order_proposer")
-STRETCH = 5  # updates timed together: a curriculum may look at the Solver only now and then
+STRETCH = 2  # updates timed together: a curriculum may look at the Solver only now and then
 
 
 def update_seconds(options: Options) -> Result:
