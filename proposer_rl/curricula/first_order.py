@@ -136,13 +136,14 @@ class FirstOrderCurriculum(BinCurriculum):
         smoothing: float = 0.9,
         measure: str = "log_success",
     ) -> None:
+        exact = require_gradients(task)
         if min(target_levels, candidates) < 1:
             raise ValueError(
                 "target_levels and candidates must be at least 1, got "
                 f"{target_levels}, {candidates}"
             )
         super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
-        self._exact = require_gradients(task)
+        self._exact = exact
         self._target_levels = target_levels
         self._candidates = candidates
         self._measure = measure
