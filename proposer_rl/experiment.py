@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +170,7 @@ class Experiment:
     def _improve(self) -> None:
         streams = self._streams("cycle", self.cycles)
         while True:
-            before = self._state()
+            before = deepcopy(self._state())  # improving may change a curriculum's state in place
             try:
                 outcome = self.curriculum.improve(self.learner, self.updates, streams)
                 break

@@ -16,8 +16,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.learning.ppo import Update
-from proposer_rl.meta.actions import Proposals
+from proposer_rl.learning import Update
+from proposer_rl.meta.actions import Actions, Mixture
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import TrainingStep, performance_gain
 from proposer_rl.meta.view import SolverView
@@ -62,41 +62,71 @@ class SkillLadder:
         self.agent.skills = snapshot["skills"].clone()
 
 
+class Kinds:
+    """A space of levels that are nothing but the number of their kind."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.axes = {"kind": range(size)}
+        self.coordinates = torch.linspace(-1, 1, size).unsqueeze(-1)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        return torch.randint(self.size, (count,), generator=generator)
+
+    def generate(self, choices: Tensor, generators: list[torch.Generator]) -> Tensor:
+        return choices
+
+
+class LadderTask:
+    """What a view asks of a task: how good the last skill is, and all skills as a probe."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, kinds: int) -> None:
+        self.target = self.space = Kinds(kinds)
+
+    def performance(
+        self, agent: SimpleNamespace, levels: Tensor, generator: torch.Generator
+    ) -> TensorDict:
+        last = agent.skills[:, -1:].expand(-1, len(levels))
+        return TensorDict({"return": last}, last.shape)
+
+    def probe(self, agent: SimpleNamespace, levels: Tensor) -> Tensor:
+        return agent.skills[:, None].expand(-1, len(levels), -1)
+
+
 def ladder_env(
-    proposals: Callable[[Callable], Proposals],
+    actions: Callable[[Kinds], Actions],
     *,
     copies: int = 16,
     skills: int = 3,
+    idle: int = 0,
     problems: int = 8,
     shuffled: bool = False,
     **lengths: int,
 ) -> SolverTrainingEnv:
-    """The meta-environment of a ladder; ``shuffled`` pays every copy what another one gained."""
+    """The meta-environment of a ladder.
+
+    ``idle`` kinds teach nothing; ``shuffled`` pays every copy what another one gained.
+    """
 
     def paid(step: TrainingStep) -> Tensor:
         gain = performance_gain(step)
         return gain.roll(1) if shuffled else gain
 
-    def probe(solver: SimpleNamespace, levels: Tensor) -> Tensor:
-        return solver.skills[:, None].expand(-1, len(levels), -1)
-
-    def evaluate(solver: SimpleNamespace, levels: Tensor, generator: torch.Generator) -> TensorDict:
-        last = solver.skills[:, -1:].expand(-1, len(levels))
-        return TensorDict({"return": last}, last.shape)
-
+    task = LadderTask(skills + idle)
     return SolverTrainingEnv(
         SkillLadder(copies, skills, problems),
-        view=SolverView(
-            target=lambda count, generator: torch.zeros(count),
-            evaluate=evaluate,
-            probe=probe,
-            validation_levels=1,
-            probe_levels=1,
-        ),
-        proposals=proposals(lambda choices, generators: choices),
+        view=SolverView(task, validation_levels=1, probe_levels=1),
+        actions=actions(task.space),
         reward=paid,
         **lengths,
     )
+
+
+def any_mixture(space: Kinds) -> Mixture:
+    """A number for each kind."""
+    return Mixture(space, torch.eye(space.size))
 
 
 def best_sequence(skills: int, updates: int) -> float:

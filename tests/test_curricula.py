@@ -3,22 +3,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
 from proposer_rl.curricula import (
     Curriculum,
-    FrozenProposer,
     Improvement,
+    Proposal,
     ProposerCurriculum,
+    ProposerTrainer,
     SamplingCurriculum,
     ScheduleCurriculum,
-    load_agent,
 )
 from proposer_rl.curricula.proposer import explained_share
-from proposer_rl.learning.advantages import LeaveOneOutBaseline
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, load_agent
+from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.models import (
-    MapEncoder,
+    ActorCritic,
     MixtureHead,
     ProblemHead,
     ProposerNetwork,
@@ -26,87 +27,146 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
+from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
-from tests.meta.test_env import SPACE, K, L, P, meta_env, mixture, solvers
+from tests.meta.test_env import SPACE, E, K, L, P, meta_env, mixture
+from tests.tiny import TASK, learners
+
+HELD = {"mix": True, "meta_episode_length": 4, "action_repeat": 2}
 
 
-def sample(count: int, generator: torch.Generator):
-    return SPACE.sample((count,), generator)
+def cycle(number: int) -> list[Streams]:
+    return [Streams(0, "cycle", number)]
 
 
-def network(head: nn.Module) -> ProposerNetwork:
-    return ProposerNetwork(head, MapEncoder(7, (8, 8), 8), context=8, hidden=8)
+def update(number: int) -> list[Streams]:
+    return [Streams(0, "update", number)]
+
+
+def proposer_agent(mix: bool) -> ActorCritic:
+    torch.manual_seed(0)
+    head: nn.Module = ProblemHead(8, P, SPACE.size, hidden=8)
+    if mix:
+        head = MixtureHead(8, SPACE.size, hidden=8)
+    network = ProposerNetwork(head, TASK.probe_encoder(8), context=8, hidden=8)
+    return proposer_actor_critic(network, normal if mix else categorical)
 
 
 def proposer(
     advance: str = "train", *, own_action: str = "sample", mix: bool = False, **options
 ) -> ProposerCurriculum:
-    """A Proposer of problem choices, or of mixtures that hold for the options' updates."""
-    env = meta_env(**({"proposals": mixture()} if mix else {}), **options)
-    torch.manual_seed(0)
-    head = MixtureHead(8, SPACE.size, hidden=8) if mix else ProblemHead(8, P, SPACE.size, hidden=8)
+    """A Proposer of problem choices, or of mixtures."""
+    env = meta_env(**({"actions": mixture()} if mix else {}), **options)
     settings = PPOSettings(horizon=env.steps, gamma=1.0, epochs=2)
-    agent = proposer_actor_critic(network(head), normal if mix else categorical)
-    ppo = PPO(env, agent, settings, advantage=LeaveOneOutBaseline(1.0) if mix else None)
-    return ProposerCurriculum(ppo, advance=advance, own_action=own_action)
+    advantage = LeaveOneOutBaseline(1.0) if mix else None
+    ppo = PPO(env, proposer_agent(mix), settings, advantage=advantage)
+    return ProposerTrainer(ppo, advance=advance).curriculum(own_action)
+
+
+def weights(curriculum: ProposerCurriculum) -> TensorDict:
+    assert curriculum.trainer is not None
+    return curriculum.trainer.learner.snapshot()
 
 
 def test_a_copys_levels_depend_on_its_stream_alone() -> None:
-    curriculum = SamplingCurriculum(sample)
-    both = curriculum.propose(solvers(2), [Streams(0), Streams(1)])
-    alone = curriculum.propose(solvers(1), [Streams(1)])
-    assert both.batch_size == (2, P)
-    assert (both[1] == alone[0]).all()
-    assert not (both[0] == both[1]).all()
+    curriculum = SamplingCurriculum(SPACE)
+    both = curriculum.propose(learners(2), 0, [Streams(0), Streams(1)])
+    alone = curriculum.propose(learners(1), 0, [Streams(1)])
+    assert both.levels.batch_size == (2, P) and both[1:] == (0, 0)
+    assert (both.levels[1] == alone.levels[0]).all()
+    assert not (both.levels[0] == both.levels[1]).all()
 
 
-def test_a_schedule_changes_after_the_given_updates_and_resumes() -> None:
-    class Named(Curriculum):
-        def __init__(self, name: str) -> None:
-            self.name = name
+class Stage(Curriculum):
+    """Notes what it is called for."""
 
-        def propose(self, solver, streams):
-            return self.name
+    def __init__(self, name: str, calls: list) -> None:
+        self.name, self.calls, self.state = name, calls, 0
 
-    def schedule() -> ScheduleCurriculum:
-        return ScheduleCurriculum([Named("a"), Named("b"), Named("c")], until=[2, 3])
+    def begin(self) -> None:
+        self.calls.append((self.name, "begin"))
 
-    curriculum, seen = schedule(), []
-    for update in range(6):
-        if update == 3:  # interrupted, and put back from its state
+    def propose(self, learner, updates, streams) -> Proposal:
+        self.calls.append((self.name, "propose", updates))
+        return Proposal(self.name, frames=3, evaluations=4)
+
+    def observe(self, learner, levels, update) -> None:
+        self.calls.append((self.name, "observe", levels))
+        self.state += 1
+
+    def improve(self, learner, updates, streams) -> Improvement:
+        self.calls.append((self.name, "improve", updates))
+        return Improvement({"of": self.name}, frames=5, evaluations=6)
+
+    def state_dict(self) -> dict:
+        return {"state": self.state}
+
+    def load_state_dict(self, state) -> None:
+        self.state = state["state"]
+
+    def close(self) -> None:
+        self.calls.append((self.name, "close"))
+
+
+def schedule(calls: list) -> ScheduleCurriculum:
+    return ScheduleCurriculum([Stage(name, calls) for name in "abc"], until=[2, 3])
+
+
+def test_a_schedule_passes_everything_on_and_changes_at_the_exact_update() -> None:
+    calls: list = []
+    curriculum = schedule(calls)
+    curriculum.begin()
+    assert calls == [(name, "begin") for name in "abc"]
+    calls.clear()
+    for updates in range(5):
+        if updates == 3:  # interrupted, and put back from its state
             state = curriculum.state_dict()
-            curriculum = schedule()
+            curriculum = schedule(calls)
             curriculum.load_state_dict(state)
-        seen.append(curriculum.propose(None, []))
-        curriculum.observe(None, None)
-    assert seen == ["a", "a", "b", "c", "c", "c"]
+        if updates % 2 == 0:
+            improved = curriculum.improve(None, updates, [])
+            assert improved == Improvement({"of": calls[-1][0]}, frames=5, evaluations=6)
+        proposal = curriculum.propose(None, updates, [])
+        assert proposal == (calls[-1][0], 3, 4)
+        curriculum.observe(None, proposal.levels, None)
+    expected = []
+    for updates, name in enumerate("aabcc"):
+        expected += [(name, "improve", updates)] * (updates % 2 == 0)
+        expected += [(name, "propose", updates), (name, "observe", name)]
+    assert calls == expected
+    assert [stage["state"] for stage in curriculum.state_dict()["stages"]] == [2, 1, 2]
+    calls.clear()
+    curriculum.close()
+    assert calls == [(name, "close") for name in "abc"]
 
 
 @pytest.mark.parametrize("until", [[], [2], [3, 2], [2, 2], [0, 4]])
 def test_a_schedule_refuses_ends_that_do_not_fit(until: list[int]) -> None:
     with pytest.raises(ValueError, match="3 stages need 2 ascending positive"):
-        ScheduleCurriculum([SamplingCurriculum(sample)] * 3, until)
+        ScheduleCurriculum([SamplingCurriculum(SPACE)] * 3, until)
 
 
 def test_a_curriculum_must_propose() -> None:
     with pytest.raises(TypeError, match="Curriculum must define propose"):
-        Curriculum().propose(solvers(1), [Streams(0)])
+        Curriculum().propose(learners(1), 0, [Streams(0)])
 
 
 def test_improving_reports_gains_cost_and_proposals() -> None:
-    curriculum, solver = proposer(), solvers(1)
-    before = curriculum.proposer.snapshot()
-    outcome = curriculum.improve(solver, [Streams(0, "cycle", 0)])
-    assert outcome.meta_frames == K * P * 8 * L
+    curriculum = proposer(reward=log_success_gain)
+    before = weights(curriculum)
+    outcome = curriculum.improve(learners(1), 0, cycle(0))
+    assert outcome.frames == K * P * 8 * L
+    assert outcome.evaluations == K * (L + 1) * E
     assert outcome.advance is None
     metrics = outcome.metrics
-    assert len(metrics["total_gain"]) == K
-    # The reward is the gain, so over an episode both add up to the same.
-    torch.testing.assert_close(
-        torch.tensor(metrics["total_gain"]), torch.tensor(metrics["total_reward"])
-    )
-    assert sum(metrics["histogram"]) == K * L * P
-    assert not (curriculum.proposer.snapshot() == before).all()
+    assert len(metrics["return_gain"]) == len(metrics["log_success_gain"]) == K
+    # What is paid is this gain, so over an episode both add up to the same; not to the other.
+    assert metrics["total_reward"] == pytest.approx(metrics["log_success_gain"], abs=1e-5)
+    assert metrics["total_reward"] != pytest.approx(metrics["return_gain"], abs=1e-3)
+    assert metrics["reward_sd"] == pytest.approx(np.std(metrics["total_reward"]), abs=1e-6)
+    assert np.shape(metrics["histogram"]) == (2, 2)  # fractions, lengths
+    assert np.sum(metrics["histogram"]) == K * L * P
+    assert not (weights(curriculum) == before).all()
 
 
 def test_the_explained_share_is_that_of_a_linear_model() -> None:
@@ -132,117 +192,90 @@ def test_the_explained_share_is_unknown_where_it_cannot_be_told() -> None:
 
 @pytest.mark.parametrize("advance", ["train", "best", "random"])
 def test_what_becomes_of_the_solver(advance: str) -> None:
-    curriculum, solver = proposer(advance), solvers(1)
+    curriculum, solver = proposer(advance), learners(1)
     before = solver.snapshot()
-    outcome = curriculum.improve(solver, [Streams(0, "cycle", 0)])
-    copies = curriculum.env.solvers.snapshot()
+    outcome = curriculum.improve(solver, 0, cycle(0))
+    assert curriculum.trainer is not None
+    copies = curriculum.trainer.env.solvers.snapshot()
     equal = [bool((solver.snapshot()[0] == copies[k]).all()) for k in range(K)]
     if advance == "train":
         assert (solver.snapshot() == before).all() and outcome.advance is None
     else:
-        assert sum(equal) == 1 and outcome.advance.updates == L
+        assert sum(equal) == 1 and outcome.advance is not None
+        assert outcome.advance.updates == L
         assert outcome.advance.levels.batch_size == (1, P)
         assert outcome.advance.update.rollout.batch_size == (1, P, 8)
     if advance == "best":
-        gains = outcome.metrics["total_gain"]
-        assert equal.index(True) == gains.index(max(gains))
+        rewards = outcome.metrics["total_reward"]
+        assert equal.index(True) == rewards.index(max(rewards))
 
 
 def test_proposals_are_a_function_of_solver_proposer_and_stream() -> None:
-    curriculum, solver = proposer(), solvers(1)
-    curriculum.improve(solver, [Streams(0, "cycle", 0)])
-    one, same, other = (
-        curriculum.propose(solver, [Streams(0, "update", update)]) for update in (3, 3, 4)
-    )
-    assert one.batch_size == (1, P)
-    assert (one == same).all() and not (one == other).all()
+    curriculum, solver = proposer(), learners(1)
+    curriculum.improve(solver, 0, cycle(0))
+    one, same, other = (curriculum.propose(solver, 3, update(number)) for number in (3, 3, 4))
+    assert one.levels.batch_size == (1, P)
+    assert (one.levels == same.levels).all() and not (one.levels == other.levels).all()
 
 
-@pytest.mark.parametrize("mix", [False, True])
-def test_a_restored_proposer_proposes_and_improves_alike(mix: bool) -> None:
-    options = {"mix": True, "episode_length": 4, "updates_per_step": 4} if mix else {}
-    original, solver = proposer(**options), solvers(1)
-    original.improve(solver, [Streams(0, "cycle", 0)])
-    original.propose(solver, [Streams(0, "update", 0)])
-    original.observe(None, None)
+def test_proposing_costs_an_evaluation_where_an_action_begins() -> None:
+    curriculum, solver = proposer(**HELD), learners(1)
+    curriculum.improve(solver, 6, cycle(0))
+    costs = [curriculum.propose(solver, updates, update(0))[1:] for updates in range(6, 10)]
+    assert costs == [(0, E), (0, 0), (0, E), (0, 0)]
+
+
+@pytest.mark.parametrize("options", [{}, HELD], ids=["problems", "mixtures"])
+def test_a_restored_proposer_proposes_and_improves_alike(options: dict) -> None:
+    original, solver = proposer(**options), learners(1)
+    original.improve(solver, 0, cycle(0))
+    original.propose(solver, 0, update(0))
     resumed = proposer(**options)
     resumed.load_state_dict(original.state_dict())
+    came = []
     for curriculum in (original, resumed):
-        # In the middle of a step of 4 updates the action is that of its first.
-        curriculum.levels = curriculum.propose(solver, [Streams(0, "update", 1)])
-        curriculum.outcome = curriculum.improve(solver, [Streams(0, "cycle", 1)])
-    assert (original.levels == resumed.levels).all()
-    assert original.outcome == resumed.outcome
+        # Where an action holds for two updates, that of the second is the first's.
+        levels = [curriculum.propose(solver, number, update(number)).levels for number in (1, 2)]
+        came.append((levels, curriculum.improve(solver, 3, cycle(1)).metrics, weights(curriculum)))
+    (levels, metrics, learnt), (other_levels, other_metrics, other_learnt) = came
+    assert all((one == other).all() for one, other in zip(levels, other_levels, strict=True))
+    assert metrics == other_metrics and (learnt == other_learnt).all()
 
 
-class Stop(Exception):
-    """An interruption."""
-
-
-def interrupt(curriculum: ProposerCurriculum, solver: PPO, pauses: int) -> dict:
-    """The state at a pause within improving, as a checkpoint has it."""
-    states = []
-
-    def pause() -> None:
-        states.append(curriculum.state_dict())
-        if len(states) == pauses:
-            raise Stop
-
-    with pytest.raises(Stop):
-        curriculum.improve(solver, [Streams(0, "cycle", 0)], pause)
-    return states[-1]
-
-
-KINDS = [{}, {"mix": True, "episode_length": 6, "updates_per_step": 3}]
-
-
-@pytest.mark.parametrize("pauses", [1, 4])  # within the first step, and with held actions after it
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("advance", ["train", "best"])
-def test_an_interrupted_episode_goes_on_as_if_it_had_never_stopped(
-    advance: str, kind: dict, pauses: int
-) -> None:
-    whole, solver = proposer(advance, **kind), solvers(1)
-    expected = whole.improve(solver, [Streams(0, "cycle", 0)])
-    steps = []
-    resumed, again = proposer(advance, on_step=lambda: steps.append(1), **kind), solvers(1)
-    resumed.load_state_dict(interrupt(proposer(advance, **kind), solvers(1), pauses))
-    trained = []
-    update = resumed.env.solvers.update
-    resumed.env.solvers.update = lambda *a: trained.append(1) or update(*a)
-    outcome = resumed.improve(again, [Streams(0, "cycle", 0)])
-    assert outcome.metrics == expected.metrics
-    assert (resumed.proposer.snapshot() == whole.proposer.snapshot()).all()
-    assert (again.snapshot() == solver.snapshot()).all()
-    # What had been trained before is not trained again, but is counted.
-    length = resumed.env.episode_length
-    assert len(steps) == length and len(trained) == length - pauses
-    assert resumed.env.episode() is None
-    # The next cycle begins anew.
-    expected = whole.improve(solver, [Streams(0, "cycle", 1)])
-    assert resumed.improve(again, [Streams(0, "cycle", 1)]).metrics == expected.metrics
+def test_an_interrupted_episode_is_played_again(advance: str) -> None:
+    class Stop(Exception):
+        """An interruption."""
 
+    def stop() -> None:
+        raise Stop
 
-def test_an_episode_that_cannot_be_repeated_is_begun_anew() -> None:
-    """As on another machine, where rounding can change an action."""
-    expected = proposer().improve(solvers(1), [Streams(0, "cycle", 0)])
-    state = interrupt(proposer(), solvers(1), 2)
-    state["episode"]["updates"][1]["action"][0, 0] += 1
-    resumed = proposer()
-    resumed.load_state_dict(state)
-    assert resumed.improve(solvers(1), [Streams(0, "cycle", 0)]).metrics == expected.metrics
+    whole, solver = proposer(advance, **HELD), learners(1)
+    expected = whole.improve(solver, 0, cycle(0))
+    broken_off, again = proposer(advance, **HELD), learners(1)
+    before = broken_off.state_dict()
+    assert broken_off.trainer is not None
+    broken_off.trainer.env.on_update = stop
+    with pytest.raises(Stop):
+        broken_off.improve(again, 0, cycle(0))
+    # In the same process, and in another one.
+    broken_off.trainer.env.on_update = lambda: None
+    for resumed in (broken_off, proposer(advance, **HELD)):
+        fresh = learners(1)
+        resumed.load_state_dict(before)
+        assert resumed.improve(fresh, 0, cycle(0)).metrics == expected.metrics
+        assert (weights(resumed) == weights(whole)).all()
+        assert (fresh.snapshot() == solver.snapshot()).all()
 
 
 def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
-    options = {"mix": True, "episode_length": 4, "updates_per_step": 2}
     actions = {}
     for own in ("sample", "mode"):
-        curriculum, solver = proposer(own_action=own, **options), solvers(1)
-        curriculum.improve(solver, [Streams(0, "cycle", 0)])
+        curriculum, solver = proposer(own_action=own, **HELD), learners(1)
+        curriculum.improve(solver, 0, cycle(0))
         actions[own] = []
-        for update in range(4):
-            curriculum.propose(solver, [Streams(0, "update", update)])
-            curriculum.observe(None, None)
+        for number in range(4):
+            curriculum.propose(solver, number, update(number))
             actions[own].append(curriculum.state_dict()["action"])
     first, same, other, _ = actions["sample"]
     assert torch.equal(first, same) and not torch.equal(first, other)
@@ -251,49 +284,41 @@ def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
 
 
 @pytest.mark.parametrize("own", ["sample", "mode"])
-def test_a_frozen_one_proposes_the_same_and_learns_no_more(own: str) -> None:
-    learnt, solver = proposer(own_action=own), solvers(1)
-    learnt.improve(solver, [Streams(0, "cycle", 0)])
-    frozen, before = learnt.frozen(), learnt.proposer.snapshot()
-    assert frozen.improve(solver, [Streams(0, "cycle", 0)]) == Improvement()
-    for update in range(3):
-        stream = Streams(0, "update", update)
-        expected = learnt.propose(solver, [stream])
-        assert (frozen.propose(solver, [stream]) == expected).all()
-    assert (learnt.proposer.snapshot() == before).all()
-
-
-def test_a_frozen_proposer_proposes_what_it_learnt_and_costs_nothing() -> None:
-    learnt, solver = proposer(), solvers(1)
-    learnt.improve(solver, [Streams(0, "cycle", 0)])
-    head = ProblemHead(8, P, SPACE.size, hidden=8)
-    agent = proposer_actor_critic(network(head), categorical)
-    load_agent(agent, learnt.proposer.snapshot())
+def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> None:
+    learnt, solver = proposer(own_action=own), learners(1)
+    learnt.improve(solver, 0, cycle(0))
+    # Another network with its weights, as from a checkpoint, and the very same one.
+    agent = proposer_agent(mix=False)
+    load_agent(agent, weights(learnt))
     env = meta_env()
-    frozen = FrozenProposer(agent, env.view, env.proposals, episode_length=L)
-    assert frozen.improve(solver, [Streams(0, "cycle", 0)]) == Improvement()
-    for update in range(3):
-        levels = [
-            curriculum.propose(solver, [Streams(0, "update", update)])
-            for curriculum in (learnt, frozen)
-        ]
-        assert (levels[0] == levels[1]).all()
+    loaded = ProposerCurriculum(
+        agent, env.view, env.actions, meta_episode_length=L, action_repeat=1, own_action=own
+    )
+    before = weights(learnt)
+    for frozen in (learnt.frozen(), loaded):
+        assert frozen.improve(solver, 0, cycle(0)) == Improvement()
+        for number in range(3):
+            expected = learnt.propose(solver, number, update(number)).levels
+            assert (frozen.propose(solver, number, update(number)).levels == expected).all()
+    assert (weights(learnt) == before).all()
+
+
+def test_a_fresh_solvers_cycle_is_not_the_last_ones() -> None:
+    curriculum, solver = proposer(**HELD), learners(1)
+    curriculum.improve(solver, 4, cycle(0))
+    curriculum.propose(solver, 4, update(4))
+    curriculum.begin()
+    state = curriculum.state_dict()
+    assert state["began"] == 0 and state["action"] is None
 
 
 def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:
-    agent = proposer_actor_critic(network(MixtureHead(8, 3, hidden=8)), normal)
     with pytest.raises(ValueError, match="belongs to another network"):
-        load_agent(agent, proposer().proposer.snapshot())
+        load_agent(proposer_agent(mix=True), weights(proposer()))
 
 
 def test_refuses_what_does_not_fit() -> None:
-    with pytest.raises(ValueError, match=r"advance must be one of .* got 'all'"):
-        proposer("all")
-    with pytest.raises(ValueError, match=r"own_action must be one of .* got 'mean'"):
-        proposer(own_action="mean")
     with pytest.raises(ValueError, match="must be a SolverTrainingEnv"):
-        ProposerCurriculum(solvers(1))
+        ProposerTrainer(learners(1))
     with pytest.raises(ValueError, match="horizon 4 must be the meta-environment's number of"):
-        settings = PPOSettings(horizon=4)
-        agent = proposer_actor_critic(network(ProblemHead(8, P, SPACE.size)), categorical)
-        ProposerCurriculum(PPO(meta_env(), agent, settings))
+        ProposerTrainer(PPO(meta_env(), proposer_agent(mix=False), PPOSettings(horizon=4)))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.runs import assert_same_run, tables, trained
+from tests.same_run import assert_same_run, tables, trained
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
-SMOKE = ["+scale=smoke", "progress=false", "schedule.updates=4"]
+SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=4"]
 METHODS = ["perf_gain", "target"]
 
 
@@ -37,7 +37,7 @@ def whole(train, method: str) -> Path:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
-    "option", ["cores=1", "logger=tensorboard", "schedule.checkpoint_seconds=1e-6"]
+    "option", ["compute.cores=1", "logger=tensorboard", "schedule.checkpoint_seconds=1e-6"]
 )
 def test_no_byte_depends_on_how_it_is_computed_logged_or_saved(
     method: str, option: str, whole: Path, train
@@ -60,7 +60,7 @@ def test_global_generators_are_neither_used_nor_changed(method: str, whole: Path
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("option", ["evaluation.levels=3", "schedule.evaluate_every=1"])
+@pytest.mark.parametrize("option", ["task.evaluation.levels=3", "schedule.evaluate_every=1"])
 def test_measuring_more_or_less_does_not_change_training(
     method: str, option: str, whole: Path, train
 ) -> None:
@@ -70,7 +70,7 @@ def test_measuring_more_or_less_does_not_change_training(
 
 
 def test_several_threads_give_the_same_bytes_every_time(train) -> None:
-    options = ["threads=2", "schedule.updates=2"]
+    options = ["compute.threads=2", "schedule.updates=2"]
     for name in ("one", "other"):
         assert train("+method=target", *SMOKE, *options, f"hydra.run.dir={name}") == 0
     assert_same_run(Path("one"), Path("other"))

@@ -2,58 +2,45 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
+from signal import SIG_DFL, SIGTERM, signal
 
 import pytest
 import torch
 
-from proposer_rl.curricula import Curriculum, SamplingCurriculum
-from proposer_rl.experiment import Experiment, Schedule
-from proposer_rl.learning.ppo import PPOSettings
-from proposer_rl.mazes.task import (
-    DistributionSettings,
-    EvaluationSettings,
-    MazeSettings,
-    MazeTask,
-    SolverSettings,
-    SpaceSettings,
-)
+from proposer_rl.curricula import Advance, Curriculum, Improvement, Proposal, SamplingCurriculum
+from proposer_rl.experiment import Experiment
+from proposer_rl.learning import PPO
+from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
+from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.settings import Schedule
 from proposer_rl.streams import Streams
+from tests.same_run import assert_same_run
+from tests.tiny import TASK
 
-SCHEDULE = Schedule(updates=5, cycle_length=2, evaluate_every=2, checkpoint_every=3, threshold=0.1)
+LENGTHS = {"updates": 5, "cycle_length": 2, "evaluate_every": 2, "checkpoint_every": 3}
+P, T = 4, 8
 
 
-def task() -> MazeTask:
-    return MazeTask(
-        maze=MazeSettings(height=5, width=5, max_steps=8),
-        distributions={"id": DistributionSettings(specifications=[(0.2, 3)])},
-        target="id",
-        space=SpaceSettings(obstacle_fractions=[0.0, 0.2], path_lengths=[2, 4]),
-        solver=SolverSettings(
-            channels=[8, 8],
-            groups=4,
-            problems=4,
-            ppo=PPOSettings(horizon=8, epochs=2, learning_rate=3e-3),
-        ),
-        evaluation=EvaluationSettings(distributions=["id"], levels=8),
-    )
+def learner(*seeds: int) -> PPO:
+    return TASK.learner([Streams(seed, "solver") for seed in seeds])
 
 
 def experiment(
     path: Path, *seeds: int, curriculum: Curriculum | None = None, **options
 ) -> Experiment:
-    parts = task()
+    lengths = {key: options.pop(key) for key in list(options) if hasattr(Schedule, key)}
     return Experiment(
-        parts.solvers([Streams(seed, "solver") for seed in seeds]),
-        curriculum or SamplingCurriculum(parts.sample_target),
-        schedule=SCHEDULE,
+        TASK,
+        learner(*seeds),
+        curriculum or SamplingCurriculum(TASK.target),
+        schedule=Schedule(**{"threshold": 0.1, **LENGTHS, **lengths}),
         seeds=seeds,
         folder=RunFolder(path),
-        evaluate=parts.measure,
-        statistics=parts.statistics,
-        records=parts.records,
         progress=False,
         **options,
     )
@@ -62,22 +49,22 @@ def experiment(
 def test_a_run_is_a_plain_loop_of_updates(tmp_path: Path) -> None:
     run = experiment(tmp_path, 7)
     summary = run.run()
-    parts = task()
-    solver = parts.solvers([Streams(7, "solver")])
-    success = {0: float(parts.measure(solver.agent)["id_success"])}
+    solver = learner(7)
+    success = {0: float(TASK.measure(solver.agent)["id_success"])}
     for update in range(5):
         streams = Streams(7, "update", update)
-        levels = parts.sample_target(4, streams.generator("levels"))
-        solver.env.set_levels(levels[None])
+        solver.env.set_levels(TASK.target.sample(P, streams.generator("levels"))[None])
         solver.update([streams.generator("actions")])
-        success[update + 1] = float(parts.measure(solver.agent)["id_success"])
+        success[update + 1] = float(TASK.measure(solver.agent)["id_success"])
     rows = read_csv(tmp_path / "metrics.csv")
     assert [row["updates"] for row in rows] == [0, 2, 4, 5]
     assert [row["id_success"] for row in rows] == [success[row["updates"]] for row in rows]
-    assert (run.solver.snapshot() == solver.snapshot()).all()
+    assert (run.learner.snapshot() == solver.snapshot()).all()
     first = next((row["updates"] for row in rows if row["id_success"] >= 0.1), None)
     assert summary["updates_to_threshold"] == [first]
-    assert summary["frames"] == 5 * 4 * 8 and summary["meta_frames"] == 0
+    assert summary["frames"] == 5 * P * T
+    assert summary["curriculum_frames"] == summary["evaluations"] == 0
+    assert not (tmp_path / "cycles.jsonl").exists()
 
 
 # PPO's own metrics in training.csv are means over the population.
@@ -104,9 +91,9 @@ def test_the_paths_that_are_recorded_are_legal(tmp_path: Path) -> None:
     samples = read_jsonl(tmp_path / "curriculum.jsonl")
     assert [sample["updates"] for sample in samples] == [2, 4, 5]
     for sample in samples:
-        assert len(sample["levels"]) == 4
+        assert len(sample["levels"]) == P
         for item in sample["levels"]:
-            rows, path = item["level"], item["path"]
+            rows, path = item["text"], item["path"]
             assert rows[path[0][0]][path[0][1]] == "S"
             assert all(rows[r][c] != "#" for r, c in path)
             assert all(abs(r - s) + abs(c - d) <= 1 for (r, c), (s, d) in pairwise(path))
@@ -114,26 +101,152 @@ def test_the_paths_that_are_recorded_are_legal(tmp_path: Path) -> None:
             assert ends == "G" or len(path) == 9
 
 
+class Costly(SamplingCurriculum):
+    """Notes what it is called for, and says that all of it has a price."""
+
+    def __init__(self) -> None:
+        super().__init__(TASK.target)
+        self.events: list[tuple] = []
+
+    def propose(self, learner, updates, streams) -> Proposal:
+        self.events.append(("propose", updates))
+        return super().propose(learner, updates, streams)._replace(frames=10, evaluations=1)
+
+    def observe(self, learner, levels, update) -> None:
+        assert levels.batch_size == (1, P) and update.rollout.batch_size == (1, P, T)
+        assert "grad_norm" in update.metrics.keys()
+        self.events.append(("observe",))
+
+    def improve(self, learner, updates, streams) -> Improvement:
+        self.events.append(("improve", updates))
+        return Improvement({"own": [updates]}, frames=1000, evaluations=100)
+
+
 def test_the_curriculum_is_improved_once_per_cycle_and_sees_every_update(tmp_path: Path) -> None:
-    events: list[str] = []
+    curriculum = Costly()
+    experiment(tmp_path, 0, curriculum=curriculum).run()
+    expected = []
+    for update in range(5):
+        expected += [("improve", update)] * (update % 2 == 0)
+        expected += [("propose", update), ("observe",)]
+    assert curriculum.events == expected
 
-    class Recorder(SamplingCurriculum):
-        def propose(self, solver, streams):
-            events.append("propose")
-            return super().propose(solver, streams)
 
-        def observe(self, levels, rollout):
-            assert rollout.batch_size == (1, 4, 8)
-            events.append("observe")
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_what_a_curriculum_costs_is_counted_written_and_survives(
+    interrupted: bool, tmp_path: Path
+) -> None:
+    if interrupted:
+        with pytest.raises(Interrupted):
+            experiment(tmp_path, 0, curriculum=Costly(), signals=After(4)).run()
+    summary = experiment(tmp_path, 0, curriculum=Costly()).run()
+    rows = read_csv(tmp_path / "metrics.csv")
+    # By updates: one of 10 and 1 for each, one of 1000 and 100 for each cycle that has begun.
+    costs = {0: (0, 0), 2: (1020, 102), 4: (2040, 204), 5: (3050, 305)}
+    told = {row["updates"]: (row["curriculum_frames"], row["evaluations"]) for row in rows}
+    assert told == costs
+    assert (summary["curriculum_frames"], summary["evaluations"]) == costs[5]
+    cycles = read_jsonl(tmp_path / "cycles.jsonl")
+    begun = [(0, 0, 1000, 100), (1, 2, 2020, 202), (2, 4, 3040, 304)]
+    keys = ("cycle", "updates", "curriculum_frames", "evaluations", "own")
+    assert cycles == [dict(zip(keys, (*place, [place[1]]), strict=True)) for place in begun]
 
-        def improve(self, solver, streams, pause):
-            events.append("improve")
-            return super().improve(solver, streams, pause)
 
-    experiment(tmp_path, 0, curriculum=Recorder(task().sample_target)).run()
-    update = ["propose", "observe"]
-    cycle = ["improve", *update, *update]
-    assert events == [*cycle, *cycle, "improve", *update]
+class After(StopSignals):
+    """A signal that comes at the n-th safe point."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__()
+        self.left = points
+
+    @property
+    def pending(self) -> bool:
+        return self.left <= 1
+
+    def deliver(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Interrupted(SIGTERM)
+
+
+class Jumps(SamplingCurriculum):
+    """Trains the Solver itself: an update of its own takes the cycle's place."""
+
+    def __init__(self) -> None:
+        super().__init__(TASK.target)
+
+    def improve(self, learner, updates, streams) -> Improvement:
+        levels = self.propose(learner, updates, streams).levels
+        learner.env.set_levels(levels)
+        update = learner.update([streams[0].generator("actions")])
+        return Improvement({}, advance=Advance(2, levels, update))
+
+
+def test_an_advance_takes_the_updates_of_its_cycle(tmp_path: Path) -> None:
+    run = experiment(tmp_path, 0, curriculum=Jumps())
+    summary = run.run()
+    assert [row["updates"] for row in read_csv(tmp_path / "metrics.csv")] == [0, 2, 4, 5]
+    assert [row["updates"] for row in read_csv(tmp_path / "training.csv")] == [2, 4, 5]
+    assert summary["updates"] == 5 and run.cycles == 3
+    assert all((entry["step"] == 2 * 3).all() for entry in run.learner.snapshot().values())
+
+
+class Stopped(Costly):
+    """A signal comes in the middle of its second improvement."""
+
+    def __init__(self, signals: StopSignals | None) -> None:
+        super().__init__()
+        self.signals = signals
+        self.begun = torch.zeros(())
+
+    def improve(self, learner, updates, streams) -> Improvement:
+        # What is begun here must be undone, also what has changed in place.
+        self.begun += 1
+        learner.env.set_levels(TASK.target.sample(P, streams[0].generator("levels"))[None])
+        learner.update([streams[0].generator("actions")])
+        if updates == 2 and self.signals is not None:
+            os.kill(os.getpid(), SIGTERM)
+            self.signals.check()
+        return super().improve(learner, updates, streams)
+
+    def state_dict(self) -> dict:
+        return {"begun": self.begun}
+
+    def load_state_dict(self, state) -> None:
+        self.begun = state["begun"]
+
+
+@pytest.mark.parametrize("handled", [False, True])
+def test_a_signal_within_an_improvement_undoes_what_was_begun(
+    handled: bool, tmp_path: Path
+) -> None:
+    experiment(tmp_path / "whole", 0, curriculum=Stopped(None)).run()
+    signals = StopSignals()
+    run = experiment(tmp_path / "run", 0, curriculum=Stopped(signals), signals=signals)
+
+    def goes_on(*_: object) -> None:
+        run.curriculum.signals = None
+
+    before = signal(SIGTERM, goes_on if handled else SIG_DFL)
+    try:
+        with signals, nullcontext() if handled else pytest.raises(Interrupted):
+            run.run()
+    finally:
+        signal(SIGTERM, before)
+    if not handled:
+        latest = load_latest(tmp_path / "run" / "checkpoints")
+        assert latest is not None
+        state = latest[1]
+        assert (state["updates"], state["cycles"]) == (2, 1)
+        assert state["curriculum"]["begun"] == 1
+        experiment(tmp_path / "run", 0, curriculum=Stopped(None)).run()
+    assert_same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_a_checkpoint_of_another_population_is_refused(tmp_path: Path) -> None:
+    experiment(tmp_path, 0, 1).run()
+    with pytest.raises(CheckpointError, match="does not fit this run"):
+        experiment(tmp_path, 0).run()
 
 
 def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
@@ -147,22 +260,13 @@ def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
     assert first["id_success"] == expected["id_success"]
 
 
-def test_a_task_refuses_an_unknown_target() -> None:
-    parts = task()
-    with pytest.raises(ValueError, match=r"'far' is none of the distributions \['id'\]"):
-        MazeTask(
-            maze=parts.maze,
-            distributions={"id": DistributionSettings(specifications=[(0.2, 3)])},
-            target="far",
-            space=SpaceSettings(obstacle_fractions=[0.0], path_lengths=[2]),
-            solver=parts.solver,
-            evaluation=EvaluationSettings(distributions=["id"], levels=2),
-        )
+def test_a_headline_that_nobody_measures_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"schedule.headline='fun': must be one of \['id_success'"):
+        experiment(tmp_path, 0, headline="fun")
 
 
-def test_evaluation_levels_are_the_same_in_every_run() -> None:
-    one, other = task(), task()
-    solver = one.solvers([Streams(0)])
-    assert torch.equal(
-        one.measure(solver.agent)["id_return"], other.measure(solver.agent)["id_return"]
-    )
+def test_measuring_draws_nothing() -> None:
+    agent = learner(0).agent
+    before = torch.get_rng_state()
+    assert (TASK.measure(agent) == TASK.measure(agent)).all()
+    assert torch.equal(torch.get_rng_state(), before)

@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli import look, snr, train
 
-SMOKE = ["+scale=smoke", "progress=false", "schedule.keep_checkpoints=2"]
+SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"]
 
 
 def call(command, *arguments: str) -> int:

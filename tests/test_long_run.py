@@ -10,12 +10,10 @@ import os
 import resource
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-
 from proposer_rl.cli.build import build, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, read_config
 from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.signals import StopSignals
+from tests.tiny import composed
 
 UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "200"))
 CYCLES = 20
@@ -29,14 +27,17 @@ def resident() -> float:
 
 def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
     options = [
-        *("+method=perf_gain", "+scale=smoke", "progress=false", "proposer.lookahead=2"),
+        *(
+            "+method=perf_gain",
+            "+scale=smoke",
+            "compute.progress=false",
+            "proposer.meta_episode_length=2",
+        ),
         *(f"schedule.updates={UPDATES}", f"schedule.cycle_length={UPDATES // CYCLES}"),
         *(f"schedule.evaluate_every={UPDATES // CYCLES}", "schedule.checkpoint_every=20"),
     ]
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        config = read_config(compose("train", options))
-    experiment = build(config, *parts(config), RunFolder(tmp_path))
+    config = composed(*options)
+    experiment = build(config, parts(config, StopSignals()), RunFolder(tmp_path))
     memory, files = [], []
 
     def sample(table: str, row: object, step: int) -> None:

@@ -13,9 +13,9 @@ import pytest
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.lock import locked
 from tests.processes import Ended, Processes
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
-TRAIN = ["+method=target", "+scale=smoke", "progress=false"]
+TRAIN = ["+method=target", "+scale=smoke", "compute.progress=false"]
 ROW = "fsync metrics.csv"
 
 
@@ -52,17 +52,22 @@ def test_a_signal_saves_and_ends_and_the_same_command_goes_on(
     assert_same_run(whole[0], tmp_path / "run")
 
 
-def test_a_signal_in_the_proposers_episode_loses_nothing(
+def test_a_signal_in_the_proposers_episode_ends_it_and_it_is_played_again(
     processes: Processes, tmp_path: Path
 ) -> None:
-    command = ["+method=perf_gain", "+scale=smoke", "progress=false"]
+    command = ["+method=perf_gain", "+scale=smoke", "compute.progress=false"]
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
-    # While the first row is written; what follows is the first episode.
+    # While the first row is written; what follows is the first episode. One is of 3 updates, the
+    # other is so long that nobody waits for its end.
     signal_at = {nth(whole.writes, ROW, 0): int(SIGTERM)}
-    stopped = processes(*command, f"hydra.run.dir={tmp_path / 'run'}", signal_at=signal_at)
-    assert stopped.code == 128 + SIGTERM
-    latest = load_latest(tmp_path / "run" / "checkpoints")
-    assert latest is not None and len(latest[1]["curriculum"]["episode"]["updates"]) == 1
+    long = ["proposer.meta_episode_length=100000", "schedule.cycle_length=3"]
+    for name, more in (("run", []), ("long", long)):
+        run = [*command, *more, f"hydra.run.dir={tmp_path / name}"]
+        stopped = processes(*run, signal_at=signal_at)
+        assert stopped.code == 128 + SIGTERM, stopped.output
+        latest = load_latest(tmp_path / name / "checkpoints")
+        assert latest is not None and latest[1]["cycles"] == latest[1]["updates"] == 0
+        assert not (tmp_path / name / "cycles.jsonl").exists()
     assert processes(*command, f"hydra.run.dir={tmp_path / 'run'}").code == 0
     assert_same_run(tmp_path / "whole", tmp_path / "run")
 

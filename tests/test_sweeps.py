@@ -15,7 +15,7 @@ from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
-SMOKE = ["+scale=smoke", "progress=false"]
+SMOKE = ["+scale=smoke", "compute.progress=false"]
 ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
 
 
@@ -66,7 +66,7 @@ def test_seeds_side_by_side_give_what_they_give_alone(method: str, train) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["+method=perf_gain", "seeds=[0,1]"], "seeds=[0, 1]: perf_gain trains at most 1 at a"),
+        (["+method=perf_gain", "seeds=[0,1]"], "seeds=[0, 1]: a Proposer proposes to one Solver at a time"),
         (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
         (["+method=target", "seeds=[]"], "seeds=[]: list should have at least 1 item"),
     ],

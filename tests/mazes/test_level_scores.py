@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from matplotlib.image import imread
 from torch import Tensor, nn
 
-from proposer_rl.mazes import Level, planes
+from proposer_rl.mazes import planes
 from proposer_rl.mazes.evaluation import RolloutEvaluator
 from proposer_rl.mazes.level_files import levels_from_text, shipped_levels
-from proposer_rl.mazes.level_pictures import draw_paths
-from proposer_rl.mazes.level_scores import Score, score_levels
+from proposer_rl.mazes.level_scores import score_levels
+from proposer_rl.mazes.rendering import draw_level
 from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
 from tests.mazes.oracles import random_levels
 
@@ -58,20 +55,29 @@ def test_policies_whose_scores_are_known() -> None:
     assert [(s.level, s.solver) for s in scores] == [
         (name, k) for name in ("right", "down", "right too", "blocked") for k in (0, 1)
     ]
-    assert [(s.height, s.width) for s in scores[::2]] == [(1, 5), (3, 1), (2, 5), (2, 3)]
-    assert [s.path_length for s in scores[::2]] == [4, 2, 2, 3]
-    assert all(s.max_steps == 2 * s.path_length for s in scores)
+    sizes = [(1, 5, 4), (3, 1, 2), (2, 5, 2), (2, 3, 3)]
+    about = ("height", "width", "path_length")
+    assert [tuple(s.about[key] for key in about) for s in scores[::2]] == sizes
     solved = {("right", 0): 4, ("down", 1): 2, ("right too", 0): 2}
+    levels = levels_from_text(HALLS)
     for s in scores:
-        moves = solved.get((s.level, s.solver))
+        moves, length = solved.get((s.level, s.solver)), s.about["path_length"]
+        assert s.about["max_steps"] == 2 * length
         success = float(moves is not None)
-        expected = success - 0.125 * (moves or s.max_steps)
-        assert s.success == s.greedy_success == success
-        assert s.mean_return == pytest.approx(expected)
-        assert s.greedy_return == pytest.approx(expected)
-        assert len(s.path) == 1 + (moves or s.max_steps)
-    assert scores[0].path == [[0, 0], [0, 1], [0, 2], [0, 3], [0, 4]]
-    assert scores[7].path == [[0, 0], *[[1, 0]] * 6]
+        expected = success - 0.125 * (moves or 2 * length)
+        assert s.results == {
+            "success": success,
+            "greedy_success": success,
+            "return": pytest.approx(expected),
+            "greedy_return": pytest.approx(expected),
+        }
+        greedy = f"greedy {moves}" if moves else "greedy fails"
+        assert s.note == f"shortest {length}, {greedy}"
+        assert s.picture().shape == draw_level(levels[s.level]).shape
+    paths = {0: [[0, 0], [0, 1], [0, 2], [0, 3], [0, 4]], 7: [[0, 0], *[[1, 0]] * 6]}
+    for number, path in paths.items():
+        expected = draw_level(levels[scores[number].level], path).numpy()
+        assert (scores[number].picture() == expected).all()
 
 
 def solvers(per_step: bool = False) -> object:
@@ -90,10 +96,10 @@ def test_a_level_has_the_same_score_in_any_company() -> None:
     together = score_levels(solver, levels, lambda length: 12)
     alone = [s for n, v in levels.items() for s in score_levels(solver, {n: v}, lambda length: 12)]
     for one, other in zip(together, alone, strict=True):
-        assert (one.level, one.solver, one.path) == (other.level, other.solver, other.path)
-        assert one.success == pytest.approx(other.success, abs=1e-5)
-        assert one.mean_return == pytest.approx(other.mean_return, abs=1e-5)
-    assert len({round(s.success, 6) for s in together}) > 6
+        assert one[:3] == other[:3] and one.note == other.note
+        assert one.results == pytest.approx(other.results, abs=1e-5)
+        assert (one.picture() == other.picture()).all()
+    assert len({round(s.results["success"], 6) for s in together}) > 6
 
 
 def test_many_levels_go_through_the_network_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,8 +107,9 @@ def test_many_levels_go_through_the_network_in_parts(monkeypatch: pytest.MonkeyP
     whole = score_levels(solvers(), levels, lambda length: 9)
     monkeypatch.setattr("proposer_rl.mazes.level_scores.AT_ONCE", 2 * 16)
     parts = score_levels(solvers(), levels, lambda length: 9)
-    assert [s.path for s in parts] == [s.path for s in whole]
-    assert [s.success for s in parts] == pytest.approx([s.success for s in whole], abs=1e-5)
+    for one, other in zip(parts, whole, strict=True):
+        assert one[:3] == other[:3] and (one.picture() == other.picture()).all()
+        assert one.results == pytest.approx(other.results, abs=1e-5)
 
 
 @pytest.mark.parametrize("per_step", [False, True])
@@ -114,25 +121,13 @@ def test_scores_are_what_playing_gives(per_step: bool) -> None:
     player = RolloutEvaluator(20, 0.05, episodes=4000, generator=torch.Generator().manual_seed(0))
     played = player(copies, cell_logits(solver, planes(copies)))
     for k, score in enumerate(scores):
-        assert score.success == pytest.approx(float(played["success"][k, 0]), abs=0.03)
-        assert score.mean_return == pytest.approx(float(played["return"][k, 0]), abs=0.05)
+        for key, tolerance in (("success", 0.03), ("return", 0.05)):
+            assert score.results[key] == pytest.approx(float(played[key][k, 0]), abs=tolerance)
 
 
 def test_every_shape_goes_through_the_network() -> None:
     levels = shipped_levels("shapes")
     scores = score_levels(solvers(), levels, lambda length: 2 * length)
     assert len(scores) == 2 * len(levels)
-    assert all(0 <= s.success <= 1 and s.greedy_success in (0, 1) for s in scores)
-
-
-def test_pictures(tmp_path: Path) -> None:
-    levels = {"a $x^{$": Level.from_text("S..\n..G"), "b": Level.from_text("S.\n#.\n#G")}
-    scores = [
-        Score("a $x^{$", 0, 2, 3, 3, 6, 0.5, 0.4, 1.0, 0.97, [[0, 0], [0, 1], [1, 1], [1, 2]]),
-        Score("b", 0, 3, 2, 3, 6, 0.0, -0.1, 0.0, -0.06, [[0, 0]] * 7),
-    ]
-    file = tmp_path / "sheet.png"
-    file.write_bytes(draw_paths(levels, scores, "title [b]"))
-    picture = imread(file)[..., :3]
-    purple = (picture - torch.tensor([204, 121, 167]).numpy() / 255).__abs__().max(-1) < 0.02
-    assert purple[:, : purple.shape[1] // 2].sum() > 3 * purple[:, purple.shape[1] // 2 :].sum() > 0
+    assert all(0 <= s.results["success"] <= 1 for s in scores)
+    assert {s.results["greedy_success"] for s in scores} <= {0, 1}

@@ -1,4 +1,4 @@
-"""The maze task: its recorded measurements are the plain ones, and wait for no device."""
+"""The maze task: what it refuses, what it measures, and that it waits for no device."""
 
 from __future__ import annotations
 
@@ -9,21 +9,49 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
-from benchmarks.results import Options
-from benchmarks.scales import TINY
-from proposer_rl.mazes.task import EvaluationSettings, MazeTask, SpaceSettings, faster_precision
-from proposer_rl.meta.actions import Mixture
+from proposer_rl.mazes import LevelSpec, shortest_path_length
+from proposer_rl.mazes.settings import (
+    DistributionSettings,
+    EvaluationSettings,
+    MazeSettings,
+    NetworkSettings,
+    SpaceSettings,
+)
+from proposer_rl.mazes.task import MazeTask, faster_precision
 from proposer_rl.meta.rewards import performance_gain, task_difficulty
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
+from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
 from tests.graphs import NoHostReads
+from tests.tiny import TASK, evaluate, learners, tiny_task
 
-OPTIONS = Options(size="tiny", precision="fp32")
+SMALL = ProposerSettings(
+    rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
+)
 
 
-def task(observe_agent: bool = False) -> MazeTask:
-    return replace(TINY, maze=replace(TINY.maze, observe_agent=observe_agent)).task(OPTIONS)
+def test_performance_and_measurements_are_those_of_the_exact_evaluator() -> None:
+    agent = learners(2).agent
+    levels = TASK.target.sample(5, Streams(0).generator())
+    assert (TASK.performance(agent, levels, torch.Generator()) == evaluate(agent, levels)).all()
+    measured = TASK.measure(agent)
+    expected = evaluate(agent, TASK.evaluation_levels("id"))
+    for kind in ("success", "return"):
+        torch.testing.assert_close(measured[f"id_{kind}"], expected[kind].mean(1))
+    # A tenth of eight levels is less than one: the worst.
+    torch.testing.assert_close(measured["id_success_worst10"], expected["success"].amin(1))
+    assert set(measured.keys()) == set(TASK.measurements)
+
+
+def test_evaluation_levels_are_the_same_in_every_run_and_follow_their_seed() -> None:
+    same, other = (
+        tiny_task(evaluation=EvaluationSettings(distributions=["id"], levels=8, seed=seed))
+        for seed in (0, 1)
+    )
+    levels = TASK.evaluation_levels("id")
+    assert (levels == same.evaluation_levels("id")).all()
+    assert not (levels == other.evaluation_levels("id")).all()
 
 
 def test_another_network_takes_the_unets_place() -> None:
@@ -37,41 +65,15 @@ def test_another_network_takes_the_unets_place() -> None:
             maps = super().forward(planes.flatten(0, -4)).unflatten(0, planes.shape[:-3])
             return maps.split([4, 1], -3)
 
-    own = MazeTask(
-        maze=TINY.maze,
-        distributions=TINY.distributions,
-        target="id",
-        space=TINY.space,
-        solver=TINY.solver,
-        evaluation=EvaluationSettings(distributions=["id"], levels=8),
-        network=Convolution,
-    )
-    solvers = own.solvers([Streams(0), Streams(1)])
+    own = tiny_task(make_network=Convolution)
+    solvers = own.learner([Streams(0), Streams(1)])
     assert sum(p.numel() for p in solvers.agent.parameters()) == 2 * (3 * 9 + 1) * 5
     before = own.measure(solvers.agent)
-    levels = own.sample_target(5, Streams(0).generator())
+    levels = own.target.sample(5, Streams(0).generator())
     probes = own.probe(solvers.agent, levels)
     assert not torch.equal(probes[0], probes[1])
     solvers.update()
-    after = own.measure(solvers.agent)
-    assert (before["id_return"] != after["id_return"]).all()
-
-
-def test_a_mixture_can_favour_the_target() -> None:
-    mixture = Mixture(task().directions("target"), lambda choices, generators: choices)
-    even, favoured, disfavoured = mixture.shares(
-        torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    )
-    wanted = [pair == (0.2, 4) for pair in task().space.specifications]
-    assert sum(wanted) == 1 and even.tolist() == [0.25] * 4
-    assert favoured[wanted] == pytest.approx(4 / 7) and disfavoured[wanted] == pytest.approx(1 / 13)
-    assert favoured[[not here for here in wanted]].tolist() == pytest.approx([1 / 7] * 3)
-
-
-def test_a_space_without_the_target_cannot_favour_it() -> None:
-    elsewhere = replace(TINY, space=SpaceSettings(obstacle_fractions=[0.0], path_lengths=[2, 4]))
-    with pytest.raises(ValueError, match=r"proposer\.directions=target: 0 of the space's 2 spec"):
-        elsewhere.task(OPTIONS).directions("target")
+    assert (before["id_return"] != own.measure(solvers.agent)["id_return"]).all()
 
 
 @pytest.mark.parametrize("observe_agent", [False, True])
@@ -79,9 +81,10 @@ def test_a_space_without_the_target_cannot_favour_it() -> None:
 def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
     reward, observe_agent
 ) -> None:
-    maze = task(observe_agent)
-    every_update = replace(TINY.proposer, updates_per_step=1)
-    env = proposer(Parts(maze, every_update, seed=0), reward).env
+    maze = tiny_task(maze=replace(TASK.maze, observe_agent=observe_agent))
+    trainer = proposer(Parts(maze, SMALL, seeds=[0]), reward).trainer
+    assert trainer is not None
+    env = trainer.env
     for module in env.solvers.agent.modules():
         if isinstance(module, Population):
             module.batched = True
@@ -93,7 +96,7 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
 
         return call
 
-    env.proposals.levels = on_the_host(env.proposals.levels)
+    env.actions.levels = on_the_host(env.actions.levels)
     env.solvers.check = on_the_host(env.solvers.check)
     state = env.reset()
     with torch.no_grad():
@@ -106,15 +109,95 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
             state = env.step(state)["next"]
 
 
+def test_statistics_and_records_of_what_was_trained_on() -> None:
+    ppo = learners(2)
+    levels = TASK.space.generate(
+        torch.tensor([[0, 1, 2, 3]] * 2), [Streams(k).generator() for k in (0, 1)]
+    )
+    ppo.env.set_levels(levels)
+    rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
+    statistics = TASK.statistics(levels, rollout)
+    torch.testing.assert_close(statistics["obstacle_fraction"], torch.full((2,), 0.1))
+    torch.testing.assert_close(statistics["path_length"], torch.full((2,), 3.0))
+    torch.testing.assert_close(statistics["path_length_sd"], torch.ones(2))
+    for k in range(2):
+        solved = []
+        for record, level in zip(TASK.record(levels[k], rollout[k]), levels[k], strict=True):
+            first, *_ = level.to_text().splitlines()
+            assert record["text"][0].replace("•", ".") == first
+            solved.append(record["path"][-1] == level.goal.tolist())
+        assert statistics["train_success"][k] == sum(solved) / 4
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"target": "far"}, r"target: must be among \['id'\], got 'far'"),
+        (
+            {"evaluation": EvaluationSettings(distributions=["far"], levels=2)},
+            r"evaluation.distributions: must be among \['id'\], got 'far'",
+        ),
+        (
+            {"maze": MazeSettings(height=5, width=5, max_steps=3)},
+            "maze.max_steps=3 must be at least 4, the path length of distributions.id",
+        ),
+        (
+            {"network": NetworkSettings(channels=[12], groups=8)},
+            r"network.channels=\[12\] must be multiples of network.groups=8",
+        ),
+        (
+            {"network": NetworkSettings(channels=[8] * 4, groups=4)},
+            "halve a 5x5 maze to nothing",
+        ),
+        (
+            {"space": SpaceSettings(obstacle_fractions=[0.9], path_lengths=[12])},
+            "space: cannot make levels with obstacle_fraction=0.9",
+        ),
+        (
+            {"distributions": {"id": DistributionSettings(specifications=[(0.9, 8)])}},
+            "distributions.id: cannot make levels with obstacle_fraction=0.9",
+        ),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused_naming_the_key(parts, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tiny_task(**parts)
+
+
+def named(task: MazeTask, name: str, max_steps: int | None = None) -> dict[str, float]:
+    """The step limits of a set's levels."""
+    scores = task.scores(learners(1).agent, name, max_steps)
+    return {score.level: score.about["max_steps"] for score in scores}
+
+
+def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
+    (tmp_path / "halls.txt").write_text("[long]\nS....G\n......\n......\n......\n")
+    file = str(tmp_path / "halls.txt")
+    assert named(TASK, file) == {"long": 10} and named(TASK, file, 4) == {"long": 4}
+    assert set(named(TASK, "ID").values()) == {8}
+    shapes = named(TASK, "shapes")
+    assert shapes["corridor_8"] == 2 * 34 and min(shapes.values()) >= 8
+    with pytest.raises(ValueError, match="--levels mazes: must be a file that ends in .txt or"):
+        named(TASK, "mazes")
+
+
 def test_levels_of_copies_are_those_of_each_alone() -> None:
-    maze, choices = task(), torch.randint(TINY_CHOICES, (3, 6))
-    together = maze.generate(choices, [Streams(k).generator() for k in range(3)])
+    choices = torch.randint(TASK.space.size, (3, 6))
+    together = TASK.space.generate(choices, [Streams(k).generator() for k in range(3)])
     for k in range(3):
-        alone = maze.generate(choices[k : k + 1], [Streams(k).generator()])
+        alone = TASK.space.generate(choices[k : k + 1], [Streams(k).generator()])
         assert (together[k] == alone[0]).all()
 
 
-TINY_CHOICES = len(TINY.space.obstacle_fractions) * len(TINY.space.path_lengths)
+def test_the_bins_are_the_product_of_the_axes() -> None:
+    space = TASK.space
+    assert list(space.axes) == ["obstacle fraction", "path length"]
+    levels = space.generate(torch.arange(4)[None], [Streams(0).generator()])[0]
+    lengths = shortest_path_length(levels).tolist()
+    fractions = levels.walls.float().mean((-2, -1)).tolist()
+    found = [LevelSpec(round(f, 3), n) for f, n in zip(fractions, lengths, strict=True)]
+    first, second = space.axes.values()
+    assert found == [LevelSpec(f, n) for f in first for n in second]
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from proposer_rl.meta.actions import Mixture
-from proposer_rl.meta.signal import by_validation_size, total_gains, variance_components
+from proposer_rl.meta.signal import by_validation_size, performance_around, variance_components
 from proposer_rl.streams import Streams
-from tests.skill_ladder import ladder_env
+from tests.skill_ladder import any_mixture, ladder_env
 
 GROUPS, COPIES = 5, 3
 
@@ -60,21 +58,12 @@ def test_smaller_validation_batches_are_the_first_levels() -> None:
 
 
 def test_copies_of_a_proposal_gain_alike_where_chance_has_no_part() -> None:
-    env = ladder_env(
-        lambda generate: Mixture(torch.eye(3), generate),
-        copies=6,
-        problems=64,
-        episode_length=4,
-        updates_per_step=2,
-    )
-
-    def evaluate(solver, levels, generator) -> TensorDict:
-        last = solver.skills[:, -1:].expand(-1, len(levels))
-        return TensorDict({"return": last}, last.shape)
-
+    env = ladder_env(any_mixture, copies=6, problems=64, meta_episode_length=4, action_repeat=2)
     actions = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0))
     start = env.solvers.snapshot()[0]
-    found = total_gains(env, start, actions, torch.zeros(5), evaluate, Streams(0))
+    before, after = performance_around(env, start, actions, torch.zeros(5), Streams(0))
+    assert (before["return"] == 0).all()  # a beginner's
+    found = after["return"]
     assert found.shape == (3, 2, 5)
     # The draws are systematic, so that only their rounding differs between copies.
     assert found.mean((1, 2)).std() > 5 * found.std(1).max()

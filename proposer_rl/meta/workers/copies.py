@@ -88,7 +88,10 @@ class CopiesInWorkers:
         return self._proposer.complete(self._together(rollout))
 
     def trained(self, copy: int) -> Trained:
-        """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
+        """See :meth:`~proposer_rl.meta.copies.Copies.trained`.
+
+        In the means over all copies, those that two workers have in common count twice.
+        """
         assert self._collector is not None, "there has been no episode"
         orders = [(copy,)] * len(self._shares)
         reports: list[Report] = self._collector.map_fn("env.report", orders)

@@ -7,22 +7,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+import torch
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
+from proposer_rl.cli.build import make_in_place, make_task
+from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum
-from proposer_rl.mazes.task import MazeTask
 from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Parts, Workers, proposer
 from proposer_rl.streams import Streams
+from proposer_rl.task import Place, Task
+from tests.tiny import composed
 
 COPIES = 3
 OVERRIDES = ["+method=perf_gain", "+scale=smoke", f"proposer.rollouts={COPIES}"]
 # Three actions for each copy: the Proposer's forward pass is over all copies, wherever it is made.
-OVERRIDES += ["proposer.advance=best", "proposer.updates_per_step=1", "threads=1"]
+OVERRIDES += ["proposer.advance=best", "proposer.action_repeat=1", "compute.threads=1"]
 
 
 class Hangs(BaseException):
@@ -46,9 +46,7 @@ def within(seconds: int) -> Iterator[None]:
 
 
 def config(*overrides: str) -> RunConfig:
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        return read_config(compose("train", [*OVERRIDES, *overrides]))
+    return composed(*OVERRIDES, *overrides)
 
 
 def workers(engine: Any, count: int = 2) -> WorkerSettings:
@@ -57,35 +55,41 @@ def workers(engine: Any, count: int = 2) -> WorkerSettings:
 
 def make(
     elsewhere: WorkerSettings | None, reward: Reward = performance_gain, *overrides: str
-) -> tuple[MazeTask, ProposerCurriculum]:
+) -> tuple[Task, ProposerCurriculum]:
     settings = config(*overrides)
+    maker, solver = task_maker(settings), settings.solver
+
+    def make_in_worker(device: str) -> Task:
+        return make_in_place(maker, solver, Place(torch.device(device)))
+
     task = make_task(settings)
-    parts = Parts(task, settings.proposer, seed=0, workers=elsewhere)
-    curriculum: Any = proposer(parts, reward)
-    return task, curriculum
+    found = None if elsewhere is None else Workers(elsewhere, make_in_worker)
+    parts = Parts(task, settings.proposer, seeds=[0], workers=found)
+    return task, proposer(parts, reward)
 
 
 def cycles(
-    task: MazeTask,
+    task: Task,
     curriculum: ProposerCurriculum,
     count: int = 2,
     between: Callable[[], None] = lambda: None,
-) -> list[Any]:
-    """All that comes of cycles in which the Solver becomes the best copy: plain, to compare."""
-    solver = task.solvers([Streams(0, "solver")])
-    came: list[Any] = []
+) -> tuple[list[Any], list[float]]:
+    """What comes of cycles in which the Solver becomes the best copy: choices, and numbers."""
+    assert curriculum.trainer is not None
+    solver = task.learner([Streams(0, "solver")])
+    chosen: list[Any] = []
+    numbers: list[float] = []
     for cycle in range(count):
-        outcome = curriculum.improve(solver, [Streams(0, "cycle", cycle)])
+        outcome = curriculum.improve(solver, 3 * cycle, [Streams(0, "cycle", cycle)])
         assert outcome.advance is not None
-        levels, update = outcome.advance.levels, outcome.advance.update
-        came += [outcome.metrics, outcome.meta_frames, levels.to_text()]
-        came += [update.rollout["action"].tolist(), _bits(update.rollout["next", "state_value"])]
-        came += [_bits(update.metrics["loss_critic"]), _bits(update.metrics["grad_norm"])]
+        metrics, levels, update = outcome.metrics, outcome.advance.levels, outcome.advance.update
+        chosen += [metrics.pop("histogram"), outcome.frames, outcome.evaluations, metrics.keys()]
+        chosen += [levels.to_text(), update.rollout["action"].tolist()]
+        for value in metrics.values():
+            numbers += value if isinstance(value, list) else [] if value is None else [value]
+        numbers += update.rollout["next", "state_value"].flatten().tolist()
         between()
-    for learner in (solver, curriculum.proposer):
-        came += [_bits(x) for x in learner.snapshot().values(True, True)]
-    return came
-
-
-def _bits(tensor: Any) -> bytes:
-    return tensor.detach().contiguous().numpy().tobytes()
+    for learner in (solver, curriculum.trainer.learner):
+        for entry in learner.snapshot().values(True, True):
+            numbers += entry.flatten().tolist()
+    return chosen, numbers

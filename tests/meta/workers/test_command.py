@@ -10,10 +10,10 @@ import pytest
 
 from proposer_rl.runs.checkpoint import load_latest
 from tests.processes import Processes
-from tests.runs import assert_same_run
+from tests.same_run import assert_same_run
 
-COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "progress=false"]
-MULTIPROCESS = ["collector=multiprocess", "workers=2"]
+COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "compute.progress=false"]
+MULTIPROCESS = ["compute.collector=multiprocess", "compute.workers=2"]
 
 
 def working_in(folder: Path) -> list[str]:
@@ -29,14 +29,14 @@ def working_in(folder: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_killed_with_its_workers_and_resumed_it_is_the_run_of_one_process(
+def test_killed_with_its_workers_and_resumed_it_is_the_run_that_was_not(
     processes: Processes, tmp_path: Path
 ) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    whole = processes(*COMMAND, f"hydra.run.dir={tmp_path / 'whole'}")
+    whole = processes(*COMMAND, *MULTIPROCESS, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
     # With the second cycle's line: its episode is over, and no checkpoint knows of it.
-    at = [i for i, name in enumerate(whole.writes) if name == "fsync proposer.jsonl"][1]
+    at = [i for i, name in enumerate(whole.writes) if name == "fsync cycles.jsonl"][1]
     folder = tmp_path / "works_here"
     folder.mkdir()
     killed = processes(
@@ -50,15 +50,14 @@ def test_killed_with_its_workers_and_resumed_it_is_the_run_of_one_process(
         time.sleep(0.2)
     latest = load_latest(tmp_path / "run" / "checkpoints")
     assert latest is not None and latest[1]["cycles"] == 1
-    # Where the copies are trained may change in between.
     ended = processes(*COMMAND, *MULTIPROCESS, run)
     assert ended.code == 0, ended.output
     assert_same_run(tmp_path / "whole", tmp_path / "run")
 
 
 def test_without_the_cluster_one_line_and_exit_code_6(processes: Processes, tmp_path: Path) -> None:
-    ray = ["collector=ray", "workers=2", "ray_address=127.0.0.1:1"]
+    ray = ["compute.collector=ray", "compute.workers=2", "compute.ray_address=127.0.0.1:1"]
     ended = processes(*COMMAND, *ray, f"hydra.run.dir={tmp_path}")
     assert ended.code == 6, ended.output
     last = ended.output.strip().splitlines()[-1]
-    assert last.startswith("error: ray_address=127.0.0.1:1: no cluster answers there: ")
+    assert last.startswith("error: compute.ray_address=127.0.0.1:1: no cluster answers there: ")

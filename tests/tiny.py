@@ -1,0 +1,68 @@
+"""A task of seconds, and the Proposer's environment on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from tensordict import TensorDictBase
+
+from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
+from proposer_rl.learning import PPO
+from proposer_rl.mazes import Level, planes
+from proposer_rl.mazes.evaluation import ExactEvaluator
+from proposer_rl.mazes.settings import (
+    DistributionSettings,
+    EvaluationSettings,
+    MazeSettings,
+    NetworkSettings,
+    SpaceSettings,
+)
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.models import ActorCritic, cell_logits
+from proposer_rl.settings import PPOSettings, SolverSettings
+from proposer_rl.streams import Streams
+from proposer_rl.task import Place
+
+EVALUATE = ExactEvaluator(max_steps=8)
+
+
+def tiny_task(**changed: Any) -> MazeTask:
+    """5x5 mazes in four bins, of which the last one is the target."""
+    ppo = PPOSettings(horizon=8, epochs=2, learning_rate=3e-3)
+    parts: dict[str, Any] = {
+        "maze": MazeSettings(height=5, width=5, max_steps=8),
+        "distributions": {"id": DistributionSettings(specifications=[(0.2, 4)])},
+        "target": "id",
+        "space": SpaceSettings(obstacle_fractions=[0.0, 0.2], path_lengths=[2, 4]),
+        "network": NetworkSettings(channels=[8, 8], groups=4),
+        "encoder_channels": [8, 8],
+        "evaluation": EvaluationSettings(distributions=["id"], levels=8),
+        "solver": SolverSettings(batch_size=4, ppo=ppo),
+        "place": Place(),
+    }
+    return MazeTask(**{**parts, **changed})
+
+
+TASK = tiny_task()
+
+
+def learners(copies: int) -> PPO:
+    """As many copies of one Solver, the same in every call."""
+    return TASK.learner([Streams(0, "solver")] * copies)
+
+
+def evaluate(agent: ActorCritic, levels: Level) -> TensorDictBase:
+    """What K Solvers reach on levels [E], without the task."""
+    copies = levels.expand(agent.copies, *levels.batch_size)
+    with torch.no_grad():
+        return EVALUATE(copies, cell_logits(agent, planes(copies)))
+
+
+def composed(*overrides: str) -> RunConfig:
+    """The settings that the command gets."""
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        return read_config(compose("train", list(overrides)))
