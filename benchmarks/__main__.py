@@ -1,4 +1,4 @@
-"""``bin/bench`` and ``proposer-bench``: measure, print tables, write a JSON file."""
+"""``bin/bench``: measure, print tables, write a JSON file."""
 
 from __future__ import annotations
 

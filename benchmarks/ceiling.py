@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from benchmarks.plain import PlainUNet
 from benchmarks.profiling import profile
 from benchmarks.results import Options, Result, Row, Spread, Table
-from benchmarks.scales import PAPER, TINY, Solvers, bf16_in_hardware
+from benchmarks.scales import Solvers, paper, precisions
 from benchmarks.timing import Timings, interleave
 from proposer_rl.learning.cuda_graphs import WARM_UPS
 
@@ -100,12 +100,11 @@ def convolutions(channels: Sequence[int], batch: int, height: int, width: int) -
 
 def against_convolutions(options: Options) -> Result:
     """An update against its convolutions alone, and where the rest of its time goes."""
-    scale = TINY if options.tiny else PAPER
-    layers = convolutions(
-        scale.solver.channels, scale.solver.problems, scale.maze.height, scale.maze.width
-    )
-    dtypes = ["fp32", "bf16"] if bf16_in_hardware(options.device) else ["fp32"]
-    solvers = {dtype: Solvers(scale.task(options, dtype)) for dtype in dtypes}
+    scale, dtypes = paper(options), precisions(options)
+    tasks = {dtype: scale.task(options, f"precision={dtype}") for dtype in dtypes}
+    task = tasks["fp32"]
+    layers = convolutions(scale.channels, task.batch_size, task.maze.height, task.maze.width)
+    solvers = {dtype: Solvers(task) for dtype, task in tasks.items()}
     candidates: dict[str, Callable[[], object]] = {d: solvers[d].update for d in dtypes}
     for (i, layer), layout, dtype in product(enumerate(layers), LAYOUTS, dtypes):
         forward, both = layer.passes(layout, dtype, options.device)
@@ -117,7 +116,7 @@ def against_convolutions(options: Options) -> Result:
         # An update in the faster precision has to stand against the best of both.
         allowed = dtypes if dtype == "bf16" else ["fp32"]
         best = _Best(seconds, len(layers), allowed)
-        ceiling = best.ceiling(scale.solver.ppo.epochs)
+        ceiling = best.ceiling(task.solver.ppo.epochs)
         shares = [c / u for c, u in zip(ceiling, seconds[dtype], strict=True)]
         rows.append(
             Row(
@@ -125,7 +124,7 @@ def against_convolutions(options: Options) -> Result:
                 f"a Solver update, {dtype}",
                 Spread.of(shares),
                 "%",
-                target=None if options.tiny else 0.60,
+                target=0.60,
                 samples={"update": seconds[dtype], "convolutions": ceiling},
             )
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from benchmarks.results import Options, Result, Row
-from benchmarks.scales import PAPER, TINY, Solvers
+from benchmarks.scales import Solvers, paper
 from benchmarks.timing import interleave, ratio
 from proposer_rl.mazes import planes
 from proposer_rl.mazes.evaluation import ExactEvaluator
@@ -17,20 +17,20 @@ PAPERS_LEVELS = 75  # of the paper's validation batch, which is evaluated after 
 
 def exact_evaluation(options: Options) -> Result:
     """The evaluation of a meta-environment step against one update of one Solver."""
-    scale = TINY if options.tiny else PAPER
+    scale = paper(options)
     task = scale.task(options)
-    copies, count = scale.proposer.rollouts, PAPERS_LEVELS
+    copies, count = scale.config.proposer.rollouts, PAPERS_LEVELS
     generator = Streams(0, "validation").generator()
-    validation = task.sample_target(count, generator)
+    validation = task.target.sample(count, generator)
     solver, population = Solvers(task), Solvers(task, copies, batches=1)
     agent = population.ppo.agent
     levels = validation.expand(copies, count)
     logits = cell_logits(agent, planes(levels))
-    evaluator = ExactEvaluator(scale.maze.max_steps, scale.maze.step_penalty)
+    evaluator = ExactEvaluator(task.maze.max_steps, task.maze.step_penalty)
 
     @torch.no_grad()
     def whole() -> None:
-        task.evaluate(agent, validation, generator)
+        task.performance(agent, validation, generator)
 
     candidates = {
         "update": solver.update,
@@ -38,20 +38,19 @@ def exact_evaluation(options: Options) -> Result:
         "with the network": whole,
     }
     seconds = interleave(candidates, options.repeats, options.device)
-    size = f"K = {copies}, E = {count}"
     rows = [
         Row(
-            f"exact evaluation, {size}",
-            f"a Solver update, {scale.precision(options)}",
+            f"exact evaluation, K = {copies}, E = {count}",
+            f"a Solver update, {task.precision}",
             ratio(seconds["evaluation"], seconds["update"]),
             "%",
-            target=None if options.tiny else 0.03,
+            target=0.03,
             at_most=True,
             samples=seconds,
         ),
         Row(
             "... with the forward passes for its policies",
-            f"{copies} x a Solver update, {scale.precision(options)}",
+            f"{copies} x a Solver update, {task.precision}",
             ratio(seconds["with the network"], seconds["update"], 1 / copies),
             "%",
             samples=seconds,

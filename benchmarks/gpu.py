@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import replace
 
-from benchmarks.meta import MetaStep, StepParts, proposer_curriculum
+from benchmarks.meta import MetaStep, StepParts, trainer_of
 from benchmarks.results import Options, Result, Row, Spread
-from benchmarks.scales import PAPER, TINY, Scale, Solvers, bf16_in_hardware
+from benchmarks.scales import Scale, Solvers, paper, precisions
 from benchmarks.timing import interleave, synchronise, time_once
-from proposer_rl.curricula import Curriculum, SamplingCurriculum
-from proposer_rl.experiment import Experiment, Schedule
-from proposer_rl.mazes.task import MazeTask
-from proposer_rl.runs.folder import RunFolder
 from proposer_rl.streams import Streams
 
 NOTHING = "There is no GPU here: none of its targets is measured."
@@ -24,92 +19,59 @@ def gpu_targets(options: Options) -> Result:
     """Everything that is promised of a GPU, at the paper's values."""
     if not (options.tiny or options.device.startswith("cuda")):
         return Result([], notes=[NOTHING])
-    scale = TINY if options.tiny else PAPER
-    precision = "bf16" if bf16_in_hardware(options.device) else "fp32"
-    results = [
-        _update(scale, options, precision),
-        _meta_step(scale, options, precision),
-        _runs(scale, options, precision),
-    ]
-    return Result(
-        [row for result in results for row in result.rows],
-        [table for result in results for table in result.tables],
-    )
+    options = replace(options, precision=precisions(options)[-1])
+    scale = paper(options)
+    step = _meta_step(scale, options)
+    return Result([*_update(scale, options), *step.rows, *_runs(scale, options)], step.tables)
 
 
-def _update(scale: Scale, options: Options, precision: str) -> Result:
+def _update(scale: Scale, options: Options) -> list[Row]:
     """One Solver: replayed in both precisions, and as it is; and how long the host is busy."""
-    solvers = {
-        f"{precision}, replayed": Solvers(scale.task(options, precision)),
-        "fp32 (TF32), replayed": Solvers(scale.task(options, "fp32")),
-        f"{precision}, not replayed": Solvers(scale.task(options, precision, graphs=False)),
+    ways = {
+        f"{options.precision}, replayed": [],
+        "fp32 (TF32), replayed": ["precision=fp32"],
+        f"{options.precision}, not replayed": ["compute.graphs=false"],
     }
-    candidates: dict[str, Callable[[], object]] = {n: s.update for n, s in solvers.items()}
-    seconds = interleave(candidates, options.repeats, options.device)
+    updates = {name: Solvers(scale.task(options, *way)).update for name, way in ways.items()}
+    seconds = interleave(updates, options.repeats, options.device)
     rows = [
-        _row(f"a Solver update, {name}", "K = 1", times, 8e-3 if i == 0 else None, options)
+        _row(f"a Solver update, {name}", "K = 1", times, 8e-3 if i == 0 else None)
         for i, (name, times) in enumerate(seconds.items())
     ]
-    first = next(iter(solvers.values()))
-    host = [_host_seconds(first.update, options.device) for _ in range(options.repeats)]
-    rows.append(
-        _row("... of which the host is busy", f"{precision}, replayed", host, None, options)
-    )
-    return Result(rows)
+    first = next(iter(updates))
+    host = [_host_seconds(updates[first], options.device) for _ in range(options.repeats)]
+    return [*rows, _row("... of which the host is busy", first, host)]
 
 
-def _meta_step(scale: Scale, options: Options, precision: str) -> Result:
+def _meta_step(scale: Scale, options: Options) -> Result:
     """K Solvers: a step and its parts."""
-    task = scale.task(options, precision)
-    env = proposer_curriculum(task, scale).env
-    parts = StepParts(task, env)
-    steps: dict[str, Callable[[], object]] = {"step": MetaStep(env), "parts": parts}
-    seconds = interleave(steps, options.repeats, options.device)
-    size = f"K = {scale.proposer.rollouts}, {precision}"
-    row = _row("a meta-environment step", size, seconds["step"], 50e-3, options)
+    env = trainer_of(scale.made(options)).env
+    parts = StepParts(env)
+    seconds = interleave({"step": MetaStep(env), "parts": parts}, options.repeats, options.device)
+    size = f"K = {scale.config.proposer.rollouts}, {options.precision}"
+    row = _row("a meta-environment step", size, seconds["step"], 50e-3)
     return Result([row], [parts.table(f"Parts of a meta-environment step, {size}")])
 
 
-def _runs(scale: Scale, options: Options, precision: str) -> Result:
+def _runs(scale: Scale, options: Options) -> list[Row]:
     """A whole run of `target`; of `perf_gain` one cycle, times their number."""
-    updates, cycle = (6, scale.proposer.lookahead) if options.tiny else (750, 50)
-    cycles = updates // cycle
-    task = scale.task(options, precision)
-    target = _run_seconds(task, SamplingCurriculum(task.sample_target), updates, cycle, options)
-    curriculum = proposer_curriculum(task, scale)
-    _run_seconds(task, curriculum, cycle, cycle, options)  # everything is recorded here
-    one = _run_seconds(task, curriculum, cycle, cycle, options)
-    return Result(
-        [
-            _row("a complete run, target", f"{updates} updates", [target], 15, options),
-            _row(
-                f"a complete run, perf_gain, {cycles} x one cycle",
-                f"{updates} updates",
-                [cycles * one],
-                180,
-                options,
-            ),
-        ]
-    )
+    schedule = scale.config.schedule
+    cycles = schedule.updates // schedule.cycle_length
+    target = Scale(scale.name, "target")
+    plain, made = target.made(options), scale.made(options)
 
+    def one_cycle() -> None:
+        fresh = made._replace(learner=made.task.learner([Streams(0, "solver")]))
+        scale.run(options, fresh, f"schedule.updates={schedule.cycle_length}")
 
-def _run_seconds(
-    task: MazeTask, curriculum: Curriculum, updates: int, cycle: int, options: Options
-) -> float:
-    """An experiment from beginning to end, with its evaluations and checkpoints."""
-    with tempfile.TemporaryDirectory() as folder:
-        experiment = Experiment(
-            task.solvers([Streams(0, "solver")]),
-            curriculum,
-            schedule=Schedule(updates=updates, cycle_length=cycle),
-            seeds=[0],
-            folder=RunFolder(Path(folder)),
-            evaluate=task.measure,
-            statistics=task.statistics,
-            records=task.records,
-            progress=False,
-        )
-        return time_once(experiment.run, options.device)
+    one_cycle()  # everything is recorded here
+    size = f"{schedule.updates} updates"
+    whole = time_once(lambda: target.run(options, plain), options.device)
+    several = cycles * time_once(one_cycle, options.device)
+    return [
+        _row("a complete run, target", size, [whole], 15),
+        _row(f"a complete run, perf_gain, {cycles} x one cycle", size, [several], 180),
+    ]
 
 
 def _host_seconds(call: Callable[[], object], device: str) -> float:
@@ -120,15 +82,13 @@ def _host_seconds(call: Callable[[], object], device: str) -> float:
     return time.perf_counter() - start
 
 
-def _row(
-    what: str, against: str, seconds: list[float], target: float | None, options: Options
-) -> Row:
+def _row(what: str, against: str, seconds: list[float], target: float | None = None) -> Row:
     return Row(
         what,
         against,
         Spread.of(seconds),
         "s" if target is not None and target > 1 else "ms",
-        target=None if options.tiny else target,
+        target=target,
         at_most=True,
         samples={what: seconds},
     )

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from benchmarks.results import Options, Result, Row, Spread, Table
-from benchmarks.scales import PAPER, QUICK, TINY
+from benchmarks.scales import QUICK, TINY, Scale
 from benchmarks.timing import threads
-from proposer_rl.mazes.task import DistributionSettings, EvaluationSettings, MazeTask
-from proposer_rl.streams import Streams
 
-# An easy mix, so that something is learnt in few updates.
-MIX = DistributionSettings(specifications=[(0.0, 2), (0.1, 3), (0.2, 4), (0.25, 5), (0.3, 6)])
-
-# The paper's network and step size, which is where bf16 pays, on mazes and batches of `quick`.
-WIDE = replace(
-    QUICK,
-    solver=replace(
-        PAPER.solver,
-        problems=QUICK.solver.problems,
-        ppo=replace(PAPER.solver.ppo, horizon=QUICK.solver.ppo.horizon),
-    ),
+# The paper's network and step size, which is where bf16 pays, on mazes and batches of `quick`; an
+# easy mix, so that something is learnt in few updates.
+WIDE = QUICK.but(
+    "task.network.channels=[64,128,256]",
+    "solver.ppo.learning_rate=2.5e-4",
+    "task.distributions.mix.specifications=[[0.0,2],[0.1,3],[0.2,4],[0.25,5],[0.3,6]]",
 )
 
 
@@ -32,28 +23,16 @@ def learning_curves(options: Options) -> Result:
     scale = TINY if options.tiny else WIDE
     updates, every = (4, 2) if options.tiny else (100, 10)
     seeds = max(2, options.repeats)
-    curves = {}
-    for precision in ("fp32", "bf16"):
-        task = MazeTask(
-            maze=scale.maze,
-            distributions={"mix": MIX if not options.tiny else scale.distributions["id"]},
-            target="mix",
-            space=scale.space,
-            solver=scale.solver,
-            evaluation=EvaluationSettings(distributions=["mix"], levels=8 if options.tiny else 512),
-            device=options.device,
-            precision=precision,
-        )
-        with threads(scale.threads):
-            curves[precision] = train(task, seeds, updates, every)
-    full, low = curves["fp32"], curves["bf16"]
+    full, low = (
+        train(scale, options, precision, seeds, updates, every) for precision in ("fp32", "bf16")
+    )
     # Both precisions share their seeds, so the spread between seeds is that of each alone.
     spread = torch.stack([full.std(1), low.std(1)]).mean(0)
     difference = low.mean(1) - full.mean(1)
     error = spread * (2 / seeds) ** 0.5
     score = [float(d.abs() / e.clamp_min(1e-3)) for d, e in zip(difference, error, strict=True)]
     lines = [
-        [str(every * i), *(_cell(curve[i]) for curve in curves.values()), f"{difference[i]:+.3f}"]
+        [str(every * i), _cell(full[i]), _cell(low[i]), f"{difference[i]:+.3f}"]
         for i in range(len(full))
     ]
     row = Row(
@@ -61,7 +40,7 @@ def learning_curves(options: Options) -> Result:
         "standard error between seeds, along the curve",
         Spread.of(score),
         "x",
-        target=None if options.tiny else 2.0,
+        target=2.0,
         at_most=True,
     )
     header = ["update", "fp32 success (min-max)", "bf16 success (min-max)", "difference"]
@@ -71,20 +50,22 @@ def learning_curves(options: Options) -> Result:
     )
 
 
-def train(task: MazeTask, seeds: int, updates: int, every: int) -> Tensor:
+def train(
+    scale: Scale, options: Options, precision: str, seeds: int, updates: int, every: int
+) -> Tensor:
     """Success rates along training, [measurements, seeds]; the first is before it."""
-    streams = [Streams(seed, "learning") for seed in range(seeds)]
-    solvers = task.solvers(streams)
-    shape = torch.Size([seeds, task.solver.problems])
-    curve = [task.measure(solvers.agent)["mix_success"]]
-    for update in range(updates):
-        levels = [task.sample_target(shape[1], s.generator("levels", update)) for s in streams]
-        stacked: object = torch.stack(levels)  # type: ignore[arg-type]
-        solvers.env.set_levels(stacked)
-        solvers.update([s.generator("actions", update, device=task.device) for s in streams])
-        if (update + 1) % every == 0:
-            curve.append(task.measure(solvers.agent)["mix_success"])
-    return torch.stack(curve).cpu()
+    of_run = (
+        f"precision={precision}",
+        f"seeds={list(range(seeds))}",
+        "task.target=mix",
+        "task.evaluation.distributions=[mix]",
+        f"schedule.updates={updates}",
+        f"schedule.evaluate_every={every}",
+    )
+    target = Scale(scale.name, "target", scale.overrides)
+    with threads(scale.threads):
+        rows = target.run(options, target.made(options, *of_run), *of_run)
+    return torch.tensor([row["mix_success"] for row in rows]).view(-1, seeds)
 
 
 def _cell(success: Tensor) -> str:

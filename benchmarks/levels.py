@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.results import Options, Result, Row
-from benchmarks.scales import PAPER, TINY
+from benchmarks.scales import paper
 from benchmarks.timing import interleave, rate, ratio
 from proposer_rl.mazes import Level, LevelDistribution, generate_levels, shortest_path_length
 from proposer_rl.mazes.levels import cell_index
@@ -20,8 +20,7 @@ BATCH = 2048
 
 def generation(options: Options) -> Result:
     """Levels as specified, against drawing walls, start and goal without regard to the path."""
-    scale, batch = (TINY, 8) if options.tiny else (PAPER, BATCH)
-    task = scale.task(options)
+    task, batch = paper(options).task(options), 8 if options.tiny else BATCH
     generator = torch.Generator(options.device).manual_seed(0)
     sources: dict[str, tuple[LevelDistribution, float | None]] = {
         "ID": (task.target, 200e3),
@@ -30,7 +29,7 @@ def generation(options: Options) -> Result:
     }
     for distribution, _ in sources.values():
         check_exact(distribution, batch, generator)
-    height, width = scale.maze.height, scale.maze.width
+    height, width = task.maze.height, task.maze.width
     ((fraction, _),) = task.target.specifications
     candidates: dict[str, Callable[[], object]] = {
         "uncontrolled": partial(
@@ -48,7 +47,7 @@ def generation(options: Options) -> Result:
                 "each as specified",
                 rate(batch, seconds[name]),
                 "/s",
-                target=None if options.tiny else target,
+                target=target,
                 samples={name: seconds[name]},
             )
         )
@@ -124,7 +123,7 @@ def shortest_paths(options: Options) -> Result:
                     name,
                     ratio(seconds[name], seconds["here"], batch / count),
                     "x",
-                    target=None if options.tiny else target,
+                    target=target,
                     samples={"here": seconds["here"], name: seconds[name]},
                 )
             )

@@ -10,46 +10,43 @@ from typing import Any
 import torch
 
 from benchmarks.results import Options, Result, Row, Spread, Table
-from benchmarks.scales import PAPER, QUICK, TINY, Scale
+from benchmarks.scales import PAPER, QUICK, TINY, paper
 from benchmarks.timing import interleave, ratio, threads
-from proposer_rl.curricula import ProposerCurriculum
-from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes.task import MazeTask
+from proposer_rl.cli.build import Made
+from proposer_rl.curricula import ProposerTrainer
+from proposer_rl.learning import PPO
 from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.rewards import performance_gain
-from proposer_rl.methods import Parts, proposer
 from proposer_rl.streams import Streams
 
 PARTS = ("generation", "update", "evaluation", "probing")
+# The shortest steps, and the most of them.
+EVERY_UPDATE = "proposer.action_repeat=1"
 
 
 def meta_step(options: Options) -> Result:
     """A step through TorchRL's interface against what it is made of, called by hand."""
-    if options.tiny:
-        scales = {"tiny": TINY}
-    else:
-        scales = {"quick": QUICK.with_copies(16)}
-        if options.size == "full":
-            scales["paper"] = PAPER
+    scales = [TINY] if options.tiny else [QUICK.but("proposer.rollouts=16")]
+    if options.size == "full":
+        scales.append(PAPER)
     rows, tables = [], []
-    for name, scale in scales.items():
-        task = scale.task(options)
-        env = proposer_curriculum(task, _acting_at_every_update(scale)).env
-        parts = StepParts(task, env)
+    for scale in scales:
+        made = scale.made(options, EVERY_UPDATE)
+        env = trainer_of(made).env
+        parts = StepParts(env)
         with threads(scale.threads):
             seconds = interleave(
                 {"step": MetaStep(env), "parts": parts},
-                options.few if scale is PAPER else options.repeats,
+                options.few if scale == PAPER else options.repeats,
                 options.device,
             )
-        size = f"K = {scale.proposer.rollouts}, {name} values, {scale.precision(options)}"
+        size = f"K = {env.batch_size[0]}, {scale.name} values, {made.task.precision}"
         rows.append(
             Row(
                 f"a meta-environment step, {size}",
                 "the sum of its parts",
                 ratio(seconds["step"], seconds["parts"]),
                 "x",
-                target=None if options.tiny else 1.05,
+                target=1.05,
                 at_most=True,
                 samples=seconds,
             )
@@ -75,13 +72,12 @@ class MetaStep:
 class StepParts:
     """What a step consists of, without the environment around it."""
 
-    def __init__(self, task: MazeTask, env: SolverTrainingEnv) -> None:
-        self.task = task
-        self.solvers = env.solvers
-        self.validation, self.probes = env.view.validation, env.view.probes
+    def __init__(self, env: SolverTrainingEnv) -> None:
         self.env = env
+        self.solvers = env.solvers
+        self.task = env.view.task
         self.streams = [Streams(copy, "bench") for copy in range(env.batch_size[0])]
-        self.generators = [stream.generator(device=task.device) for stream in self.streams]
+        self.generators = [stream.generator(device=self.task.device) for stream in self.streams]
         self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
 
     def __call__(self) -> None:
@@ -92,8 +88,8 @@ class StepParts:
 
     def generation(self) -> None:
         """Levels for random actions."""
-        action, problems = self.env.action_spec.rand(), self.task.solver.problems
-        self.levels, _ = self.env.proposals.levels(action, problems, self.streams)
+        action, count = self.env.action_spec.rand(), self.env.batch_of_levels
+        self.levels, _ = self.env.actions.levels(action, count, self.streams)
 
     def update(self) -> None:
         """One PPO update of each Solver on them."""
@@ -102,13 +98,13 @@ class StepParts:
 
     @torch.no_grad()
     def evaluation(self) -> None:
-        """Their return on the validation levels."""
-        self.task.evaluate(self.solvers.agent, self.validation, self.generators[0])
+        """How they do on the validation levels."""
+        self.task.performance(self.solvers.agent, self.env.view.validation, self.generators[0])
 
     @torch.no_grad()
     def probing(self) -> None:
         """What the Proposer sees of them."""
-        self.task.probe(self.solvers.agent, self.probes)
+        self.task.probe(self.solvers.agent, self.env.view.probes)
 
     def table(self, title: str) -> Table:
         """Milliseconds of each part."""
@@ -127,36 +123,29 @@ def memory(options: Options) -> Result:
     The steps of a meta-episode follow one another in the same memory; so two are run, and the
     Proposer is trained on an episode of full length that repeats them.
     """
-    name, scale = ("tiny", TINY) if options.tiny else ("paper", PAPER)
-    length, steps = scale.proposer.lookahead, 2
-    task = scale.task(options)
+    scale, steps = paper(options), 2
     before = peak_memory()
-    short = replace(scale, proposer=replace(scale.proposer, lookahead=steps))
-    curriculum = proposer_curriculum(task, _acting_at_every_update(short))
     # The Solver itself, its levels and measurements are in memory beside its copies.
-    solver = task.solvers([Streams(0, "solver")])
-    curriculum.env.fork(solver.snapshot()[0], Streams(1))
-    rollout = curriculum.proposer.collect()
+    made = scale.made(options, EVERY_UPDATE, f"proposer.meta_episode_length={steps}")
+    proposer = trainer_of(made).learner
+    proposer.env.fork(made.learner.snapshot()[0], Streams(1))
+    rollout = proposer.collect()
     after_steps = peak_memory()
-    long = rollout[:, torch.arange(length) % steps]
-    trainer = PPO(
-        curriculum.env,
-        curriculum.proposer.agent,
-        replace(curriculum.proposer.settings, updates=1, epochs=2),
-    )
-    trainer.optimise(long)
-    task.measure(solver.agent)
+    long = rollout[:, torch.arange(scale.config.proposer.meta_episode_length) % steps]
+    few = replace(proposer.settings, updates=1, epochs=2)
+    PPO(proposer.env, proposer.agent, few).optimise(long)
+    made.task.measure(made.learner.agent)
     peak = peak_memory()
     row = Row(
-        f"peak memory of a run, K = {scale.proposer.rollouts}, {name} values",
-        f"resident, {scale.precision(options)}",
+        f"peak memory of a run, K = {scale.config.proposer.rollouts}, {scale.name} values",
+        f"resident, {made.task.precision}",
         Spread.of([peak / 2**30]),
         "GiB",
-        target=None if options.tiny else 4.0,
+        target=4.0,
         at_most=True,
     )
     lines = [
-        ["libraries and the task", f"{before / 2**30:.2f}"],
+        ["libraries", f"{before / 2**30:.2f}"],
         ["... and meta-environment steps", f"{after_steps / 2**30:.2f}"],
         ["... and the Proposer's training", f"{peak / 2**30:.2f}"],
     ]
@@ -170,12 +159,8 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
-def _acting_at_every_update(scale: Scale) -> Scale:
-    """The same with one update for each action: the shortest steps, and the most of them."""
-    return replace(scale, proposer=replace(scale.proposer, updates_per_step=1))
-
-
-def proposer_curriculum(task: MazeTask, scale: Scale) -> ProposerCurriculum:
-    """The curriculum of the method `perf_gain`."""
-    curriculum: Any = proposer(Parts(task, scale.proposer, seed=0), performance_gain)
-    return curriculum
+def trainer_of(made: Made) -> ProposerTrainer:
+    """What trains the Proposer of a run of `perf_gain`."""
+    curriculum: Any = made.curriculum
+    trainer: ProposerTrainer = curriculum.trainer
+    return trainer

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from benchmarks.ceiling import against_convolutions
+from benchmarks.curricula import update_seconds
 from benchmarks.environment import environment_steps
 from benchmarks.evaluation import exact_evaluation
 from benchmarks.gpu import gpu_targets
@@ -14,7 +16,7 @@ from benchmarks.levels import generation, shortest_paths
 from benchmarks.meta import memory, meta_step
 from benchmarks.placement import throughput
 from benchmarks.results import Options, Result
-from benchmarks.solver import against_plain, overhead, population, precisions
+from benchmarks.solver import against_plain, in_both_precisions, overhead, population
 
 
 class Benchmark(NamedTuple):
@@ -38,18 +40,27 @@ BENCHMARKS = {
     "environment": Benchmark("environment steps against Gymnasium", environment_steps),
     "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),
     "overhead": Benchmark("what of a Solver update is not the network", overhead),
-    "precision": Benchmark("a Solver update in bf16 against fp32", precisions),
+    "precision": Benchmark("a Solver update in bf16 against fp32", in_both_precisions),
     "ceiling": Benchmark(
         "a Solver update against its convolutions alone, and a profile", against_convolutions
     ),
     "meta": Benchmark("a meta-environment step against its parts", meta_step),
     "population": Benchmark("K Solvers in one update against one after another", population),
     "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
+    "curricula": Benchmark("seconds of an update by curriculum", update_seconds),
     "workers": Benchmark("rollouts of the copies in one worker and in two", throughput),
     "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
     "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
     "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),
 }
+
+
+def measure(name: str, options: Options) -> Result:
+    """Run a benchmark; at a tiny size nothing is claimed."""
+    result = BENCHMARKS[name].run(options)
+    if options.tiny:
+        result.rows = [replace(row, target=None) for row in result.rows]
+    return result
 
 
 def selected(names: list[str], full: bool, cuda: bool = False) -> list[str]:

@@ -1,138 +1,93 @@
-"""The sizes that are measured: ``conf/train.yaml`` and ``conf/scale`` (a test compares them)."""
+"""The sizes that are measured: those of ``conf/``, composed and made as for a run."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import cycle
+from pathlib import Path
+from typing import Any
 
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 
 from benchmarks.results import Options
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.cli.build import Made, build, make_task, parts
+from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
+from proposer_rl.learning import PPO
 from proposer_rl.mazes import Level
-from proposer_rl.mazes.task import (
-    DistributionSettings,
-    EvaluationSettings,
-    MazeSettings,
-    MazeTask,
-    SolverSettings,
-    SpaceSettings,
-    faster_precision,
-)
-from proposer_rl.methods import ProposerSettings
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
-
-NARROW = [16, 32, 32]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """The settings of a run, without its schedule; ``threads`` None leaves torch's choice."""
+    """The settings of a run: a file of ``conf/scale``, a method, and what else is overridden."""
 
-    maze: MazeSettings
-    distributions: dict[str, DistributionSettings]
-    space: SpaceSettings
-    solver: SolverSettings
-    proposer: ProposerSettings
-    threads: int | None = None
+    name: str
+    method: str = "perf_gain"
+    overrides: tuple[str, ...] = ()
 
-    def with_solver(
-        self, *, channels: list[int] | None = None, problems: int | None = None
-    ) -> Scale:
-        """The same with another network or number of levels per update."""
-        solver = replace(
-            self.solver,
-            channels=channels or self.solver.channels,
-            problems=problems or self.solver.problems,
-        )
-        return replace(self, solver=solver)
+    def but(self, *overrides: str) -> Scale:
+        """The same with further overrides."""
+        return replace(self, overrides=(*self.overrides, *overrides))
 
-    def with_copies(self, copies: int) -> Scale:
-        """The same with another number of parallel Solvers."""
-        return replace(self, proposer=replace(self.proposer, rollouts=copies))
+    @property
+    def config(self) -> RunConfig:
+        """The settings, checked."""
+        return _composed(f"+method={self.method}", f"+scale={self.name}", *self.overrides)
 
-    def precision(self, options: Options) -> str:
-        """The precision asked for; with ``auto`` that of a run."""
-        if options.precision != "auto":
-            return options.precision
-        return faster_precision(self.solver.channels, torch.device(options.device))
+    @property
+    def threads(self) -> int | None:
+        """Of torch for one operation; None leaves torch's choice."""
+        return self.config.compute.threads
 
-    def task(self, options: Options, precision: str | None = None, graphs: bool = True) -> MazeTask:
-        """The maze task of these settings."""
-        return MazeTask(
-            maze=self.maze,
-            distributions=self.distributions,
-            target="id",
-            space=self.space,
-            solver=self.solver,
-            # Of no account here, so few.
-            evaluation=EvaluationSettings(distributions=["id"], levels=8),
-            device=options.device,
-            precision=precision or self.precision(options),
-            graphs=graphs,
-        )
+    @property
+    def channels(self) -> list[int]:
+        """Of the Solver's network."""
+        return list(self.config.task["network"]["channels"])
+
+    def task(self, options: Options, *overrides: str) -> MazeTask:
+        """The task of these settings."""
+        task: Any = make_task(self._placed(options, overrides))
+        return task
+
+    def made(self, options: Options, *overrides: str) -> Made:
+        """Task, Solver and curriculum of these settings."""
+        return parts(self._placed(options, overrides), StopSignals())
+
+    def run(self, options: Options, made: Made, *overrides: str) -> list[dict[str, Any]]:
+        """A run from beginning to end, in a folder of its own; returns the rows of its metrics."""
+        with tempfile.TemporaryDirectory() as folder:
+            build(self._placed(options, overrides), made, RunFolder(folder)).run()
+            return list(read_csv(Path(folder) / "metrics.csv"))
+
+    def _placed(self, options: Options, overrides: tuple[str, ...]) -> RunConfig:
+        # Threads are set around what is timed, and are this process's own again after it.
+        compute = ["threads=null", "progress=false", f"device={options.device}"]
+        placed = [f"precision={options.precision}", *(f"compute.{value}" for value in compute)]
+        return self.but(*placed, *overrides).config
 
 
-PAPER = Scale(
-    maze=MazeSettings(),
-    distributions={
-        "id": DistributionSettings(specifications=[(0.4, 12)]),
-        "ood": DistributionSettings(specifications=[(0.5, 14)], mechanism="path_first"),
-    },
-    space=SpaceSettings(
-        obstacle_fractions=[0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
-        path_lengths=[2, 4, 6, 8, 10, 12, 14, 16],
-    ),
-    solver=SolverSettings(channels=[64, 128, 256]),
-    proposer=ProposerSettings(
-        channels=[32, 64], ppo=PPOSettings(horizon=50, updates=3, epochs=16, gamma=1.0)
-    ),
-)
+PAPER = Scale("paper")
+QUICK = Scale("quick")
+TINY = Scale("smoke")
+NARROW = "task.network.channels=[16,32,32]"
 
-_QUICK_PPO = PPOSettings(horizon=15, learning_rate=1e-3)
-QUICK = Scale(
-    maze=MazeSettings(height=6, width=6, max_steps=15),
-    distributions={
-        "id": DistributionSettings(specifications=[(0.4, 8)]),
-        "ood": DistributionSettings(specifications=[(0.5, 10)], mechanism="path_first"),
-    },
-    space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4, 0.5], path_lengths=[2, 4, 6, 8, 10]),
-    solver=SolverSettings(channels=[16, 32], problems=32, ppo=_QUICK_PPO),
-    proposer=replace(
-        PAPER.proposer,
-        rollouts=8,
-        lookahead=20,
-        updates_per_step=20,
-        context=64,
-        hidden=64,
-        channels=[16, 32],
-        ppo=replace(PAPER.proposer.ppo, horizon=20, learning_rate=1e-3),
-    ),
-    threads=1,
-)
 
-_TINY_PPO = PPOSettings(horizon=10, epochs=2)
-TINY = Scale(
-    maze=MazeSettings(height=5, width=5, max_steps=10),
-    distributions={
-        "id": DistributionSettings(specifications=[(0.2, 4)]),
-        "ood": DistributionSettings(specifications=[(0.3, 5)], mechanism="path_first"),
-    },
-    space=SpaceSettings(obstacle_fractions=[0.0, 0.2], path_lengths=[2, 4]),
-    solver=SolverSettings(channels=[8, 8, 8], groups=4, problems=4, ppo=_TINY_PPO),
-    proposer=ProposerSettings(
-        rollouts=2,
-        lookahead=3,
-        updates_per_step=3,
-        validation_levels=16,
-        probe_levels=2,
-        context=8,
-        hidden=8,
-        channels=[8, 8],
-        ppo=PPOSettings(horizon=3, epochs=2, gamma=1.0),
-    ),
-)
+def paper(options: Options) -> Scale:
+    """The paper's values, unless the code is only to be tried."""
+    return TINY if options.tiny else PAPER
+
+
+def precisions(options: Options) -> list[str]:
+    """Those that are compared: bf16 only where it is more than emulated."""
+    return ["fp32", "bf16"] if bf16_in_hardware(options.device) else ["fp32"]
 
 
 def bf16_in_hardware(device: str) -> bool:
@@ -152,13 +107,16 @@ class Solvers:
     """
 
     def __init__(self, task: MazeTask, copies: int = 1, batches: int = 3) -> None:
-        self.task = task
-        self.copies = copies
-        self.ppo: PPO = task.solvers([Streams(copy, "solver") for copy in range(copies)])
+        self.ppo: PPO = task.learner([Streams(copy, "solver") for copy in range(copies)])
         self._generators = [
             Streams(copy, "actions").generator(device=task.device) for copy in range(copies)
         ]
-        self._levels: Iterator[Level] = cycle([self._draw(batch) for batch in range(batches)])
+        shape = torch.Size([copies, task.batch_size])
+        drawn = [
+            task.target.sample(shape.numel(), Streams(batch, "levels").generator()).reshape(shape)
+            for batch in range(batches)
+        ]
+        self._levels: Iterator[Level] = cycle(drawn)
 
     def update(self) -> None:
         """One PPO update on new levels."""
@@ -169,8 +127,9 @@ class Solvers:
         """Give the environment its next levels."""
         self.ppo.env.set_levels(next(self._levels))
 
-    def _draw(self, batch: int) -> Level:
-        shape = torch.Size([self.copies, self.task.solver.problems])
-        generator = Streams(batch, "levels").generator()
-        levels = self.task.sample_target(shape.numel(), generator)
-        return levels.reshape(shape)
+
+@cache
+def _composed(*overrides: str) -> RunConfig:
+    GlobalHydra.instance().clear()  # a command in the same process may have left its own
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        return read_config(compose("train", list(overrides)))

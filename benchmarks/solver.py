@@ -10,9 +10,10 @@ import torch
 
 from benchmarks.plain import PlainPPO, PlainUNet
 from benchmarks.results import Options, Result, Row, Spread, Table
-from benchmarks.scales import NARROW, PAPER, TINY, Scale, Solvers, bf16_in_hardware
+from benchmarks.scales import NARROW, PAPER, TINY, Scale, Solvers, paper, precisions
 from benchmarks.timing import interleave, ratio, threads, total
 from proposer_rl.mazes import MazeEnv
+from proposer_rl.streams import Streams
 
 SMALL_BATCH = 16
 
@@ -23,7 +24,7 @@ def against_plain(options: Options) -> Result:
         return _complete(TINY, options)
     if options.size == "full":
         return _complete(PAPER, options)
-    small = _complete(PAPER.with_solver(problems=SMALL_BATCH), options)
+    small = _complete(PAPER.but(f"solver.batch_size={SMALL_BATCH}"), options)
     paper = _from_parts(PAPER, options)
     return Result(paper.rows + small.rows, paper.tables, paper.notes)
 
@@ -43,7 +44,7 @@ def _complete(scale: Scale, options: Options) -> Result:
 
 def _from_parts(scale: Scale, options: Options) -> Result:
     """The plain update, put together from one collection and one epoch, since it takes a minute."""
-    plain, epochs = _plain(scale, options), scale.solver.ppo.epochs
+    plain, epochs = _plain(scale, options), scale.config.solver.ppo.epochs
     rollout = plain.collect()
     candidates: dict[str, Callable[[], object]] = {
         **_updates(scale, options),
@@ -73,12 +74,12 @@ def _from_parts(scale: Scale, options: Options) -> Result:
     return Result(rows, [table], [note])
 
 
-def precisions(options: Options) -> Result:
+def in_both_precisions(options: Options) -> Result:
     """The same update with bf16 autocast and without."""
-    if not bf16_in_hardware(options.device):
+    if precisions(options) == ["fp32"]:
         return Result([], notes=["This machine has no bf16 instructions; fp32 it is."])
     rows = []
-    scales = [TINY] if options.tiny else [PAPER, PAPER.with_solver(channels=NARROW)]
+    scales = [TINY] if options.tiny else [PAPER, PAPER.but(NARROW)]
     for scale in scales:
         updates = _updates(scale, options)
         seconds = interleave(updates, options.repeats, options.device)
@@ -100,12 +101,12 @@ def population(options: Options) -> Result:
     if options.tiny:
         scales = [TINY]
     else:
-        scales = [PAPER.with_solver(channels=NARROW)]
+        scales = [PAPER.but(NARROW)]
         if options.size == "full":
             scales.append(PAPER)
     rows = []
     for scale in scales:
-        copies, task = scale.proposer.rollouts, scale.task(options)
+        copies, task = scale.config.proposer.rollouts, scale.task(options)
         alone, together = Solvers(task), Solvers(task, copies)
 
         def in_turn(count: int | None = None, solver: Solvers = alone, times: int = copies) -> None:
@@ -118,16 +119,16 @@ def population(options: Options) -> Result:
             "in turn": in_turn,
             "in turn, one thread": partial(in_turn, 1),
         }
-        repeats = options.few if scale is PAPER else options.repeats
+        repeats = options.few if scale == PAPER else options.repeats
         seconds = interleave({"together": together.update, **ways}, repeats, options.device)
         best = min((seconds[way] for way in ways), key=median)
         rows.append(
             Row(
-                f"one update of K = {copies}, {_size(scale)}, {scale.precision(options)}",
+                f"one update of K = {copies}, {_size(scale)}, {task.precision}",
                 f"{copies} updates of K = 1",
                 ratio(seconds["together"], best),
                 "x",
-                target=None if options.tiny else limit,
+                target=limit,
                 at_most=True,
                 samples=seconds,
             )
@@ -137,11 +138,12 @@ def population(options: Options) -> Result:
 
 def overhead(options: Options) -> Result:
     """What of an update is not the network: environment, GAE, loss, collector, optimiser."""
-    scale = TINY if options.tiny else PAPER
+    scale = paper(options)
     rows = []
-    for precision in _precisions(options):
+    for precision in precisions(options):
         # Both called as they are: on a GPU the network alone would not be replayed.
-        solvers = Solvers(scale.task(options, precision, graphs=False))
+        own = f"precision={precision}"
+        solvers = Solvers(scale.task(options, own, "compute.graphs=false"))
         agent = solvers.ppo.agent
         level = solvers.ppo.env.reset().select(*agent.level_keys)
         with torch.no_grad():
@@ -151,7 +153,7 @@ def overhead(options: Options) -> Result:
         def network_alone(agent=agent, level=level, slopes=slopes) -> None:  # type: ignore[no-untyped-def]
             with torch.no_grad():
                 agent.encode(level)
-            for _ in range(scale.solver.ppo.epochs):
+            for _ in range(scale.config.solver.ppo.epochs):
                 context = agent.encode(level)
                 agent.zero_grad()
                 torch.autograd.backward([context[key] for key in agent.context_keys], slopes)
@@ -166,7 +168,7 @@ def overhead(options: Options) -> Result:
                 "a Solver update",
                 Spread.of(shares),
                 "%",
-                target=None if options.tiny else 0.10,
+                target=0.10,
                 at_most=True,
                 samples=seconds,
             )
@@ -178,23 +180,18 @@ def overhead(options: Options) -> Result:
     return Result(rows, notes=[note])
 
 
-def _precisions(options: Options) -> list[str]:
-    return ["fp32", "bf16"] if bf16_in_hardware(options.device) else ["fp32"]
-
-
 def _updates(scale: Scale, options: Options) -> dict[str, Callable[[], object]]:
     return {
-        precision: Solvers(scale.task(options, precision)).update
-        for precision in _precisions(options)
+        precision: Solvers(scale.task(options, f"precision={precision}")).update
+        for precision in precisions(options)
     }
 
 
 def _plain(scale: Scale, options: Options) -> PlainPPO:
-    solvers = Solvers(scale.task(options, "fp32"))
-    solvers.next_levels()
-    solvers.ppo.env.reset()
-    env = MazeEnv(solvers.ppo.env.levels[0], max_steps=scale.maze.max_steps)
-    return PlainPPO(env, PlainUNet(scale.solver.channels), scale.solver.ppo)
+    task = scale.task(options)
+    levels = task.target.sample(task.batch_size, Streams(0, "levels").generator())
+    env = MazeEnv(levels, max_steps=task.maze.max_steps)
+    return PlainPPO(env, PlainUNet(scale.channels), task.solver.ppo)
 
 
 def _row(scale: Scale, precision: str, plain: list[float], ours: list[float], against: str) -> Row:
@@ -212,9 +209,8 @@ def _row(scale: Scale, precision: str, plain: list[float], ours: list[float], ag
 def _size(scale: Scale) -> str:
     if scale == PAPER:
         return "paper values"
-    solver = scale.solver
-    channels = "→".join(str(width) for width in solver.channels)
-    return f"P = {solver.problems}, {channels}"
+    channels = "→".join(str(width) for width in scale.channels)
+    return f"P = {scale.config.solver.batch_size}, {channels}"
 
 
 def _cells(seconds: Spread) -> list[str]:

@@ -15,9 +15,8 @@ from typing import Any
 import torch
 
 from benchmarks.meta import peak_memory
-from benchmarks.registry import BENCHMARKS
+from benchmarks.registry import measure
 from benchmarks.results import Options
-from proposer_rl.learning.cuda_graphs import use
 
 
 class BenchmarkFailed(Exception):
@@ -65,9 +64,8 @@ def main() -> None:
         torch.set_num_threads(int(threads))
     torch.manual_seed(0)
     chosen = Options(**json.loads(options))
-    use(torch.empty(0, device=chosen.device).device)
     start = time.perf_counter()
-    result = BENCHMARKS[name].run(chosen)
+    result = measure(name, chosen)
     content = {
         "seconds": time.perf_counter() - start,
         "peak_memory": peak_memory(),

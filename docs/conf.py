@@ -94,8 +94,13 @@ def prepare(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
     ):  # TensorClass drops docstrings
         source = ast.parse(inspect.getsource(obj)).body[0]
         lines[:] = (ast.get_docstring(source) or "").splitlines()
-    # The star of a shape such as [*B, 2] begins no emphasis.
-    lines[:] = [re.sub(r"(``.*?``)|\*(?=[A-Z])", lambda m: m[1] or r"\*", line) for line in lines]
+    # The star of a shape such as [*B, 2] begins no emphasis, the bar of |d| no substitution.
+    lines[:] = [
+        line
+        if line.lstrip().startswith((">>>", "..."))
+        else re.sub(r"(``.*?``)|\*(?=[A-Z])|\|", lambda m: m[1] or "\\" + m[0], line)
+        for line in lines
+    ]
     # "height, width: of the grid" are two parameters.
     for i, line in reversed(list(enumerate(lines))):
         if found := re.fullmatch(r"    (\w+(?:, \w+)+)(: .*)", line):

@@ -29,7 +29,7 @@ UPDATES = 20
 
 
 def a2c(actor: TensorDictModuleBase, critic: TensorDictModule) -> A2CLoss:
-    """Mnih et al. 2016. It takes an action as one event: for ``problems``, ``ratio: joint``."""
+    """Mnih et al. 2016. It takes an action as one event: ``problems`` need ``ratio=joint``."""
     return A2CLoss(
         actor, critic, functional=False, reduction="none", critic_coeff=0.5, loss_critic_type="l2"
     )

@@ -7,8 +7,8 @@ acts in mazes larger than those it was trained on.
 
     python examples/own_solver.py [updates]
 
-A run's folder keeps settings, not code, and the commands make the Solver of its settings again. So
-another network is for Python; the command line has the U-Net's sizes.
+The command line has the U-Net's sizes; there, another network is a task of your own: a function
+with MazeTask's arguments that passes `make_network` to it, named as `task._target_`.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class Distribution(Protocol):
 
 
 class Space(Distribution, Protocol):
-    """The levels that a Proposer chooses among, in N bins; :meth:`sample` draws evenly from them.
+    """The levels that a Proposer chooses among, in N bins; ``sample`` draws evenly from them.
 
     Attributes:
         axes: the values along each axis, by the axis's name; the bins are their product, the last

@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 
 from benchmarks.__main__ import main
 from benchmarks.ceiling import convolutions
@@ -20,12 +17,11 @@ from benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
 from benchmarks.plain import PlainPPO, PlainUNet
 from benchmarks.plain_env import PlainMaze
 from benchmarks.profiling import kind_of
-from benchmarks.registry import BENCHMARKS, selected
+from benchmarks.registry import BENCHMARKS, measure, selected
 from benchmarks.report import summary
 from benchmarks.results import Options, Result, Row, Spread
-from benchmarks.scales import PAPER, QUICK, TINY, Scale, Solvers
-from benchmarks.timing import interleave, ratio
-from proposer_rl.cli.config import CONFIG_FOLDER, read_config
+from benchmarks.scales import PAPER, QUICK, TINY, Solvers
+from benchmarks.timing import interleave, ratio, threads
 from proposer_rl.mazes import MazeEnv, generate_levels
 from proposer_rl.streams import Streams
 
@@ -38,7 +34,7 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: str) -> int:
-        monkeypatch.setattr(sys, "argv", ["proposer-bench", *arguments])
+        monkeypatch.setattr(sys, "argv", ["bin/bench", *arguments])
         try:
             main()
         except SystemExit as end:
@@ -50,7 +46,7 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_measures_something(name: str) -> None:
-    result = BENCHMARKS[name].run(TRIED)
+    result = measure(name, TRIED)
     for row in result.rows:
         assert row.what and row.against
         assert row.target is None and row.reached is None  # nothing is claimed at this size
@@ -125,44 +121,40 @@ def test_long_benchmarks_run_on_request() -> None:
     assert "gpu" not in selected([], full=True)
 
 
-@pytest.mark.parametrize(("name", "scale"), [("paper", PAPER), ("quick", QUICK), ("smoke", TINY)])
-def test_the_sizes_are_those_of_the_configuration(name: str, scale: Scale) -> None:
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        config = read_config(compose("train", ["+method=perf_gain", f"+scale={name}"]))
-    assert scale.maze == config.maze
-    assert scale.space == config.space
-    assert scale.solver == config.solver
-    assert scale.proposer == config.proposer
-    assert scale.threads == config.threads
-    for key, distribution in scale.distributions.items():
-        assert distribution == config.distributions[key]
+def test_what_is_measured_is_what_a_run_would_be() -> None:
+    narrow = QUICK.but("task.network.channels=[16,32,32]", "solver.batch_size=16")
+    assert narrow.channels == [16, 32, 32] and narrow.config.solver.batch_size == 16
+    assert narrow.threads == 1  # of conf/scale/quick.yaml, but set only while something is timed
+    with threads(2):
+        made = narrow.made(TRIED, "precision=bf16", "proposer.rollouts=3")
+        assert torch.get_num_threads() == 2
+    assert made.task.batch_size == 16 and made.task.precision == "bf16"
+    assert made.learner.env.batch_size == (1, 16)
+    assert made.curriculum.trainer.env.batch_size == (3,)
 
 
 def test_the_plain_way_learns_the_same_numbers() -> None:
     """Same rollout, same weights: the reference and the library's PPO end in the same weights."""
     # Coarsest maps of 2x2 and two channels per group: what GroupNorm sees is then not constant,
     # for otherwise gradients are rounding errors, which Adam would blow up.
-    tiny = TINY.with_solver(channels=[16, 16, 16])
-    scale = replace(
-        tiny,
-        solver=replace(tiny.solver, groups=8),  # the plain network's
-        maze=replace(tiny.maze, height=8, width=8),
+    scale = TINY.but(
+        "task.network={channels: [16,16,16], groups: 8}", "task.maze={height: 8, width: 8}"
     )
-    solvers = Solvers(scale.task(TRIED))
+    task = scale.task(TRIED)
+    solvers = Solvers(task)
     solvers.next_levels()
     solvers.ppo.env.reset()
-    network = PlainUNet(scale.solver.channels)
+    network = PlainUNet(scale.channels)
     own = list(solvers.ppo.agent.parameters())
     for plain, parameter in zip(network.parameters(), own, strict=True):
         plain.data.copy_(parameter.data[0])
     start = [parameter.detach().clone() for parameter in own]
-    env = MazeEnv(solvers.ppo.env.levels[0], max_steps=scale.maze.max_steps)
-    reference = PlainPPO(env, network, scale.solver.ppo)
+    env = MazeEnv(solvers.ppo.env.levels[0], max_steps=task.maze.max_steps)
+    reference = PlainPPO(env, network, task.solver.ppo)
     rollout = reference.collect()
     reference.advantages(rollout)
     metrics = solvers.ppo.optimise(rollout.clone().unsqueeze(0))
-    epochs = [reference.epoch(rollout) for _ in range(scale.solver.ppo.epochs)]
+    epochs = [reference.epoch(rollout) for _ in range(task.solver.ppo.epochs)]
     for part in ("objective", "critic", "entropy"):
         expected = torch.stack([terms[part].detach() for terms in epochs]).mean()
         torch.testing.assert_close(metrics[f"loss_{part}"], expected, rtol=1e-4, atol=1e-6)
@@ -197,7 +189,7 @@ def test_three_environments_play_alike() -> None:
 
 def test_the_convolutions_are_those_of_the_solver() -> None:
     layers = convolutions([64, 128, 256], 128, 10, 10)
-    solver = PAPER.task(TRIED).solvers([Streams(0)])
+    solver = PAPER.task(TRIED).learner([Streams(0)])
     weights = [p for p in solver.agent.parameters() if p.ndim == 5]
     expected = sorted(tuple(weight.shape[1:4]) for weight in weights)
     assert sorted((c.outputs, c.inputs, c.kernel) for c in layers) == expected

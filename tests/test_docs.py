@@ -27,7 +27,7 @@ def programs() -> dict[str, str]:
     """The module behind every command of bin/ that is a Python program."""
     found = {}
     for file in (ROOT / "bin").iterdir():
-        started = re.search(r"-m (proposer_rl\S*)", file.read_text(encoding="utf-8"))
+        started = re.search(r"-m ((?:proposer_rl|benchmarks)\S*)", file.read_text(encoding="utf-8"))
         if started:
             found[file.name] = started[1]
     return found

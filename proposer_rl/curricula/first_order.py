@@ -117,7 +117,8 @@ class FirstOrderCurriculum(BinCurriculum):
         every, temperature, smoothing: see :class:`BinCurriculum`.
         target_levels: fresh levels E of the target that the direction is taken from.
         candidates: levels C of each bin.
-        measure: of the target's performance; see :func:`target_performance`.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
 
     Raises:
         TypeError: if the task's performance has no gradients.
@@ -126,7 +127,7 @@ class FirstOrderCurriculum(BinCurriculum):
 
     def __init__(
         self,
-        task: ExactTask,
+        task: Task,
         *,
         every: int = 1,
         target_levels: int = 256,
@@ -135,14 +136,14 @@ class FirstOrderCurriculum(BinCurriculum):
         smoothing: float = 0.9,
         measure: str = "log_success",
     ) -> None:
-        require_gradients(task)
+        exact = require_gradients(task)
         if min(target_levels, candidates) < 1:
             raise ValueError(
                 "target_levels and candidates must be at least 1, got "
                 f"{target_levels}, {candidates}"
             )
         super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
-        self._exact = task
+        self._exact = exact
         self._target_levels = target_levels
         self._candidates = candidates
         self._measure = measure
@@ -266,10 +267,12 @@ class SampledFirstOrderCurriculum(BinCurriculum):
         self._direction = {k: v.to(self.task.device) for k, v in state["direction"].items()}
 
 
-def require_gradients(task: object) -> None:
-    """Raise a TypeError if the task's performance has none."""
+def require_gradients(task: Task) -> ExactTask:
+    """The task, if its performance has gradients; else a TypeError."""
     if not isinstance(task, DifferentiableTask):
         raise TypeError(
             f"first-order gain needs gradients: {type(task).__name__} must define "
             "differentiable_performance(agent, levels); +method=first_order_sampled needs none"
         )
+    exact: Any = task
+    return exact

@@ -11,12 +11,13 @@ from torch import nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
-from proposer_rl.curricula.first_order import ExactTask, require_gradients
+from proposer_rl.curricula.first_order import require_gradients
 from proposer_rl.learning import PPO
 from proposer_rl.meta.first_order import exact_alignment, exact_direction
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
+from proposer_rl.task import Task
 
 
 class FirstOrderProposer(Curriculum):
@@ -35,7 +36,8 @@ class FirstOrderProposer(Curriculum):
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
         target_levels: fresh levels E of the target that the direction is taken from.
-        measure: of the target's performance; see :func:`target_performance`.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
 
     Raises:
         TypeError: if the task's performance has no gradients.
@@ -43,7 +45,7 @@ class FirstOrderProposer(Curriculum):
 
     def __init__(
         self,
-        task: ExactTask,
+        task: Task,
         agent: ActorCritic,
         settings: PPOSettings,
         *,
@@ -51,9 +53,8 @@ class FirstOrderProposer(Curriculum):
         target_levels: int = 256,
         measure: str = "log_success",
     ) -> None:
-        require_gradients(task)
         self.agent = agent
-        self._task = task
+        self._task = require_gradients(task)
         self._settings = settings
         self._probe_levels = probe_levels
         self._target_levels = target_levels

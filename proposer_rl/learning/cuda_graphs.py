@@ -194,7 +194,8 @@ class _Recording:
         except RuntimeError as error:
             name = getattr(self._function, "__qualname__", self._function)
             raise RuntimeError(
-                f"{name} cannot be recorded as a CUDA graph; graphs=false does without: {error}"
+                f"{name} cannot be recorded as a CUDA graph; compute.graphs=false does without: "
+                f"{error}"
             ) from error
 
 

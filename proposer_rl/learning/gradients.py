@@ -20,8 +20,10 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     if copies is None:
         return nn.utils.clip_grad_norm_(parameters, max_norm)
     gradients = [p.grad for p in parameters if p.grad is not None]
-    norms = torch.stack([gradient.flatten(1).norm(dim=1) for gradient in gradients])
-    norm = norms.norm(dim=0)  # [K]
+    # Slice by slice, since a norm over a row of several is rounded otherwise than over one alone.
+    slices = [gradient[k] for k in range(copies) for gradient in gradients]
+    norms = torch.stack(torch._foreach_norm(slices)).view(copies, len(gradients))
+    norm = norms.square().sum(1).sqrt()  # [K]
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))

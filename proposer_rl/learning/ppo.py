@@ -55,10 +55,10 @@ class PPO:
             independent copies, which decides over what losses, advantages and norms are taken.
         settings: PPO's numbers.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
-            TorchRL's :class:`GAE`.
+            TorchRL's :class:`~torchrl.objectives.value.GAE`.
         loss: makes another TorchRL loss of the agent's actor and critic, with
             ``functional=False`` and ``reduction="none"``, whose terms ``loss_...`` are added up;
-            None for :class:`ClipPPOLoss`.
+            None for :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of copies, or

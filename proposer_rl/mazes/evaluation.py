@@ -118,6 +118,10 @@ class ExactEvaluator:
 class RolloutEvaluator:
     """Mean return and share of successes over episodes played in :class:`MazeEnv`.
 
+    Of levels ``[*B, E]`` the random numbers are those of E levels, the same for every index of the
+    dimensions before: copies of a Solver differ by what they do alone, and what one of them gets
+    does not depend on the company that it is evaluated in.
+
     Attributes:
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
@@ -157,15 +161,19 @@ class RolloutEvaluator:
             levels.expand(batch), max_steps=self.max_steps, step_penalty=self.step_penalty
         )
         policy = _policy(cell_logits, self.greedy).flatten(-2).movedim(-2, -1)  # [*B, H*W, 4]
-        policy = policy.expand(self.episodes, *policy.shape)
+        cumulative = policy.cumsum(-1).expand(self.episodes, *policy.shape)
+        shared = [1] * (len(batch) - 2)
+        noise = (self.max_steps, self.episodes, *shared, *levels.batch_size[-1:])
+        uniform = torch.rand(noise, generator=generator, device=levels.walls.device)
         state = env.reset()
         playing = torch.ones(batch, dtype=torch.bool, device=levels.walls.device)
         returns, successes = torch.zeros_like(playing, dtype=torch.float32), ~playing
-        for _ in range(self.max_steps):
+        for number in uniform:
             cell = cell_index(state["agent"], levels.walls.shape[-1])[..., None, None]
-            here = policy.gather(-2, cell.expand(*batch, 1, len(MOVES)))  # [episodes, *B, 1, 4]
-            action = here.reshape(-1, len(MOVES)).multinomial(1, generator=generator)
-            state = env.step(state.set("action", action.view(batch)))["next"]
+            here = cumulative.gather(-2, cell.expand(*batch, 1, len(MOVES))).squeeze(-2)
+            threshold = number.expand(batch).unsqueeze(-1) * here[..., -1:]
+            action = (here <= threshold).sum(-1).clamp_(max=len(MOVES) - 1)
+            state = env.step(state.set("action", action))["next"]
             returns += state["reward"].squeeze(-1) * playing
             successes |= state["terminated"].squeeze(-1) & playing
             playing &= ~state["done"].squeeze(-1)

@@ -126,6 +126,18 @@ def test_generator_determines_the_rollouts(source: str) -> None:
     assert not torch.equal(success(1), success(2))
 
 
+def test_copies_play_with_the_same_numbers_in_any_company() -> None:
+    levels, logits = random_levels(12, 4, 4, 0.2, 0), random_logits(3, 12, 4, 4, 4)
+
+    def returns(copies: slice) -> Tensor:
+        generator, own = torch.Generator().manual_seed(0), logits[copies]
+        return RolloutEvaluator(episodes=3)(levels.expand(len(own), 12), own, generator)["return"]
+
+    together = returns(slice(3))
+    assert torch.equal(returns(slice(1, 3)), together[1:])
+    assert not torch.equal(together[0], together[1])
+
+
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10_000), greedy=st.booleans())
 def test_success_is_a_probability_that_grows_with_the_step_limit(seed: int, greedy: bool) -> None:

@@ -1,0 +1,62 @@
+"""``bin/foresight``: predicted gains against measured ones, on a run of a few updates."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from proposer_rl.cli import foresight, train
+from proposer_rl.cli.foresight import agreement
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+
+def test_agreement_is_that_of_ranks_and_of_a_line() -> None:
+    predicted = np.linspace(-1, 1, 9)
+    exact = agreement(predicted, 3 * predicted + 1)
+    assert exact["rank"] == pytest.approx(1) and exact["explained"] == pytest.approx(1)
+    assert exact["slope"] == pytest.approx(3) and exact["slope_error"] == pytest.approx(0)
+    # Ranks see any rising curve; a line sees less of it.
+    bent = agreement(predicted, np.exp(4 * predicted))
+    assert bent["rank"] == pytest.approx(1) and bent["explained"] < 0.8
+    assert agreement(predicted, -predicted)["rank"] == pytest.approx(-1)
+    mixed = np.random.default_rng(0).permutation(9)
+    assert agreement(predicted, mixed)["rank"] == pytest.approx(spearmanr(predicted, mixed)[0])
+
+
+def test_the_interval_covers_no_correlation_where_there_is_none() -> None:
+    generator = np.random.default_rng(0)
+    found = [agreement(*generator.normal(size=(2, 16))) for _ in range(20)]
+    covered = sum(row["low"] <= 0 <= row["high"] for row in found)
+    assert covered >= 16  # 19 of 20 on average
+
+
+def test_three_proposals_are_too_few() -> None:
+    with pytest.raises(ValueError, match="at least 4 proposals are needed, got 3"):
+        agreement(np.arange(3.0), np.arange(3.0))
+
+
+def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, output = tmp_path / "run", tmp_path / "rows.json"
+    smoke = ["+method=target", "+scale=smoke", "compute.progress=false", f"hydra.run.dir={run}"]
+    monkeypatch.setattr(sys, "argv", ["train", *smoke, "schedule.updates=2"])
+    train.main()
+    sizes = ["--ahead", "1", "2", "--proposals", "4", "--copies", "1", "--levels", "8"]
+    monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes, "--output", str(output)])
+    foresight.main()
+    rows = json.loads(output.read_text())
+    stages = len(list((run / "checkpoints").glob("*.pt")))
+    assert [row["ahead"] for row in rows] == [1, 2] * stages
+    assert all(-1 <= row["rank"] <= 1 for row in rows)
+    monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes[:3], "--proposals", "3"])
+    with pytest.raises(SystemExit) as stopped:
+        foresight.main()
+    assert stopped.value.code == 2
+    assert "at least 4 proposals are needed, got 3" in capsys.readouterr().err
