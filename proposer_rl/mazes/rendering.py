@@ -56,8 +56,11 @@ def draw_level(
     if path is not None:
         _draw_path(picture, torch.as_tensor(path).cpu(), cell)
     if agent is not None:
-        row, column = (int(place) for place in agent)
-        _draw_disc(picture, row, column, cell)
+        top, left = (int(place) * cell for place in agent)
+        offset = torch.arange(cell) - cell // 2
+        inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
+        square = picture[top : top + cell, left : left + cell]
+        square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)
     return picture
 
 
@@ -111,11 +114,3 @@ def _draw_path(picture: Tensor, path: Tensor, cell: int) -> None:
         top, left = (torch.minimum(here, there) - half).tolist()
         bottom, right = (torch.maximum(here, there) + half + 1).tolist()
         picture[top:bottom, left:right] = colour
-
-
-def _draw_disc(picture: Tensor, row: int, column: int, cell: int) -> None:
-    """Draws the agent in its cell; changes the picture."""
-    offset = torch.arange(cell) - cell // 2
-    inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
-    square = picture[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
-    square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)

@@ -227,7 +227,7 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _observe(self) -> Observation:
         """The mazes as they are now, arrays ``[n, ...]`` of their own."""
-        return {key: self._state[key].numpy().copy() for key in self.single_observation_space}
+        return {key: self._state[key].numpy().copy() for key in ("agent", "planes")}
 
     def _final(self) -> Info:
         """What Gymnasium's convention has in the info of mazes that were reset in the same step."""
