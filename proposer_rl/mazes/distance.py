@@ -117,7 +117,7 @@ def cells_at_depth(free: Tensor, source: Tensor, depth: Tensor) -> Tensor:
         depth: int64 ``[N]``, ascending, at least 1, on the CPU.
 
     Returns:
-        bool ``[H, W, N]``, True at the cells whose distance from the source is the maze's depth.
+        bool ``[H, W, N]``.
     """
     frontier, unvisited = _begin(free, source)
     spare = torch.zeros_like(frontier)
