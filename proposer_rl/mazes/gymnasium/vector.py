@@ -143,11 +143,12 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
         levels = self._given(chosen["level"]) if "level" in chosen else None
         which = self._mask(chosen.get("reset_mask"))
         if seed is not None:
-            one = isinstance(seed, int | np.integer)
-            seeds = [seed + i for i in range(self.num_envs)] if one else [*seed]
+            if isinstance(seed, int | np.integer):
+                seed = range(seed, seed + self.num_envs)
+            seeds = list(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed must be one or {self.num_envs} of them, got {len(seeds)}")
-            for i in which.nonzero()[0]:
+            for i in which.nonzero()[0].tolist():
                 if seeds[i] is not None:
                     self.set_random(i, seeding.np_random(seeds[i])[0])
         self._begin(which, levels)
