@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from gymnasium import register
 
-from proposer_rl.mazes.distance import distance_field, shortest_path_length
+from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.dynamics import successors
 from proposer_rl.mazes.env import MazeEnv
 from proposer_rl.mazes.generation import MECHANISMS, generate_levels
 from proposer_rl.mazes.levels import Level, LevelSpec, planes, validate_levels
-from proposer_rl.mazes.rendering import draw_grid, draw_level
+from proposer_rl.mazes.rendering import draw_level
 
 __all__ = [
     "MECHANISMS",
@@ -19,8 +19,6 @@ __all__ = [
     "LevelSpec",
     "MazeEnv",
     "SpecificationSpace",
-    "distance_field",
-    "draw_grid",
     "draw_level",
     "generate_levels",
     "planes",
