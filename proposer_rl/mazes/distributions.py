@@ -63,16 +63,10 @@ class LevelDistribution:
         return len(self.specifications)
 
     def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Looks specifications up.
-
-        Args:
-            index: int64 ``[*B]``, in 0 ... size - 1.
-
-        Returns:
-            Obstacle fractions, float64 ``[*B]``, and path lengths, int64 ``[*B]``.
+        """Obstacle fractions float64 ``[*B]`` and path lengths int64 ``[*B]`` of numbers ``[*B]``.
 
         Raises:
-            ValueError: If a number is out of range.
+            ValueError: If a number is not in 0 ... size - 1.
         """
         if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
             raise ValueError(
@@ -105,14 +99,11 @@ class LevelDistribution:
     def sample(
         self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Level:
-        """Draws levels of uniformly random specifications.
+        """Draws levels ``[*B]`` of uniformly random specifications.
 
         Args:
             batch_shape: ``[*B]``; a number for ``[B]``.
             generator: Source of randomness; None for the default one.
-
-        Returns:
-            Levels of batch shape ``[*B]``.
         """
         shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
         place = "cpu" if generator is None else generator.device
@@ -128,10 +119,7 @@ class SpecificationSpace(LevelDistribution):
     Args:
         obstacle_fractions: M distinct fractions in [0, 1).
         path_lengths: N distinct numbers of moves.
-        mechanism: As in :class:`LevelDistribution`.
-        height: H, cells.
-        width: W, cells.
-        device: Where the levels are returned.
+        mechanism, height, width, device: As in :class:`LevelDistribution`.
 
     Attributes:
         axes: The M fractions and N lengths, by name.

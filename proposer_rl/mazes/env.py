@@ -115,12 +115,6 @@ class MazeEnv(EnvBase):
 
         As TorchRL's, but without asking first whether there are any, which would wait for the
         device.
-
-        Args:
-            tensordict: The root of the next step, with the ends of the last one.
-
-        Returns:
-            The same with the reset of every maze that was done.
         """
         if self._waiting:
             return super().maybe_reset(tensordict)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -171,18 +171,14 @@ class _Task:
         self.wanted = spec_of.bincount(minlength=len(specs))  # [S]
         self.first = self.wanted.cumsum(0) - self.wanted  # of each specification in ``order``
         self.example = fraction[self.order[self.first]]
-        for spec in range(len(specs)):
-            self._check_necessary(spec)
+        self._check_necessary()
 
     def solve(self, generator: Generators, device: torch.device) -> Level:
         """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
         count, (height, width) = self.order.shape[0], self.grid
-        result = Level(
-            walls=torch.empty(count, height, width, dtype=torch.bool, device=device),
-            start=torch.empty(count, 2, dtype=torch.int64, device=device),
-            goal=torch.empty(count, 2, dtype=torch.int64, device=device),
-            batch_size=[count],
-        )
+        cells = torch.zeros(2, count, 2, dtype=torch.int64, device=device)
+        walls = torch.zeros(count, height, width, dtype=torch.bool, device=device)
+        result = Level(walls=walls, start=cells[0], goal=cells[1], batch_size=[count])
         drawn, accepted = torch.zeros_like(self.wanted), torch.zeros_like(self.wanted)
         filled = torch.zeros_like(self.wanted)
         while (filled < self.wanted).any():
@@ -220,33 +216,32 @@ class _Task:
         room = torch.empty_like(share).scatter_(0, self.by_group, chunk - before)
         return share.minimum(room.clamp(min=0))
 
-    def _check_necessary(self, spec: int) -> None:
+    def _check_necessary(self) -> None:
         """Refuses at once what no level can meet."""
         height, width = self.grid
-        obstacles, length = int(self.obstacles[spec]), int(self.length[spec])
-        free = height * width - obstacles
-        if free < length + 1:
-            self._refuse(spec, f"a path of {length} moves needs {length + 1} free cells of {free}")
-        if obstacles == 0 and length > height + width - 2:
+        free, farthest = height * width - self.obstacles, height + width - 2
+        for spec in (free <= self.length).nonzero().flatten():
+            moves = self.length[spec]
             self._refuse(
-                spec, f"without obstacles no two cells are over {height + width - 2} moves apart"
+                spec, f"a path of {moves} moves needs {moves + 1} free cells of {free[spec]}"
             )
+        for spec in ((self.obstacles == 0) & (self.length > farthest)).nonzero().flatten():
+            self._refuse(spec, f"without obstacles no two cells are over {farthest} moves apart")
 
     def _check_rarity(self, filled: Tensor, drawn: Tensor, accepted: Tensor) -> None:
         """Gives up on what is met less often than once in ``limit`` candidates."""
         hopeless = (filled < self.wanted) & (drawn > self.mechanism.limit * (accepted + 1))
-        if hopeless.any():
-            spec = int(hopeless.nonzero()[0])
+        for spec in hopeless.nonzero().flatten():
             self._refuse(
                 spec,
                 f"it is impossible or rarer than 1 in {self.mechanism.limit:,} candidates "
-                f"({int(accepted[spec])} met in {int(drawn[spec]):,})",
+                f"({accepted[spec]} met in {drawn[spec]:,})",
             )
 
-    def _refuse(self, spec: int, reason: str) -> None:
+    def _refuse(self, spec: Tensor, reason: str) -> NoReturn:
         height, width = self.grid
         raise ValueError(
             f"cannot make levels with obstacle_fraction={self.example[spec].item():g}, "
-            f"path_length={int(self.length[spec])} on a {height}x{width} grid "
-            f"({int(self.obstacles[spec])} obstacles, mechanism {self.name!r}): {reason}"
+            f"path_length={self.length[spec]} on a {height}x{width} grid "
+            f"({self.obstacles[spec]} obstacles, mechanism {self.name!r}): {reason}"
         )

@@ -124,17 +124,12 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
     """
     rows: list[dict[str, Number]] = []
     lines = _lines(Path(path))
-    header = next(lines, (0, ""))[1].split(",")
-    for number, line in lines:
+    header = next(lines, ("", ""))[1].split(",")
+    for place, line in lines:
         cells = line.split(",")
         if len(cells) != len(header):
-            raise ValueError(
-                f"{path}, line {number}: {len(cells)} cells under {len(header)} columns"
-            )
-        try:
-            rows.append(dict(zip(header, map(_number, cells), strict=True)))
-        except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}") from None
+            raise ValueError(f"{place}: {len(cells)} cells under {len(header)} columns")
+        rows.append({name: _number(place, cell) for name, cell in zip(header, cells, strict=True)})
     return rows
 
 
@@ -149,13 +144,13 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
         ValueError: if a line is not a JSON object.
     """
     rows = []
-    for number, line in _lines(Path(path)):
+    for place, line in _lines(Path(path)):
         try:
             row = json.loads(line)
         except (json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"{path}, line {number}: not JSON: {error}") from None
+            raise ValueError(f"{place}: not JSON: {error}") from None
         if not isinstance(row, dict):
-            raise ValueError(f"{path}, line {number}: not a JSON object: {line[:60]}")
+            raise ValueError(f"{place}: not a JSON object: {line[:60]}")
         rows.append(row)
     return rows
 
@@ -219,11 +214,11 @@ def _cell(path: Path, column: str, value: object) -> str:
     )
 
 
-def _number(text: str) -> Number:
+def _number(place: str, text: str) -> Number:
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
-    raise ValueError(f"{text!r} is not a number")
+    raise ValueError(f"{place}: {text!r} is not a number")
 
 
 def _json(path: Path, value: object, indent: int | None = None) -> str:
@@ -233,14 +228,14 @@ def _json(path: Path, value: object, indent: int | None = None) -> str:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yields each complete line with its number."""
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yields each complete line, after words that say where it is."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no table {path}")
     with open(path, "rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(b"\n"):
-                yield number, line[:-1].decode()
+                yield f"{path}, line {number}", line[:-1].decode()
 
 
 def _first_line(path: Path) -> str | None:
