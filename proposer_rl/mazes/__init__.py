@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from gymnasium import register
 
-from proposer_rl.mazes.distance import distance_field, shortest_path_length
+from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.dynamics import successors
 from proposer_rl.mazes.env import MazeEnv
-from proposer_rl.mazes.generation import MECHANISMS, check_specifications, generate_levels
+from proposer_rl.mazes.generation import MECHANISMS, generate_levels
 from proposer_rl.mazes.levels import Level, LevelSpec, planes, validate_levels
-from proposer_rl.mazes.rendering import draw_grid, draw_level
+from proposer_rl.mazes.rendering import draw_level
 
 __all__ = [
     "MECHANISMS",
@@ -19,9 +19,6 @@ __all__ = [
     "LevelSpec",
     "MazeEnv",
     "SpecificationSpace",
-    "check_specifications",
-    "distance_field",
-    "draw_grid",
     "draw_level",
     "generate_levels",
     "planes",
@@ -34,5 +31,5 @@ __all__ = [
 register(
     "proposer_rl/Maze-v0",
     entry_point="proposer_rl.mazes.gymnasium.env:MazeGymnasiumEnv",
-    vector_entry_point="proposer_rl.mazes.gymnasium.env:MazeVectorEnv",
+    vector_entry_point="proposer_rl.mazes.gymnasium.vector:MazeVectorEnv",
 )

@@ -16,44 +16,6 @@ from proposer_rl.mazes.levels import Level, cell_index
 _STEPS_BETWEEN_CHECKS = 8  # asking whether the frontier is empty waits for the device
 
 
-def distance_field(walls: Tensor, source: Tensor, limit: int | None = None) -> Tensor:
-    """Moves from a source cell to every cell.
-
-    Args:
-        walls: bool ``[*B, H, W]``, True where a cell is an obstacle.
-        source: int64 ``[*B, 2]``, row and column of a free cell.
-        limit: Largest distance to look for; None means no limit.
-
-    Returns:
-        int64 ``[*B, H, W]``: the least number of moves from the source, -1 for obstacles, for cells
-        that cannot be reached, and for cells beyond the limit.
-
-    Example:
-        >>> level = Level.from_text('''
-        ... S.#
-        ... #..
-        ... #.G
-        ... ''')
-        >>> distance_field(level.walls, level.start)
-        tensor([[ 0,  1, -1],
-                [-1,  2,  3],
-                [-1,  3,  4]])
-    """
-    height, width = walls.shape[-2:]
-    free = cells_first(~walls)
-    frontier, unvisited = _begin(free, cell_index(source, width).flatten())
-    distance = torch.full(free.shape, -1, dtype=torch.int32, device=walls.device)
-    distance.masked_fill_(frontier[1:-1, 1:-1], 0)
-    spare = torch.zeros_like(frontier)
-    for step in range(1, 1 + (height * width - 1 if limit is None else limit)):
-        _spread(frontier, spare, unvisited)
-        frontier, spare = spare, frontier
-        distance.masked_fill_(frontier[1:-1, 1:-1], step)
-        if step % _STEPS_BETWEEN_CHECKS == 0 and not frontier.any():
-            break
-    return distance.permute(2, 0, 1).long().reshape(walls.shape)
-
-
 def shortest_path_length(level: Level) -> Tensor:
     """Moves on the shortest path from start to goal.
 
@@ -117,7 +79,7 @@ def cells_at_depth(free: Tensor, source: Tensor, depth: Tensor) -> Tensor:
         depth: int64 ``[N]``, ascending, at least 1, on the CPU.
 
     Returns:
-        bool ``[H, W, N]``, True at the cells whose distance from the source is the maze's depth.
+        bool ``[H, W, N]``.
     """
     frontier, unvisited = _begin(free, source)
     spare = torch.zeros_like(frontier)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from proposer_rl.mazes.generation import check_specifications, generate_levels
+from proposer_rl.mazes.generation import generate_levels
 from proposer_rl.mazes.levels import Level, LevelSpec
 from proposer_rl.mazes.randomness import Generators
 
 
 class LevelDistribution:
     """Levels of specifications that are equally likely, numbered in their order.
+
+    Making one proves that every specification can be met: it draws a level of each, from a
+    generator of its own, so that it does not disturb any other random state.
 
     Args:
         specifications: Pairs (obstacle fraction, path length), at least one; see
@@ -51,7 +53,9 @@ class LevelDistribution:
         self.mechanism = mechanism
         self.height = height
         self.width = width
-        check_specifications(self.specifications, height, width, mechanism)
+        if not self.specifications:
+            raise ValueError("at least one specification is needed")
+        self.generate(torch.arange(self.size), torch.Generator().manual_seed(0))
 
     @property
     def size(self) -> int:
@@ -59,18 +63,16 @@ class LevelDistribution:
         return len(self.specifications)
 
     def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Looks specifications up.
-
-        Args:
-            index: int64 ``[*B]``, in 0 ... size - 1.
-
-        Returns:
-            Obstacle fractions, float64 ``[*B]``, and path lengths, int64 ``[*B]``.
+        """Obstacle fractions float64 ``[*B]`` and path lengths int64 ``[*B]`` of numbers ``[*B]``.
 
         Raises:
-            ValueError: If a number is out of range.
+            ValueError: If a number is not in 0 ... size - 1.
         """
-        self._check(index)
+        if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
+            raise ValueError(
+                f"specifications are numbered 0 to {self.size - 1}, "
+                f"got {int(index.min())} to {int(index.max())}"
+            )
         fractions, lengths = zip(*self.specifications, strict=True)
         return (
             torch.tensor(fractions, dtype=torch.float64, device=index.device)[index],
@@ -82,9 +84,7 @@ class LevelDistribution:
 
         Args:
             index: int64 ``[*B]``, in 0 ... size - 1.
-            generator: Source of randomness; None for the default one, a sequence for one of each
-                index of the first dimension (see
-                :func:`~proposer_rl.mazes.generation.generate_levels`).
+            generator: As in :func:`~proposer_rl.mazes.generation.generate_levels`.
 
         Returns:
             Levels ``[*B]``, in the order of the numbers.
@@ -99,26 +99,16 @@ class LevelDistribution:
     def sample(
         self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Level:
-        """Draws levels of uniformly random specifications.
+        """Draws levels ``[*B]`` of uniformly random specifications.
 
         Args:
             batch_shape: ``[*B]``; a number for ``[B]``.
             generator: Source of randomness; None for the default one.
-
-        Returns:
-            Levels of batch shape ``[*B]``.
         """
         shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
         place = "cpu" if generator is None else generator.device
         index = torch.randint(self.size, shape, generator=generator, device=place)
         return self.generate(index, generator)
-
-    def _check(self, index: Tensor) -> None:
-        if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
-            raise ValueError(
-                f"specifications are numbered 0 to {self.size - 1}, "
-                f"got {int(index.min())} to {int(index.max())}"
-            )
 
 
 class SpecificationSpace(LevelDistribution):
@@ -129,9 +119,10 @@ class SpecificationSpace(LevelDistribution):
     Args:
         obstacle_fractions: M distinct fractions in [0, 1).
         path_lengths: N distinct numbers of moves.
-        mechanism: As in :class:`LevelDistribution`.
-        height: H, cells.
-        width: W, cells.
+        mechanism, height, width, device: As in :class:`LevelDistribution`.
+
+    Attributes:
+        axes: The M fractions and N lengths, by name.
 
     Raises:
         ValueError: If an entry is repeated or a specification cannot be met.
@@ -153,15 +144,16 @@ class SpecificationSpace(LevelDistribution):
         width: int = 10,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.obstacle_fractions = _distinct("obstacle_fractions", obstacle_fractions)
-        self.path_lengths = _distinct("path_lengths", path_lengths)
-        pairs = list(product(self.obstacle_fractions, self.path_lengths))
+        axes = {"obstacle_fractions": obstacle_fractions, "path_lengths": path_lengths}
+        for name, values in axes.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} must be distinct, got {list(values)}")
+        self.axes: dict[str, Sequence[float]] = {
+            "obstacle fraction": tuple(obstacle_fractions),
+            "path length": tuple(path_lengths),
+        }
+        pairs = list(product(obstacle_fractions, path_lengths))
         super().__init__(pairs, mechanism, height, width, device)
-
-    @property
-    def axes(self) -> dict[str, Sequence[float]]:
-        """The M fractions and N lengths, by name."""
-        return {"obstacle fraction": self.obstacle_fractions, "path length": self.path_lengths}
 
     @property
     def coordinates(self) -> Tensor:
@@ -175,12 +167,3 @@ class SpecificationSpace(LevelDistribution):
             middle, reach = (axis.max() + axis.min()) / 2, (axis.max() - axis.min()) / 2
             axes.append((axis - middle) / reach.clamp(min=torch.finfo(axis.dtype).tiny))
         return torch.cartesian_prod(*axes)
-
-
-Entry = TypeVar("Entry", float, int)
-
-
-def _distinct(name: str, values: Sequence[Entry]) -> tuple[Entry, ...]:
-    if len(set(values)) < len(values):
-        raise ValueError(f"{name} must be distinct, got {list(values)}")
-    return tuple(values)

@@ -14,6 +14,8 @@ from proposer_rl.mazes.dynamics import MOVES, successors
 from proposer_rl.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
 from proposer_rl.mazes.rendering import draw_level
 
+ENDS = ("done", "terminated", "truncated")
+
 
 class MazeEnv(EnvBase):
     """A batch of mazes, one agent in each.
@@ -113,12 +115,6 @@ class MazeEnv(EnvBase):
 
         As TorchRL's, but without asking first whether there are any, which would wait for the
         device.
-
-        Args:
-            tensordict: The root of the next step, with the ends of the last one.
-
-        Returns:
-            The same with the reset of every maze that was done.
         """
         if self._waiting:
             return super().maybe_reset(tensordict)
@@ -128,7 +124,7 @@ class MazeEnv(EnvBase):
         after = tensordict.copy()
         after.set("agent", agent)
         after.set("step_count", tensordict.get("step_count") * ~done)
-        for key in ("done", "terminated", "truncated"):
+        for key in ENDS:
             after.set(key, torch.zeros_like(done))
         if self.observe_agent and "planes" in tensordict.keys():
             after.set("planes", self._observe(agent)["planes"])
@@ -158,51 +154,32 @@ class MazeEnv(EnvBase):
         """
         if mode not in ("rgb_array", "ansi"):
             raise ValueError(f"mode must be 'rgb_array' or 'ansi', got {mode!r}")
-        levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2).tolist()
+        levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
         if mode == "ansi":
-            texts = [
-                _mark(text, *agent) for text, agent in zip(levels.to_text(), agents, strict=True)
-            ]
-            return texts if self.batch_dims else texts[0]
+            places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character
+            texts = zip(levels.to_text(), places, strict=True)
+            marked = [f"{text[:place]}A{text[place + 1 :]}" for text, place in texts]
+            return marked if self.batch_dims else marked[0]
         pictures = [
-            draw_level(level, agent=at, cell=cell) for level, at in zip(levels, agents, strict=True)
+            draw_level(level, agent=agent.tolist(), cell=cell)
+            for level, agent in zip(levels, agents, strict=True)
         ]
         return torch.stack(pictures).reshape(*self.batch_size, *pictures[0].shape)
 
     def _make_specs(self) -> None:
-        batch, device, (height, width) = self.batch_size, self.device, self._grid
-        last_cell = torch.tensor([height - 1, width - 1], device=device).expand(*batch, 2)
+        batch, (height, width) = self.batch_size, self._grid
+        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
         self.observation_spec = Composite(
-            planes=Bounded(
-                0.0,
-                1.0,
-                shape=(*batch, 4 if self.observe_agent else 3, height, width),
-                dtype=torch.float32,
-                device=device,
-            ),
-            agent=Bounded(
-                torch.zeros_like(last_cell),
-                last_cell,
-                shape=(*batch, 2),
-                dtype=torch.int64,
-                device=device,
-            ),
-            step_count=Bounded(
-                0, self.max_steps, shape=(*batch, 1), dtype=torch.int64, device=device
-            ),
+            planes=Bounded(0.0, 1.0, (*batch, 3 + self.observe_agent, height, width)),
+            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
+            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
             shape=batch,
-            device=device,
-        )
-        self.action_spec = Categorical(len(MOVES), shape=batch, dtype=torch.int64, device=device)
-        self.reward_spec = Unbounded(shape=(*batch, 1), dtype=torch.float32, device=device)
-        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            done=flag,
-            terminated=flag.clone(),
-            truncated=flag.clone(),
-            shape=batch,
-            device=device,
-        )
+        ).to(self.device)
+        self.action_spec = Categorical(len(MOVES), shape=batch, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        flag = Binary(1, (*batch, 1), dtype=torch.bool, device=self.device)
+        ends = {key: flag.clone() for key in ENDS}
+        self.done_spec = Composite(ends, shape=batch, device=self.device)
 
     def _play(self, levels: Level) -> None:
         """Takes levels up and tabulates what a step needs of them."""
@@ -222,18 +199,10 @@ class MazeEnv(EnvBase):
         start = self._levels.start
         self._agent = start if mask is None else start.where(mask.unsqueeze(-1), self._agent)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
-        return TensorDict(
-            {
-                # Of these TorchRL takes over only the entries of the mazes that are reset.
-                **self._observe(start.clone()),
-                "step_count": none.long(),
-                "done": none,
-                "terminated": none.clone(),
-                "truncated": none.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+        ends = {key: none.clone() for key in ENDS}
+        # Of these TorchRL takes over only the entries of the mazes that are reset.
+        state = {**self._observe(start.clone()), "step_count": none.long(), **ends}
+        return TensorDict(state, self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         (height, width), action = self._grid, tensordict.get("action")
@@ -253,7 +222,7 @@ class MazeEnv(EnvBase):
                 "terminated": terminated,
                 "truncated": truncated,
             },
-            batch_size=self.batch_size,
+            self.batch_size,
             device=self.device,
         )
 
@@ -265,13 +234,6 @@ class MazeEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Does nothing: the environment draws nothing at random."""
-
-
-def _mark(text: str, row: int, column: int) -> str:
-    """Puts the agent into the text of a level."""
-    lines = [list(line) for line in text.split("\n")]
-    lines[row][column] = "A"
-    return "\n".join("".join(line) for line in lines)
 
 
 def _describe(batch: torch.Size, grid: torch.Size, device: torch.device) -> str:

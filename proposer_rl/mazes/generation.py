@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
 
-from proposer_rl.mazes.levels import Level, LevelSpec
+from proposer_rl.mazes.levels import Level
 from proposer_rl.mazes.path_first import draw_path_first
 from proposer_rl.mazes.randomness import Draws, Generators
 from proposer_rl.mazes.uniform import draw_uniform
 
-_Draw = Callable[[Tensor, Tensor, int, int, Draws], tuple[Tensor, Level]]
-
 
 class _Mechanism(NamedTuple):
-    draw: _Draw
+    draw: Callable[[Tensor, Tensor, int, int, Draws], tuple[Tensor, Level]]
     limit: int  # candidates per level after which a specification counts as impossible
     chunk: int  # candidates drawn at once on a CPU, so that the working set stays in its cache
     device_chunk: int  # the same on an accelerator, where few large launches are faster
@@ -82,60 +80,64 @@ def generate_levels(
         >>> shortest_path_length(levels)
         tensor([3, 5])
     """
-    target = _target_device(obstacle_fraction, path_length, generator, device)
-    fraction, length = _broadcast(obstacle_fraction, path_length)
     if mechanism not in _MECHANISMS:
         raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
     if height < 1 or width < 1:
         raise ValueError(f"a grid has at least one row and one column, got {height}x{width}")
+    source = generator[0] if isinstance(generator, Sequence) else generator
+    if device is None:
+        tensors = [x for x in (obstacle_fraction, path_length) if isinstance(x, Tensor)]
+        device = tensors[0].device if tensors else "cpu" if source is None else source.device
+    device = torch.device(device)
+    fraction, length = _specifications(obstacle_fraction, path_length)
+    shape, groups, group = fraction.shape, 1, torch.zeros_like(length)
+    if isinstance(generator, Sequence):
+        groups = len(generator)
+        if shape[:1] != (groups,):
+            raise ValueError(
+                f"{groups} generators need as many indices in the first dimension, "
+                f"got {list(shape)}"
+            )
+        group += torch.arange(groups).view(-1, *[1] * (len(shape) - 1))
+    levels: Any
     if isinstance(generator, Sequence) and not _MECHANISMS[mechanism].pools:
-        levels: Any = torch.stack(
-            [
-                generate_levels(f, n, height, width, mechanism, g, g.device)
-                for f, n, g in zip(fraction, length, generator, strict=True)
-            ]
+        each = zip(fraction, length, generator, strict=True)
+        levels = torch.stack(
+            [generate_levels(f, n, height, width, mechanism, g, g.device) for f, n, g in each]
         )
-        return upload(levels, target)
-    group, groups = _groups(fraction.shape, generator)
-    task = _Task(
-        fraction.flatten(), length.flatten(), group.flatten(), groups, height, width, mechanism
-    )
-    return upload(task.solve(generator, _place(generator, target)).reshape(fraction.shape), target)
-
-
-def upload(levels: Level, device: torch.device) -> Level:
-    """Moves levels to a device; to a GPU without waiting for what it is doing."""
+    else:
+        problems = (fraction.flatten(), length.flatten(), group.flatten(), groups)
+        task = _Task(*problems, height, width, mechanism)
+        levels = task.solve(generator, device if source is None else source.device).reshape(shape)
     if device.type == "cuda" and levels.walls.device.type == "cpu":
-        return levels.pin_memory().to(device, non_blocking=True)
+        return levels.pin_memory().to(device, non_blocking=True)  # without waiting for the GPU
     return levels.to(device)
 
 
-def check_specifications(
-    specifications: Iterable[tuple[float, int]],
-    height: int = 10,
-    width: int = 10,
-    mechanism: str = "uniform",
-) -> None:
-    """Proves that specifications can be met, by drawing one level of each.
-
-    Draws from a generator of its own, so that it does not disturb any other random state.
-
-    Args:
-        specifications: Pairs (obstacle fraction, path length); see :class:`LevelSpec`.
-        height: H, cells.
-        width: W, cells.
-        mechanism: As in :func:`generate_levels`.
-
-    Raises:
-        ValueError: As :func:`generate_levels`; also if there is no specification.
-    """
-    specs = [LevelSpec(*specification) for specification in specifications]
-    if not specs:
-        raise ValueError("at least one specification is needed")
-    fractions = torch.tensor([spec.obstacle_fraction for spec in specs], dtype=torch.float64)
-    lengths = torch.tensor([spec.path_length for spec in specs])
-    generator = torch.Generator().manual_seed(0)
-    generate_levels(fractions, lengths, height, width, mechanism, generator)
+def _specifications(
+    obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Both arguments as float64 and int64 tensors of one shape on the CPU, if they are in range."""
+    if isinstance(obstacle_fraction, Tensor):
+        obstacle_fraction = obstacle_fraction.detach().cpu()
+    fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
+    length = torch.as_tensor(path_length).cpu()
+    if length.is_floating_point() or length.dtype == torch.bool:
+        raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
+    try:
+        fraction, length = torch.broadcast_tensors(fraction, length.long())
+    except RuntimeError as error:
+        raise ValueError(
+            f"obstacle_fraction {list(fraction.shape)} and path_length {list(length.shape)} "
+            "must have shapes that broadcast"
+        ) from error
+    bad = ~((fraction >= 0) & (fraction < 1))
+    if bad.any():
+        value = fraction[bad][0].item()
+        raise ValueError(f"obstacle_fraction must be at least 0 and below 1, got {value:g}")
+    if (length < 1).any():
+        raise ValueError(f"path_length must be at least 1, got {int(length.min())}")
+    return fraction, length
 
 
 class _Task:
@@ -153,39 +155,34 @@ class _Task:
         groups: int,
         height: int,
         width: int,
-        mechanism: str,
+        name: str,
     ) -> None:
         self.grid = (height, width)
-        self.name = mechanism
-        self.mechanism = _MECHANISMS[mechanism]
-        obstacles = (fraction * (height * width)).round()
-        _check_range(fraction, length)
+        self.name = name
+        self.mechanism = _MECHANISMS[name]
+        obstacles = (fraction * (height * width)).round().long()
         base = height * width + 1
-        number = (length * base + obstacles.long()) * groups + group
+        number = (length * base + obstacles) * groups + group
         specs, spec_of = number.unique(return_inverse=True)
         specs, self.group = specs // groups, specs % groups  # [S]
         self.length, self.obstacles = specs // base, specs % base  # ascending in length
         self.by_group = self.group.argsort(stable=True)
         self.order = spec_of.argsort(stable=True)  # problems, grouped by specification
         self.wanted = spec_of.bincount(minlength=len(specs))  # [S]
-        self.first = self.wanted.cumsum(0) - self.wanted  # of each group in ``order``
+        self.first = self.wanted.cumsum(0) - self.wanted  # of each specification in ``order``
         self.example = fraction[self.order[self.first]]
-        for spec in range(len(specs)):
-            self._check_necessary(spec)
+        self._check_necessary()
 
     def solve(self, generator: Generators, device: torch.device) -> Level:
         """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
         count, (height, width) = self.order.shape[0], self.grid
-        result = Level(
-            walls=torch.empty(count, height, width, dtype=torch.bool, device=device),
-            start=torch.empty(count, 2, dtype=torch.int64, device=device),
-            goal=torch.empty(count, 2, dtype=torch.int64, device=device),
-            batch_size=[count],
-        )
+        cells = torch.zeros(2, count, 2, dtype=torch.int64, device=device)
+        walls = torch.zeros(count, height, width, dtype=torch.bool, device=device)
+        result = Level(walls=walls, start=cells[0], goal=cells[1], batch_size=[count])
         drawn, accepted = torch.zeros_like(self.wanted), torch.zeros_like(self.wanted)
         filled = torch.zeros_like(self.wanted)
         while (filled < self.wanted).any():
-            share = self._share(self.wanted - filled, drawn, accepted, device)
+            share = self._share(self.wanted - filled, drawn, accepted, device.type == "cpu")
             spec_of = torch.arange(len(share)).repeat_interleave(share)  # [C]
             draws = Draws(generator, self.group[spec_of], device)
             kept, level = self.mechanism.draw(
@@ -197,16 +194,14 @@ class _Task:
             slot = filled[spec_of] + rank
             used = slot < self.wanted[spec_of]
             problem = self.order[(self.first[spec_of] + slot)[used]].to(device)
-            _copy(level, used.to(device), result, problem)
+            result[problem] = level[used.to(device)]
             drawn += share
             accepted += found
             filled = torch.minimum(filled + found, self.wanted)
             self._check_rarity(filled, drawn, accepted)
         return result
 
-    def _share(
-        self, pending: Tensor, drawn: Tensor, accepted: Tensor, device: torch.device
-    ) -> Tensor:
+    def _share(self, pending: Tensor, drawn: Tensor, accepted: Tensor, on_cpu: bool) -> Tensor:
         """Candidates of each specification to draw next, as many as should fill what is pending.
 
         The estimated rate is that of a uniform prior (one success and one failure seen in
@@ -214,113 +209,39 @@ class _Task:
         """
         rate = (accepted + 1) / (drawn + 2)
         share = (1.1 * pending / rate).ceil().long() + 2 * (pending > 0)
-        on_cpu = device.type == "cpu"
         chunk = self.mechanism.chunk if on_cpu else self.mechanism.device_chunk
-        return share.minimum((chunk - self._before(share)).clamp(min=0))
-
-    def _before(self, share: Tensor) -> Tensor:
-        """Candidates of the specifications before each one of its group."""
         ordered, group = share[self.by_group], self.group[self.by_group]
         before = ordered.cumsum(0) - ordered
-        first = torch.searchsorted(group, group)  # where the group begins
-        return torch.empty_like(share).scatter_(0, self.by_group, before - before[first])
+        before -= before[torch.searchsorted(group, group)]  # only those of the same group
+        room = torch.empty_like(share).scatter_(0, self.by_group, chunk - before)
+        return share.minimum(room.clamp(min=0))
 
-    def _check_necessary(self, spec: int) -> None:
+    def _check_necessary(self) -> None:
         """Refuses at once what no level can meet."""
         height, width = self.grid
-        obstacles, length = int(self.obstacles[spec]), int(self.length[spec])
-        free = height * width - obstacles
-        if free < length + 1:
-            self._refuse(spec, f"a path of {length} moves needs {length + 1} free cells of {free}")
-        if obstacles == 0 and length > height + width - 2:
+        free, farthest = height * width - self.obstacles, height + width - 2
+        for spec in (free <= self.length).nonzero().flatten():
+            moves = self.length[spec]
             self._refuse(
-                spec, f"without obstacles no two cells are over {height + width - 2} moves apart"
+                spec, f"a path of {moves} moves needs {moves + 1} free cells of {free[spec]}"
             )
+        for spec in ((self.obstacles == 0) & (self.length > farthest)).nonzero().flatten():
+            self._refuse(spec, f"without obstacles no two cells are over {farthest} moves apart")
 
     def _check_rarity(self, filled: Tensor, drawn: Tensor, accepted: Tensor) -> None:
         """Gives up on what is met less often than once in ``limit`` candidates."""
         hopeless = (filled < self.wanted) & (drawn > self.mechanism.limit * (accepted + 1))
-        if hopeless.any():
-            spec = int(hopeless.nonzero()[0])
+        for spec in hopeless.nonzero().flatten():
             self._refuse(
                 spec,
                 f"it is impossible or rarer than 1 in {self.mechanism.limit:,} candidates "
-                f"({int(accepted[spec])} met in {int(drawn[spec]):,})",
+                f"({accepted[spec]} met in {drawn[spec]:,})",
             )
 
-    def _refuse(self, spec: int, reason: str) -> None:
+    def _refuse(self, spec: Tensor, reason: str) -> NoReturn:
         height, width = self.grid
         raise ValueError(
             f"cannot make levels with obstacle_fraction={self.example[spec].item():g}, "
-            f"path_length={int(self.length[spec])} on a {height}x{width} grid "
-            f"({int(self.obstacles[spec])} obstacles, mechanism {self.name!r}): {reason}"
+            f"path_length={self.length[spec]} on a {height}x{width} grid "
+            f"({self.obstacles[spec]} obstacles, mechanism {self.name!r}): {reason}"
         )
-
-
-def _copy(source: Level, mask: Tensor, destination: Level, index: Tensor) -> None:
-    """Writes the masked source levels to the indexed places."""
-    destination.walls[index] = source.walls[mask]
-    destination.start[index] = source.start[mask]
-    destination.goal[index] = source.goal[mask]
-
-
-def _check_range(fraction: Tensor, length: Tensor) -> None:
-    bad = ~((fraction >= 0) & (fraction < 1))
-    if bad.any():
-        value = fraction[bad][0].item()
-        raise ValueError(f"obstacle_fraction must be at least 0 and below 1, got {value:g}")
-    if (length < 1).any():
-        raise ValueError(f"path_length must be at least 1, got {int(length.min())}")
-
-
-def _broadcast(
-    obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
-) -> tuple[Tensor, Tensor]:
-    """Both arguments as float64 and int64 tensors of one shape on the CPU."""
-    if isinstance(obstacle_fraction, Tensor):
-        fraction = obstacle_fraction.detach().to("cpu", torch.float64)
-    else:
-        fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
-    length = torch.as_tensor(path_length).cpu()
-    if length.is_floating_point() or length.dtype == torch.bool:
-        raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
-    try:
-        fraction, length = torch.broadcast_tensors(fraction, length.long())
-    except RuntimeError as error:
-        raise ValueError(
-            f"obstacle_fraction {list(fraction.shape)} and path_length {list(length.shape)} "
-            "must have shapes that broadcast"
-        ) from error
-    return fraction, length
-
-
-def _groups(shape: torch.Size, generator: Generators) -> tuple[Tensor, int]:
-    """The number of each problem's generator, int64 ``[*B]`` on the CPU, and how many there are."""
-    if not isinstance(generator, Sequence):
-        return torch.zeros(shape, dtype=torch.int64), 1
-    count = len(generator)
-    if shape[:1] != (count,):
-        raise ValueError(
-            f"{count} generators need as many indices in the first dimension, got {list(shape)}"
-        )
-    return torch.arange(count).view(-1, *[1] * (len(shape) - 1)).expand(shape), count
-
-
-def _place(generator: Generators, otherwise: torch.device) -> torch.device:
-    """The generators' device."""
-    first = generator[0] if isinstance(generator, Sequence) else generator
-    return otherwise if first is None else first.device
-
-
-def _target_device(
-    obstacle_fraction: object,
-    path_length: object,
-    generator: Generators,
-    device: torch.device | str | None,
-) -> torch.device:
-    if device is not None:
-        return torch.device(device)
-    for argument in (obstacle_fraction, path_length):
-        if isinstance(argument, Tensor):
-            return argument.device
-    return _place(generator, torch.device("cpu"))

@@ -53,7 +53,7 @@ def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> N
     """Writes a file of levels; one that exists is replaced.
 
     Args:
-        path: A file whose name ends in ``.txt`` or ``.json``.
+        path: As in :func:`read_levels`.
         levels: Levels of batch shape ``[]`` by their names.
 
     Raises:

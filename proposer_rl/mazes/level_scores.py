@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.evaluation import ExactEvaluator, policy_path
@@ -84,18 +83,14 @@ def _scored(
     for k in range(len(copies)):
         for i, (name, length) in enumerate(named):
             results = {key: float(value[k, i]) for key, value in measured.items()}
-            path = _until_goal(paths[k, i], levels[i].goal)
+            away = (paths[k, i] != levels[i].goal).any(-1)
+            path = paths[k, i, : int(away.sum()) + 1].tolist()  # the goal is not left again
             moves = f"greedy {len(path) - 1}" if results["greedy_success"] else "greedy fails"
             about = {"height": height, "width": width, "path_length": length, "max_steps": limit}
             note = f"shortest {length}, {moves}"
-            yield Score(name, k, about, results, note, partial(_picture, levels[i], path))
+            picture = partial(_picture, levels[i], path)
+            yield Score(name, k, about, results, note, picture)
 
 
 def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:
     return draw_level(level, path).numpy()
-
-
-def _until_goal(path: Tensor, goal: Tensor) -> list[list[int]]:
-    """Cells that a path visits, up to the goal if it gets there."""
-    reached = (path == goal).all(-1).nonzero().flatten().tolist()
-    return path[: reached[0] + 1 if reached else None].tolist()

@@ -89,35 +89,14 @@ class Level(TensorClass):
 
 
 def planes(level: Level) -> Tensor:
-    """Encodes levels as binary planes.
-
-    Args:
-        level: Levels of batch shape ``[*B]``.
-
-    Returns:
-        float32 ``[*B, 3, H, W]``: obstacles, start, goal.
-    """
-    walls = level.walls
-    return torch.stack(
-        [
-            walls.float(),
-            cell_plane(level.start, walls.shape[-2:]),
-            cell_plane(level.goal, walls.shape[-2:]),
-        ],
-        dim=-3,
-    )
+    """Encodes levels ``[*B]`` as obstacles, start and goal: binary float32 ``[*B, 3, H, W]``."""
+    grid = level.walls.shape[-2:]
+    cells = (cell_plane(level.start, grid), cell_plane(level.goal, grid))
+    return torch.stack([level.walls.float(), *cells], dim=-3)
 
 
 def cell_plane(cell: Tensor, grid: Sequence[int]) -> Tensor:
-    """Draws one cell of a grid as a binary plane.
-
-    Args:
-        cell: int64 ``[*B, 2]``, row and column.
-        grid: Height and width.
-
-    Returns:
-        float32 ``[*B, H, W]``, 1 at the cell and 0 elsewhere.
-    """
+    """Draws cells int64 ``[*B, 2]``, row and column, as binary planes float32 ``[*B, H, W]``."""
     height, width = grid
     plane = torch.zeros(*cell.shape[:-1], height * width, device=cell.device)
     plane.scatter_(-1, cell_index(cell, width).unsqueeze(-1), 1.0)
@@ -158,10 +137,8 @@ def validate_levels(level: Level) -> None:
                 f"{name} must be int64 {[*batch, 2]}, got {cell.dtype} {list(cell.shape)}"
             )
         _refuse(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
-        _refuse(
-            walls.flatten(-2).gather(-1, cell_index(cell, width).unsqueeze(-1)),
-            f"{name} on an obstacle",
-        )
+        index = cell_index(cell, width).unsqueeze(-1)
+        _refuse(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
     _refuse((level.start == level.goal).all(-1), "start and goal on the same cell")
 
 
@@ -173,7 +150,6 @@ def _refuse(bad: Tensor, fault: str) -> None:
 
 
 def _parse(drawing: str) -> Level:
-    """Reads one drawing; see :meth:`Level.from_text`."""
     rows = drawing.split()
     flat = "".join(rows)
     if not rows or any(len(row) != len(rows[0]) for row in rows):

@@ -14,11 +14,7 @@ _CLOSED = 100  # added to a cell's count of carved neighbours: it can no longer 
 
 
 def draw_path_first(
-    obstacles: Tensor,
-    path_length: Tensor,
-    height: int,
-    width: int,
-    draws: Draws,
+    obstacles: Tensor, path_length: Tensor, height: int, width: int, draws: Draws
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those that meet their specification.
 
@@ -45,12 +41,6 @@ def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[
     """Random paths of which no two cells touch unless they are consecutive.
 
     A path goes on to a uniform choice among the cells whose only carved neighbour is its end.
-
-    Args:
-        path_length: int64 ``[C]``, moves.
-        height: H.
-        width: W.
-        draws: Random numbers of the candidates.
 
     Returns:
         path, int64 ``[D + 1, C]`` with D the longest length: numbers of the cells, the last one
@@ -84,22 +74,13 @@ def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[
 
 
 def _opening_order(path: Tensor, cells: int, draws: Draws) -> Tensor:
-    """Ranks the cells of each maze in a random order of opening, the path's own cells first.
+    """Ranks the cells of each maze in a random order of opening, those of its path first.
 
-    Args:
-        path: int64 ``[D + 1, N]``, numbers of the cells that are open already.
-        cells: H * W.
-        draws: Random numbers of the candidates.
-
-    Returns:
-        int32 ``[H*W, N]``, a permutation of 0 ... H*W - 1 in each column.
+    From int64 ``[D + 1, N]`` to int32 ``[H*W, N]``, a permutation of 0 ... H*W - 1 in each column.
     """
-    key = draws.rand(cells)
-    order = key.scatter_(0, path, -1.0).argsort(0)
-    ranks = torch.arange(cells, dtype=torch.int32, device=path.device)
-    return torch.empty_like(order, dtype=torch.int32).scatter_(
-        0, order, ranks.unsqueeze(1).expand_as(order)
-    )
+    order = draws.rand(cells).scatter_(0, path, -1.0).argsort(0)
+    ranks = torch.arange(cells, dtype=torch.int32, device=path.device).unsqueeze(1)
+    return torch.empty_like(order, dtype=torch.int32).scatter_(0, order, ranks.expand_as(order))
 
 
 def _open_cells(
@@ -146,14 +127,7 @@ def _shortcut_rank(rank: Tensor, start: Tensor, goal: Tensor, path_length: Tenso
     Lengths of walks between two cells of a grid differ by even numbers and a walk may go to and
     fro, so walks of exactly ``path_length - 2`` moves cover all of them.
 
-    Args:
-        rank: int32 ``[H, W, N]``.
-        start: int64 ``[N]``, number of the start cell.
-        goal: int64 ``[N]``, number of the goal cell.
-        path_length: int64 ``[N]`` on the CPU, ascending.
-
-    Returns:
-        int32 ``[N]``, the rank of the cell; ``_NEVER`` if there is none.
+    Takes what :func:`_open_cells` does; gives the cell's rank, int32 ``[N]``, or ``_NEVER``.
     """
     height, width, count = rank.shape
     reached = rank.new_full((height + 2, width + 2, count), _NEVER)

@@ -29,18 +29,12 @@ class Draws:
 
     def rand(self, rows: int) -> Tensor:
         """Uniform numbers in [0, 1), float32 ``[rows, C]``."""
-        return self._columns(
-            lambda count, generator: torch.rand(
-                rows, count, generator=generator, device=self.device
-            )
-        )
+        return self._columns(lambda n, g: torch.rand(rows, n, generator=g, device=self.device))
 
     def randint(self, high: int) -> Tensor:
         """Uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
         return self._columns(
-            lambda count, generator: torch.randint(
-                high, (1, count), generator=generator, device=self.device
-            )
+            lambda n, g: torch.randint(high, (1, n), generator=g, device=self.device)
         )
 
     def of(self, kept: Tensor) -> Draws:

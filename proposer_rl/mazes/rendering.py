@@ -56,50 +56,12 @@ def draw_level(
     if path is not None:
         _draw_path(picture, torch.as_tensor(path).cpu(), cell)
     if agent is not None:
-        row, column = (int(place) for place in agent)
-        _draw_disc(picture, row, column, cell)
+        top, left = (int(place) * cell for place in agent)
+        offset = torch.arange(cell) - cell // 2
+        inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
+        square = picture[top : top + cell, left : left + cell]
+        square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)
     return picture
-
-
-def draw_grid(
-    levels: Level,
-    paths: Sequence[Cells | None] | Tensor | None = None,
-    columns: int | None = None,
-    cell: int = 16,
-    gap: int = 8,
-) -> Tensor:
-    """Draws several levels side by side.
-
-    Args:
-        levels: Levels of batch shape ``[n]``, n at least 1.
-        paths: One path (or None) for each level.
-        columns: Levels in a row; None for all of them.
-        cell: Side of a cell in pixels.
-        gap: White pixels between levels.
-
-    Returns:
-        uint8 ``[H', W', 3]`` on the CPU.
-
-    Raises:
-        ValueError: If the levels are not ``[n]``, or the number of paths differs from n.
-    """
-    if levels.batch_dims != 1 or not len(levels):
-        raise ValueError(f"draw_grid takes levels [n], got {list(levels.batch_size)}")
-    count = len(levels)
-    if paths is not None and len(paths) != count:
-        raise ValueError(f"draw_grid takes one path for each of {count} levels, got {len(paths)}")
-    columns = min(columns or count, count)
-    tiles = [
-        draw_level(levels[i], None if paths is None else paths[i], cell=cell) for i in range(count)
-    ]
-    height, width = tiles[0].shape[:2]
-    rows = -(-count // columns)
-    shape = (rows * (height + gap) - gap, columns * (width + gap) - gap, 3)
-    sheet = torch.full(shape, 255, dtype=torch.uint8)
-    for i, tile in enumerate(tiles):
-        top, left = i // columns * (height + gap), i % columns * (width + gap)
-        sheet[top : top + height, left : left + width] = tile
-    return sheet
 
 
 def _draw_path(picture: Tensor, path: Tensor, cell: int) -> None:
@@ -111,11 +73,3 @@ def _draw_path(picture: Tensor, path: Tensor, cell: int) -> None:
         top, left = (torch.minimum(here, there) - half).tolist()
         bottom, right = (torch.maximum(here, there) + half + 1).tolist()
         picture[top:bottom, left:right] = colour
-
-
-def _draw_disc(picture: Tensor, row: int, column: int, cell: int) -> None:
-    """Draws the agent in its cell; changes the picture."""
-    offset = torch.arange(cell) - cell // 2
-    inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
-    square = picture[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
-    square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)

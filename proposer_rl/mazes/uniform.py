@@ -11,11 +11,7 @@ from proposer_rl.mazes.randomness import Draws
 
 
 def draw_uniform(
-    obstacles: Tensor,
-    path_length: Tensor,
-    height: int,
-    width: int,
-    draws: Draws,
+    obstacles: Tensor, path_length: Tensor, height: int, width: int, draws: Draws
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those in which the path length occurs.
 
@@ -36,30 +32,16 @@ def draw_uniform(
     free = ~walls.unflatten(0, (height, width))  # [H, W, C]
     goals = cells_at_depth(free, start, path_length).flatten(0, 1)  # [H*W, C]
     kept = goals.any(0).nonzero().squeeze(1)  # [A]
-    goals = goals.index_select(1, kept)
-    goal = _choose(goals, draws.of(kept).rand(1).squeeze(0))
+    marked = goals.index_select(1, kept).cumsum(0, dtype=torch.int32)  # up to and with each cell
+    # Equal parts of [0, 1) lead to each goal; rounding may make the product their whole number.
+    rank = (draws.of(kept).rand(1).squeeze(0) * marked[-1]).int().minimum(marked[-1] - 1)
+    goal = (marked <= rank).sum(0)
     return kept, Level(
         walls=walls.index_select(1, kept).t().unflatten(1, (height, width)),
         start=cell_position(start[kept], width),
         goal=cell_position(goal, width),
         batch_size=kept.shape,
     )
-
-
-def _choose(goals: Tensor, uniform: Tensor) -> Tensor:
-    """Chooses a marked cell of each maze.
-
-    Args:
-        goals: bool ``[H*W, A]``, with a True in every column.
-        uniform: Numbers in [0, 1), ``[A]``; equal parts of them lead to each marked cell.
-
-    Returns:
-        int64 ``[A]``, numbers of cells.
-    """
-    marked = goals.cumsum(0, dtype=torch.int32)  # up to and including each cell
-    # Rounding may make the product the whole number of marks.
-    rank = (uniform * marked[-1]).int().minimum(marked[-1] - 1)
-    return (marked <= rank).sum(0)
 
 
 def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
@@ -69,11 +51,6 @@ def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[
     3.4.2, algorithm S): a cell becomes one with probability (obstacles still needed) / (cells still
     left), which gives exactly the number asked for. They are drawn among all cells but the last;
     swapping that free cell with a uniform start cell makes the pair uniform.
-
-    Args:
-        obstacles: int64 ``[C]``, less than ``cells`` each.
-        cells: H * W.
-        draws: Random numbers of the candidates.
 
     Returns:
         walls, bool ``[H*W, C]``, and start, int64 ``[C]``.

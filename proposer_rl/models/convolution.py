@@ -20,10 +20,6 @@ class Conv3x3(nn.Conv2d):
     In bf16 on a CPU the library's weight gradient takes several times as long as its forward pass
     on maps of a few pixels with many channels. There it is computed as one matrix product instead;
     everything else, and every other case, is PyTorch's.
-
-    Args:
-        in_channels: channels of the input.
-        out_channels: channels of the output.
     """
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
@@ -54,9 +50,8 @@ class _ProductGradient(torch.autograd.Function):
         pixels = gradient.permute(0, 2, 3, 1).flatten(0, 2)  # [B * H * W, out]
         product = pixels.T.contiguous() @ _neighbourhoods(maps)  # [out, 9 * in]
         of_weight = product.unflatten(1, (3, 3, -1)).permute(0, 3, 1, 2)
-        of_maps = None
-        if ctx.needs_input_grad[0]:
-            of_maps = conv2d_input(maps.shape, weight, gradient, padding=1)
+        wanted = ctx.needs_input_grad[0]
+        of_maps = conv2d_input(maps.shape, weight, gradient, padding=1) if wanted else None
         return of_maps, of_weight, pixels.sum(0)
 
 

@@ -79,27 +79,19 @@ def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) 
     Returns:
         float [*B, A, H, W].
     """
+    batch, (height, width) = planes.shape[:-3], planes.shape[-2:]
     with torch.set_grad_enabled(gradients):
-        return _cell_logits(agent, planes)
-
-
-def _cell_logits(agent: ActorCritic, planes: Tensor) -> Tensor:
-    batch = planes.shape[:-3]
-    if agent.encoder is not None:
-        (planes_key,) = agent.level_keys
-        return agent.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
-    planes_key, agent_key = agent.step_keys
-    height, width = planes.shape[-2:]
-    number = torch.arange(height * width, device=planes.device)
-    positions = torch.stack([number // width, number % width], -1)  # [H * W, 2]
-    cells = []
-    for cell, position in enumerate(positions):
-        row, column = divmod(cell, width)
-        drawn = torch.zeros_like(planes[..., :1, :, :])
-        drawn[..., row, column].fill_(1.0)
-        step = {
-            planes_key: torch.cat([planes, drawn], -3),
-            agent_key: position.expand(*batch, 2),
-        }
-        cells.append(agent(TensorDict(step, batch))["logits"])
-    return torch.stack(cells, -1).unflatten(-1, (height, width))
+        if agent.encoder is not None:
+            (planes_key,) = agent.level_keys
+            return agent.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
+        planes_key, agent_key = agent.step_keys
+        logits = []
+        rows, columns = (torch.arange(side, device=planes.device) for side in (height, width))
+        for cell, position in enumerate(torch.cartesian_prod(rows, columns)):
+            row, column = divmod(cell, width)
+            drawn = torch.zeros_like(planes[..., :1, :, :])
+            drawn[..., row, column].fill_(1.0)
+            shown, at = torch.cat([planes, drawn], -3), position.expand(*batch, 2)
+            step = TensorDict({planes_key: shown, agent_key: at}, batch)
+            logits.append(agent(step)["logits"])
+        return torch.stack(logits, -1).unflatten(-1, (height, width))

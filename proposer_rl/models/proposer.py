@@ -25,10 +25,9 @@ class MapEncoder(nn.Sequential):
 
     def __init__(self, in_channels: int, channels: Sequence[int], features: int) -> None:
         layers: list[nn.Module] = []
-        for i, (fan_in, fan_out) in enumerate(
-            zip([in_channels, *channels], channels, strict=False)
-        ):
-            layers += [nn.Conv2d(fan_in, fan_out, 3, stride=2 if i else 1, padding=1), nn.ReLU()]
+        for fan_in, fan_out in zip([in_channels, *channels], channels, strict=False):
+            stride = 2 if layers else 1
+            layers += [nn.Conv2d(fan_in, fan_out, 3, stride, padding=1), nn.ReLU()]
         pooled = [nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels[-1], features)]
         super().__init__(*layers, *pooled)
 

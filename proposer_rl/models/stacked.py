@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -26,7 +26,8 @@ class Call(NamedTuple):
     def __call__(self, member: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Apply the network with one copy's parameters to its inputs."""
         parameters = dict(zip(self.names, member, strict=True))
-        with _autocast(self.precision, member[0].device):
+        low, device = self.precision == "bf16", member[0].device.type
+        with torch.autocast(device, torch.bfloat16) if low else nullcontext():
             outputs = functional_call(self.network, parameters, tuple(inputs))
         if isinstance(outputs, Tensor):
             outputs = (outputs,)
@@ -126,9 +127,3 @@ def _own_network(network: nn.Module) -> nn.Module:
     if own is None or own[0] is not network:
         own = _networks.of = (network, copy.deepcopy(network))
     return own[1]
-
-
-def _autocast(precision: str, device: torch.device) -> AbstractContextManager[Any]:
-    if precision == "fp32":
-        return nullcontext()
-    return torch.autocast(device.type, torch.bfloat16)

@@ -17,6 +17,7 @@ import json
 import logging
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -67,26 +68,31 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
         raise CheckpointError(f"step must be at least 0 and keep at least 1, got {step} and {keep}")
     folder = Path(folder)
     path = folder / f"step_{step:09d}.pt"
-    content = _encode(step, state)
-    later = _later_damaged(folder, step)
+    payload = io.BytesIO()
+    torch.save(_plain(state, "state"), payload)
+    body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()
+    later = [old for number, old in _files(folder) if number > step]
+    for old in later:  # all of them damaged, or else this run is not theirs
+        with suppress(_DamagedError):
+            _verified(old)
+            raise CheckpointError(
+                f"{old} is later than step {step}: resume from it, or use another folder"
+            )
     with storage(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for leftover in folder.glob(".step_*.pt.tmp"):
             leftover.unlink()
-    write_atomically(path, content)
+    write_atomically(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
     with storage(folder):
-        for damaged in later:
-            damaged.unlink()
-        for old in _files(folder)[:-keep]:
+        for old in later:
+            old.unlink()
+        for _, old in _files(folder)[:-keep]:
             old.unlink()
     return path
 
 
 def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
     """Reads the newest intact checkpoint; logs a warning for each damaged one that it passes over.
-
-    Args:
-        folder: where checkpoints lie.
 
     Returns:
         Its step and its state, tensors on the CPU; None if there is no checkpoint.
@@ -97,7 +103,7 @@ def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
         StorageError: if one cannot be read.
     """
     files = _files(Path(folder))
-    for path in reversed(files):
+    for _, path in reversed(files):
         try:
             return load_checkpoint(path)
         except _DamagedError as error:
@@ -109,9 +115,6 @@ def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
 
 def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
     """Reads one checkpoint.
-
-    Args:
-        path: its file.
 
     Returns:
         Its step and its state, tensors on the CPU.
@@ -136,14 +139,6 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
             f"the checkpoint {path} is refused by torch.load: {reason}"
         ) from error
     return step, state
-
-
-def _encode(step: int, state: State) -> bytes:
-    payload = io.BytesIO()
-    torch.save(_plain(state, "state"), payload)
-    header = json.dumps({"format": FORMAT, "step": step})
-    body = header.encode() + b"\n" + payload.getvalue()
-    return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
 def _plain(value: object, where: str) -> object:
@@ -183,27 +178,7 @@ def _verified(path: Path) -> tuple[int, int, bytes]:
         raise CheckpointError(f"{path} is not a checkpoint of proposer_rl") from None
 
 
-def _files(folder: Path) -> list[Path]:
-    """Returns the checkpoints in a folder, oldest step first."""
-    found = [path for path in folder.glob("step_*.pt") if _FILE_NAME.fullmatch(path.name)]
-    return sorted(found, key=_step_of)
-
-
-def _step_of(path: Path) -> int:
-    match = _FILE_NAME.fullmatch(path.name)
-    assert match is not None
-    return int(match[1])
-
-
-def _later_damaged(folder: Path, step: int) -> list[Path]:
-    """Returns the checkpoints of later steps, all damaged: a resumed run passed over them."""
-    later = [path for path in _files(folder) if _step_of(path) > step]
-    for path in later:
-        try:
-            _verified(path)
-        except _DamagedError:
-            continue
-        raise CheckpointError(
-            f"{path} is later than step {step}: resume from it, or use another folder"
-        )
-    return later
+def _files(folder: Path) -> list[tuple[int, Path]]:
+    """Returns the steps and files of the checkpoints in a folder, oldest step first."""
+    matches = [(_FILE_NAME.fullmatch(path.name), path) for path in folder.glob("step_*.pt")]
+    return sorted((int(match[1]), path) for match, path in matches if match)

@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import accumulate
 from pathlib import Path
 
 Number = int | float
@@ -29,9 +30,6 @@ class StorageError(OSError):
 
 class RunFolder:
     """The folder of one run; created, with its parents, if it does not exist.
-
-    Args:
-        path: the folder.
 
     Raises:
         StorageError: if it cannot be created.
@@ -57,20 +55,15 @@ class RunFolder:
         """
         path = self._table(name)
         with storage(path):
-            size = path.stat().st_size if path.exists() else 0
-            if size and not _ends_with_newline(path):
-                raise ValueError(f"{path} ends in the middle of a row; cut it back first")
-            lines = _new_lines(path, row, with_header=not size)
-            with open(path, "ab") as file:
-                file.write(lines.encode())
-                file.flush()
-                os.fsync(file.fileno())
-            if not size:
+            first = _first_line(path)
+            lines = _json(path, dict(row)) if path.suffix == ".jsonl" else _csv(path, row, first)
+            _write(path, "ab", (lines + "\n").encode())
+            if first is None:
                 _sync_folder(self.path)
 
     def lengths(self) -> dict[str, int]:
         """Returns the number of complete rows of each table in the folder, by file name."""
-        return {path.name: _count_rows(path) for path in self._tables()}
+        return {path.name: len(_row_ends(path)) for path in self._tables()}
 
     def cut_back(self, lengths: Mapping[str, int]) -> None:
         """Removes the rows that were added after ``lengths()`` returned ``lengths``.
@@ -78,36 +71,37 @@ class RunFolder:
         Tables without rows then, or that are not named, are deleted. All is checked before anything
         is changed, and a call that was interrupted can be repeated.
 
-        Args:
-            lengths: rows to keep of each table, by file name.
-
         Raises:
             ValueError: if a table has fewer rows than it should keep.
             StorageError: if a table cannot be changed.
         """
-        ends = {name: _end_of_row(self._table(name), rows) for name, rows in lengths.items()}
+        sizes = {}
+        for name, rows in lengths.items():
+            path = self._table(name)
+            ends = _row_ends(path) if path.is_file() else []
+            if len(ends) < rows:
+                raise ValueError(f"{path} has {len(ends)} rows, fewer than the {rows} to be kept")
+            sizes[name] = ends[rows - 1] if rows else 0
         for path in self._tables():
-            end = ends.get(path.name, 0)
+            size = sizes.get(path.name, 0)
             with storage(path):
-                if end == 0:
+                if size == 0:
                     path.unlink()
-                elif end < path.stat().st_size:
-                    _truncate(path, end)
+                elif size < path.stat().st_size:
+                    with open(path, "r+b") as file:
+                        file.truncate(size)
+                        os.fsync(file.fileno())
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
         """Writes a JSON file; whoever reads it sees the old content or the new, never a part.
-
-        Args:
-            name: the file's name.
-            value: whatever JSON can hold.
 
         Raises:
             ValueError: if the value cannot be written as JSON.
             StorageError: if the disk does not take it.
         """
         path = self.path / name
-        write_atomically(path, (_to_json(path, value, indent=2) + "\n").encode())
+        write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
 
     def _table(self, name: str) -> Path:
         if Path(name).name != name or Path(name).suffix not in (".csv", ".jsonl"):
@@ -128,9 +122,15 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
         FileNotFoundError: if there is no such table.
         ValueError: if a line is not a row of the table.
     """
+    rows: list[dict[str, Number]] = []
     lines = _lines(Path(path))
-    header = next(lines, (0, ""))[1].split(",")
-    return [_parse_row(f"{path}, line {number}", header, line) for number, line in lines]
+    header = next(lines, ("", ""))[1].split(",")
+    for place, line in lines:
+        cells = line.split(",")
+        if len(cells) != len(header):
+            raise ValueError(f"{place}: {len(cells)} cells under {len(header)} columns")
+        rows.append({name: _number(place, cell) for name, cell in zip(header, cells, strict=True)})
+    return rows
 
 
 def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
@@ -144,13 +144,13 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
         ValueError: if a line is not a JSON object.
     """
     rows = []
-    for number, line in _lines(Path(path)):
+    for place, line in _lines(Path(path)):
         try:
             row = json.loads(line)
         except (json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"{path}, line {number}: not JSON: {error}") from None
+            raise ValueError(f"{place}: not JSON: {error}") from None
         if not isinstance(row, dict):
-            raise ValueError(f"{path}, line {number}: not a JSON object: {line[:60]}")
+            raise ValueError(f"{place}: not a JSON object: {line[:60]}")
         rows.append(row)
     return rows
 
@@ -160,20 +160,13 @@ def write_atomically(path: Path, content: bytes) -> None:
 
     A crash leaves the old file as it was, and perhaps a ``.NAME.tmp``; an error leaves only it.
 
-    Args:
-        path: the file; an existing one is replaced.
-        content: what it shall hold.
-
     Raises:
         StorageError: if the disk cannot take it.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     with storage(path):
         try:
-            with open(temporary, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            _write(temporary, "wb", content)
             os.replace(temporary, path)
         except BaseException:
             # A full disk must not stay full of an attempt.
@@ -187,10 +180,6 @@ def write_atomically(path: Path, content: bytes) -> None:
 def storage(path: Path, action: str = "write") -> Iterator[None]:
     """Names the file in whatever error of the operating system arises inside.
 
-    Args:
-        path: the file or folder that is worked on.
-        action: what is done to it, a verb.
-
     Raises:
         StorageError: instead of any other OSError.
     """
@@ -200,32 +189,22 @@ def storage(path: Path, action: str = "write") -> Iterator[None]:
         raise StorageError(f"cannot {action} {path}: {error.strerror or error}") from error
 
 
-def _new_lines(path: Path, row: Mapping[str, object], with_header: bool) -> str:
-    if path.suffix == ".jsonl":
-        return _to_json(path, dict(row)) + "\n"
-    header = list(row) if with_header else _read_header(path)
-    if set(row) != set(header):
-        missing, unknown = sorted(set(header) - set(row)), sorted(set(row) - set(header))
+def _csv(path: Path, row: Mapping[str, object], header: str | None) -> str:
+    """A row as text, in the order of the header; with a header of its own if there is none yet."""
+    columns = list(row) if header is None else header.split(",")
+    if set(row) != set(columns):
+        missing, unknown = sorted(set(columns) - set(row)), sorted(set(row) - set(columns))
         raise ValueError(f"{path}: a row's columns differ: missing {missing}, unknown {unknown}")
-    line = ",".join(_format_cell(path, name, row[name]) for name in header) + "\n"
-    return _format_header(path, header) + line if with_header else line
-
-
-def _format_header(path: Path, header: list[str]) -> str:
-    for name in header:
+    if not columns:
+        raise ValueError(f"{path}: a row has no columns")
+    for name in columns if header is None else ():
         if not _PLAIN_NAME.fullmatch(name):
             raise ValueError(f"{path}: {name!r} cannot be a column: no commas, quotes, line breaks")
-    if not header:
-        raise ValueError(f"{path}: a row has no columns")
-    return ",".join(header) + "\n"
+    line = ",".join(_cell(path, name, row[name]) for name in columns)
+    return line if header is not None else ",".join(columns) + "\n" + line
 
 
-def _read_header(path: Path) -> list[str]:
-    with open(path, "rb") as file:
-        return file.readline().decode().rstrip("\n").split(",")
-
-
-def _format_cell(path: Path, column: str, value: object) -> str:
+def _cell(path: Path, column: str, value: object) -> str:
     if isinstance(value, float):
         return float.__repr__(value)  # the shortest text that reads back as the same number
     if isinstance(value, int) and not isinstance(value, bool):
@@ -235,71 +214,54 @@ def _format_cell(path: Path, column: str, value: object) -> str:
     )
 
 
-def _parse_row(where: str, header: list[str], line: str) -> dict[str, Number]:
-    cells = [_parse_number(where, text) for text in line.split(",")]
-    if len(cells) != len(header):
-        raise ValueError(f"{where}: {len(cells)} cells under {len(header)} columns")
-    return dict(zip(header, cells, strict=True))
+def _number(place: str, text: str) -> Number:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    raise ValueError(f"{place}: {text!r} is not a number")
 
 
-def _parse_number(where: str, text: str) -> Number:
-    try:
-        return int(text)
-    except ValueError:
-        pass
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{where}: {text!r} is not a number") from None
-
-
-def _to_json(path: Path, value: object, indent: int | None = None) -> str:
+def _json(path: Path, value: object, indent: int | None = None) -> str:
     try:
         return json.dumps(value, indent=indent)
     except TypeError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yields each complete line with its number."""
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yields each complete line, after words that say where it is."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no table {path}")
     with open(path, "rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(b"\n"):
-                yield number, line[:-1].decode()
+                yield f"{path}, line {number}", line[:-1].decode()
 
 
-def _ends_with_newline(path: Path) -> bool:
+def _first_line(path: Path) -> str | None:
+    """The first line of a table whose last one is complete; None if there is no line yet."""
+    if not path.exists() or not path.stat().st_size:
+        return None
     with open(path, "rb") as file:
+        first = file.readline()
         file.seek(-1, os.SEEK_END)
-        return file.read() == b"\n"
+        if file.read() != b"\n":
+            raise ValueError(f"{path} ends in the middle of a row; cut it back first")
+    return first.decode().rstrip("\n")
 
 
-def _count_rows(path: Path) -> int:
+def _row_ends(path: Path) -> list[int]:
+    """Where in a table each complete row ends, in bytes."""
     with open(path, "rb") as file:
-        lines = sum(line.endswith(b"\n") for line in file)
-    return max(lines - _header_lines(path), 0)
+        ends = list(accumulate(len(line) for line in file if line.endswith(b"\n")))
+    return ends[1:] if path.suffix == ".csv" else ends
 
 
-def _header_lines(path: Path) -> int:
-    return 1 if path.suffix == ".csv" else 0
-
-
-def _end_of_row(path: Path, rows: int) -> int:
-    """Returns the size in bytes of a table of which only the first rows are kept, 0 for no rows."""
-    if rows == 0:
-        return 0
-    found = _count_rows(path) if path.is_file() else 0
-    if found < rows:
-        raise ValueError(f"{path} has {found} rows, fewer than the {rows} to be kept")
-    with open(path, "rb") as file:
-        return sum(len(file.readline()) for _ in range(rows + _header_lines(path)))
-
-
-def _truncate(path: Path, size: int) -> None:
-    with open(path, "r+b") as file:
-        file.truncate(size)
+def _write(path: Path, mode: str, content: bytes) -> None:
+    """Writes to a file and waits until it is on the disk."""
+    with open(path, mode) as file:
+        file.write(content)
+        file.flush()
         os.fsync(file.fileno())
 
 

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from proposer_rl.mazes import Level, distance_field, shortest_path_length
+from proposer_rl.mazes import Level, shortest_path_length
+from proposer_rl.mazes.distance import cells_at_depth, cells_first
 from tests.mazes.oracles import distances, path_length, random_levels
 
 
@@ -13,21 +14,21 @@ from tests.mazes.oracles import distances, path_length, random_levels
 )
 def test_distances_agree_with_networkx(height: int, width: int, fraction: float) -> None:
     levels = random_levels(400, height, width, fraction, seed=height * width)
-    field = distance_field(levels.walls, levels.start)
     lengths = shortest_path_length(levels).tolist()
     assert -1 in lengths and max(lengths) > 1
-    for level, cells, length in zip(levels, field.tolist(), lengths, strict=True):
-        expected = distances(level)
-        assert cells == [[expected.get((r, c), -1) for c in range(width)] for r in range(height)]
+    for level, length in zip(levels, lengths, strict=True):
         assert length == path_length(level)
 
 
-def test_limit_hides_cells_further_away() -> None:
-    levels = random_levels(50, 8, 8, 0.3, seed=1)
-    full = distance_field(levels.walls, levels.start)
-    for limit in (0, 1, 5, 8):
-        limited = distance_field(levels.walls, levels.start, limit=limit)
-        assert torch.equal(limited, full.masked_fill(full > limit, -1))
+@pytest.mark.parametrize("depth", [1, 2, 5, 8])
+def test_cells_at_a_depth_agree_with_networkx(depth: int) -> None:
+    levels = random_levels(50, 8, 7, 0.3, seed=1)
+    source = levels.start[:, 0] * 7 + levels.start[:, 1]
+    found = cells_at_depth(cells_first(~levels.walls), source, torch.full((50,), depth))
+    assert found.any()
+    for level, cells in zip(levels, found.unbind(-1), strict=True):
+        expected = [cell for cell, distance in distances(level).items() if distance == depth]
+        assert sorted(map(tuple, cells.nonzero().tolist())) == sorted(expected)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])

@@ -12,7 +12,7 @@ from scipy.stats import chisquare
 from proposer_rl.mazes import (
     MECHANISMS,
     Level,
-    check_specifications,
+    LevelDistribution,
     generate_levels,
     shortest_path_length,
     validate_levels,
@@ -124,8 +124,8 @@ def test_without_a_generator_the_default_one_is_used() -> None:
 
 def test_checking_draws_nothing_from_the_default_generator() -> None:
     state = torch.get_rng_state()
-    check_specifications(BINS)
-    check_specifications([(0.5, 14)], mechanism="path_first")
+    LevelDistribution(BINS)
+    LevelDistribution([(0.5, 14)], "path_first")
     assert torch.equal(state, torch.get_rng_state())
 
 
@@ -145,7 +145,7 @@ def test_impossible_specifications_are_named(
     with pytest.raises(ValueError, match=message):
         generate_levels([0.0, fraction], [1, length], *grid, mechanism, seeded())
     with pytest.raises(ValueError, match=message):
-        check_specifications([(0.0, 1), (fraction, length)], *grid, mechanism)
+        LevelDistribution([(0.0, 1), (fraction, length)], mechanism, *grid)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_invalid_arguments_are_refused(arguments: dict[str, object], message: st
 
 def test_no_specification_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one"):
-        check_specifications([])
+        LevelDistribution([])
 
 
 def assert_distributed(levels: Level, expected: dict[str, float]) -> None:

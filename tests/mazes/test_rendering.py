@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from proposer_rl.mazes import Level, draw_grid, draw_level
+from proposer_rl.mazes import Level, draw_level
 from proposer_rl.mazes.rendering import (
     AGENT_COLOUR,
     FREE_COLOUR,
@@ -51,27 +51,9 @@ def test_agent_lies_within_its_cell() -> None:
     assert changed.amin(0).tolist() > [12, 12] and changed.amax(0).tolist() < [24, 24]
 
 
-def test_grid_tiles_levels_row_by_row() -> None:
-    levels = Level.from_text(["S.#\n..G", "G.#\n..S", "S..\nG##"])
-    paths = [None, [(0, 0), (0, 1)], None]
-    sheet = draw_grid(levels, paths, columns=2, cell=8, gap=3)
-    height, width = 17, 25
-    assert sheet.shape == (2 * height + 3, 2 * width + 3, 3)
-    corners = [(0, 0), (0, width + 3), (height + 3, 0)]
-    for level, path, (top, left) in zip(levels, paths, corners, strict=True):
-        tile = sheet[top : top + height, left : left + width]
-        assert torch.equal(tile, draw_level(level, path, cell=8))
-    assert (sheet[height + 3 :, width:] == 255).all() and (sheet[height : height + 3] == 255).all()
-    assert draw_grid(levels, cell=8, gap=3).shape == (height, 3 * width + 6, 3)
-
-
 def test_wrong_shapes_are_refused() -> None:
     levels = Level.from_text(["S.G", "G.S"])
     with pytest.raises(ValueError, match=r"\[2\]"):
         draw_level(levels)
     with pytest.raises(ValueError, match="3"):
         draw_level(levels[0], cell=3)
-    with pytest.raises(ValueError, match=r"\[\]"):
-        draw_grid(levels[0])
-    with pytest.raises(ValueError, match="2 levels, got 1"):
-        draw_grid(levels, [None])

@@ -17,7 +17,6 @@ from proposer_rl.learning import PPO, DivergedError, Update
 from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
-    Order,
     WorkersError,
     WorkerSettings,
     collect,
@@ -111,7 +110,7 @@ class CopiesInWorkers:
     ) -> tuple[TensorDictBase, Sequence[str | None]]:
         """The batch of all workers, [W, k, T], and what diverged in each."""
         if self._collector is None:
-            self._collector = start(self._settings, self._order())
+            self._collector = self._start()
         collector, every = self._collector, len(self._shares)
         # One block of memory each: across processes, every tensor costs a file descriptor.
         origin = solver.cpu().consolidate()
@@ -121,19 +120,16 @@ class CopiesInWorkers:
         collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
         return collect(collector), collector.get_distant_attr("env.diverged")
 
-    def _order(self) -> Order:
-        """What the workers are to be."""
-        settings, proposer = self._settings, self._proposer
-        horizon, threads = proposer.settings.horizon, torch.get_num_threads()
-        devices = [device for _, device in zip(self._shares, cycle(settings.devices), strict=False)]
-        agent = deepcopy(proposer.agent).cpu()
-        shape = self._env.full_action_spec[proposer.agent.action_key].shape[1:]
-        return Order(
-            [
-                partial(make_worker_env, self._make_env, share, device, threads)
-                for share, device in zip(self._shares, devices, strict=True)
-            ],
-            [partial(WorkerPolicy, agent, horizon, shape, device) for device in devices],
+    def _start(self) -> BaseCollector:
+        """Workers with an environment and a policy each."""
+        horizon, threads = self._proposer.settings.horizon, torch.get_num_threads()
+        agent = deepcopy(self._proposer.agent).cpu()
+        shape = self._env.full_action_spec[agent.action_key].shape[1:]
+        placed = list(zip(self._shares, cycle(self._settings.devices), strict=False))
+        return start(
+            self._settings,
+            [partial(make_worker_env, self._make_env, *place, threads) for place in placed],
+            [partial(WorkerPolicy, agent, horizon, shape, device) for _, device in placed],
             frames=len(self._shares[0]) * horizon,
             threads=threads,
         )
