@@ -93,7 +93,7 @@ def test_the_paths_that_are_recorded_are_legal(tmp_path: Path) -> None:
     for sample in samples:
         assert len(sample["levels"]) == P
         for item in sample["levels"]:
-            rows, path = item["text"], item["path"]
+            rows, path = [row.replace(" ", "") for row in item["text"]], item["path"]
             assert rows[path[0][0]][path[0][1]] == "S"
             assert all(rows[r][c] != "#" for r, c in path)
             assert all(abs(r - s) + abs(c - d) <= 1 for (r, c), (s, d) in pairwise(path))

@@ -59,7 +59,7 @@ class SolverTrainingEnv(EnvBase):
         actions: Actions,
         reward: Reward,
         meta_episode_length: int,
-        action_repeat: int,
+        action_repeat: int = 1,
         first_copy: int = 0,
         on_update: Callable[[], None] | None = None,
     ) -> None:
