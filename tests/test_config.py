@@ -73,11 +73,17 @@ WRONG = [
     ("solver.ppo.epochs=0", "solver.ppo.epochs=0: input should be greater than or equal to 1"),
     ("solver.ppo.horizon=0", "solver.ppo.horizon=0: input should be greater than or equal to 1"),
     ("task.network.channels=[]", "task.network.channels=[]: list should have at least 1 item"),
-    ("task.network.channels=[8,0]", "task.network.channels.1=0: input should be greater than or equal to 1"),
+    (
+        "task.network.channels=[8,0]",
+        "task.network.channels.1=0: input should be greater than or equal to 1",
+    ),
     ("task.network.groups=0", "task.network.groups=0: input should be greater than or equal to 1"),
     ("task.maze.height=0", "task.maze.height=0: input should be greater than or equal to 1"),
     ("task.maze.max_steps=0", "task.maze.max_steps=0: input should be greater than or equal to 1"),
-    ("task.maze.step_penalty=-1", "task.maze.step_penalty=-1: input should be greater than or equal to 0"),
+    (
+        "task.maze.step_penalty=-1",
+        "task.maze.step_penalty=-1: input should be greater than or equal to 0",
+    ),
     ("schedule.updates=0", "schedule.updates=0: input should be greater than or equal to 1"),
     ("schedule.threshold=1.5", "schedule.threshold=1.5: input should be less than or equal to 1"),
     ("schedule.evaluate_every=0", "evaluate_every=0: input should be greater than or equal to 1"),
@@ -88,13 +94,28 @@ WRONG = [
     ("proposer.probe_levels=-1", "probe_levels=-1: input should be greater than or equal to 0"),
     ("compute.threads=0", "compute.threads=0: input should be greater than or equal to 1"),
     ("compute.cores=0", "compute.cores=0: input should be greater than or equal to 1"),
-    ("task.evaluation.levels=0", "task.evaluation.levels=0: input should be greater than or equal to 1"),
+    (
+        "task.evaluation.levels=0",
+        "task.evaluation.levels=0: input should be greater than or equal to 1",
+    ),
     ("hand_made.until=[0]", "hand_made.until.0=0: input should be greater than or equal to 1"),
-    ("task.distributions.id.specifications=[]", "specifications=[]: list should have at least 1 item"),
+    (
+        "task.distributions.id.specifications=[]",
+        "specifications=[]: list should have at least 1 item",
+    ),
     ("task.distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
-    ("task.distributions.id.specifications=[[1,4]]", "specifications.0.0=1: input should be less than"),
-    ("task.distributions.id.specifications=[[0.4,0]]", "specifications.0.1=0: input should be greater"),
-    ("maze={height:10000,width:10000}", "task.maze.height=10000, maze.width=10000: must be at most 1,0"),
+    (
+        "task.distributions.id.specifications=[[1,4]]",
+        "specifications.0.0=1: input should be less than",
+    ),
+    (
+        "task.distributions.id.specifications=[[0.4,0]]",
+        "specifications.0.1=0: input should be greater",
+    ),
+    (
+        "maze={height:10000,width:10000}",
+        "task.maze.height=10000, maze.width=10000: must be at most 1,0",
+    ),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
     # one of a few
     ("compute.threads=5000", "compute.threads=5000: input should be less than or equal to 1024"),
@@ -104,38 +125,74 @@ WRONG = [
     ("compute.device=meta", "compute.device='meta': must be auto, cpu or a usable one"),
     ("logger=paper", "logger/paper: unknown; choose one of: csv, tensorboard, wandb"),
     ("logger.type=paper", "logger.type='paper': input should be 'csv', 'tensorboard' or 'wandb'"),
-    ("task.evaluation.evaluator=guess", "task.evaluation.evaluator='guess': input should be 'exact' or 'rollout'"),
+    (
+        "task.evaluation.evaluator=guess",
+        "task.evaluation.evaluator='guess': input should be 'exact' or 'rollout'",
+    ),
     ("proposer.advance=all", "proposer.advance='all': input should be "),
     ("proposer.action.spread=0", "proposer.action.spread=0: input should be greater than 0"),
     ("proposer.action.kind=golden", "proposer.action"),
-    ("task.distributions.id.mechanism=x", "mechanism='x': input should be 'uniform' or 'path_first'"),
+    (
+        "task.distributions.id.mechanism=x",
+        "mechanism='x': input should be 'uniform' or 'path_first'",
+    ),
     ("task.target=elsewhere", "task.target: must be among ['id', 'mix', 'ood'], got 'elsewhere'"),
-    ("task.evaluation.distributions=[far]", "task.evaluation.distributions: must be among ['id', 'mix'"),
+    (
+        "task.evaluation.distributions=[far]",
+        "task.evaluation.distributions: must be among ['id', 'mix'",
+    ),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
     ("sede=1", "Could not override 'sede'"),
     ("+sede=1", "sede: there is no such key; there are: ablation, checkpoint, collector"),
     ("+solver.x=1", "solver.x: there is no such key; there are: channels, groups"),
-    ("+task.distributions.id.x=1", "task.distributions.id.x: there is no such key; there are: mechanism"),
+    (
+        "+task.distributions.id.x=1",
+        "task.distributions.id.x: there is no such key; there are: mechanism",
+    ),
     ("seed", "Error parsing override 'seed' missing EQUAL"),
     ("seed=${nowhere}", "Interpolation key 'nowhere' not found"),
     ("seed=???", "Missing mandatory value: seed"),
-    ("compute.collector=spark", "compute.collector='spark': input should be 'single', 'multiprocess' or 'ray'"),
+    (
+        "compute.collector=spark",
+        "compute.collector='spark': input should be 'single', 'multiprocess' or 'ray'",
+    ),
     ("compute.workers=0", "compute.workers=0: input should be greater than or equal to 1"),
     ("compute.worker_devices=[]", "compute.worker_devices=[]: list should have at least 1 item"),
     # contradictions
-    ("compute.workers=2", "compute.workers=2: there are workers only with compute.collector=multiprocess"),
-    ("compute.worker_devices=[cpu]", "compute.worker_devices=['cpu']: there are workers only with compute.collector="),
-    ("compute.ray_address=auto", "compute.ray_address=auto: is of use only with compute.collector=ray"),
+    (
+        "compute.workers=2",
+        "compute.workers=2: there are workers only with compute.collector=multiprocess",
+    ),
+    (
+        "compute.worker_devices=[cpu]",
+        "compute.worker_devices=['cpu']: there are workers only with compute.collector=",
+    ),
+    (
+        "compute.ray_address=auto",
+        "compute.ray_address=auto: is of use only with compute.collector=ray",
+    ),
     ("task.maze.height=3", "task.network.channels=[64, 128, 256] halve a 3x10 maze to nothing"),
     ("task.network.channels=[64,64,64,8]", "with a single number on a 10x10 maze"),
     ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),
-    ("task.network.channels=[12]", "task.network.channels=[12] must be multiples of solver.groups=8"),
+    (
+        "task.network.channels=[12]",
+        "task.network.channels=[12] must be multiples of solver.groups=8",
+    ),
     ("proposer.ppo.horizon=3", "proposer.ppo.horizon=3 must equal proposer.meta_episode_length=50"),
-    ("proposer.updates_per_step=7", "updates_per_step=7 must divide proposer.meta_episode_length=50"),
-    ("task.space.path_lengths=[50]", "space: cannot make levels with obstacle_fraction=0, path_len"),
+    (
+        "proposer.updates_per_step=7",
+        "updates_per_step=7 must divide proposer.meta_episode_length=50",
+    ),
+    (
+        "task.space.path_lengths=[50]",
+        "space: cannot make levels with obstacle_fraction=0, path_len",
+    ),
     ("task.space.path_lengths=[2,2]", "space: path_lengths must be distinct, got [2, 2]"),
-    ("task.distributions.ood.specifications=[[0.9,12]]", "task.distributions.ood: cannot make levels with"),
+    (
+        "task.distributions.ood.specifications=[[0.9,12]]",
+        "task.distributions.ood: cannot make levels with",
+    ),
     # what a method is made of
     ("curriculum._target_=os.nothing", "curriculum: Error locating target 'os.nothing'"),
     ("curriculum._target_=os.system", "curriculum: Target 'os.system' is blocklisted"),
@@ -164,8 +221,14 @@ WRONG_COMMANDS = [
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
         "compute.workers=17 must be at most proposer.rollouts=16, the copies that they share",
     ),
-    (["+method=target", "compute.collector=ray"], "compute.collector=ray: target trains no copies of the Solver"),
-    (["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"], "'abacus': must"),
+    (
+        ["+method=target", "compute.collector=ray"],
+        "compute.collector=ray: target trains no copies of the Solver",
+    ),
+    (
+        ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],
+        "'abacus': must",
+    ),
     (["--experimental-rerun", "x.pickle"], "--experimental-rerun: not supported"),
 ]
 
@@ -230,7 +293,9 @@ def refused(train, capsys, *arguments: str) -> str:
 def test_a_resumed_run_with_other_settings_is_refused(finished: Path, train, capsys) -> None:
     copy_of(finished)
     line = refused(train, capsys, "solver.ppo.gamma=0.5", "task.maze.max_steps=9")
-    assert line.startswith("error: solver.ppo.gamma=0.5: the run in ") and "started with 0.99" in line
+    assert (
+        line.startswith("error: solver.ppo.gamma=0.5: the run in ") and "started with 0.99" in line
+    )
     assert line.endswith("differing keys: solver.ppo.gamma, task.maze.max_steps")
 
 

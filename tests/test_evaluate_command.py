@@ -41,7 +41,12 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of two Solvers that were trained side by side."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
-    settings = ["+scale=smoke", "compute.progress=false", "seeds=[3,5]", "task.evaluation.levels=40"]
+    settings = [
+        "+scale=smoke",
+        "compute.progress=false",
+        "seeds=[3,5]",
+        "task.evaluation.levels=40",
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             sys, "argv", ["train", "+method=target", *settings, f"hydra.run.dir={folder}"]
