@@ -74,7 +74,7 @@ class Cars:
     """Cars of some kinds; also the Proposer's space, whose bins are the kinds."""
 
     size = len(KINDS)
-    coordinates = (KINDS - KINDS.mean(0)) / KINDS.std(0)
+    coordinates = 2 * (KINDS - KINDS.amin(0)) / (KINDS.amax(0) - KINDS.amin(0)) - 1
 
     def __init__(self, kinds: Tensor) -> None:
         self.kinds = kinds

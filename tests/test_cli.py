@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from proposer_rl.cli.config import methods
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl

@@ -211,23 +211,23 @@ def _sheet(found: Evaluation) -> bytes:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bin/eval",
-        description="Evaluate a trained Solver on named levels, one by one. For mazes: on levels "
-        "of any size, success and return of the sampled and of the greedy policy, exactly.",
-        epilog="docs/levels.md describes the files of mazes and the sets that come along.",
+        description="Evaluate a trained Solver on named levels, one by one: as exactly as its task "
+        "can, on levels of any size where it has files of them.",
+        epilog="docs/levels.md describes such files and the sets that come along.",
     )
     parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")
     parser.add_argument(
         "--levels",
         metavar="FILE|NAME",
-        help="a distribution of the run such as id or ood; for mazes also a file that ends in .txt "
-        "or .json, or a set that comes along, such as shapes, which is the default",
+        help="a distribution of the run such as id or ood; where the task has files of levels also "
+        "one that ends in .txt or .json, or a set that comes along: shapes, the default there",
     )
     parser.add_argument(
         "--max-steps",
         type=_steps,
         metavar="N",
-        help="step limit of every level (mazes: the run's, or on levels that are none of a "
-        "distribution 2 for each move of the shortest path if this is more)",
+        help="step limit of every level, where the task lets it be chosen (the run's, or on levels "
+        "that are none of a distribution 2 for each move of the shortest path if this is more)",
     )
     parser.add_argument(
         "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"

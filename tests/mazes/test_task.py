@@ -177,7 +177,7 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
     assert set(named(TASK, "ID").values()) == {8}
     shapes = named(TASK, "shapes")
     assert shapes["corridor_8"] == 2 * 34 and min(shapes.values()) >= 8
-    with pytest.raises(ValueError, match="--levels mazes: must be a file that ends in .txt or"):
+    with pytest.raises(ValueError, match=r"--levels mazes: must be a file that ends in .txt or"):
         named(TASK, "mazes")
 
 

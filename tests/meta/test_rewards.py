@@ -46,7 +46,7 @@ def test_log_success_gain_is_the_increase_of_the_mean_logarithm() -> None:
 
 def test_log_success_needs_a_task_that_tells_success() -> None:
     only_return = performance(**{"return": [[1.0]]})
-    with pytest.raises(ValueError, match="tells no success.*take the reward performance_gain"):
+    with pytest.raises(ValueError, match=r"tells no success.*take the reward performance_gain"):
         log_success_gain(step(only_return, only_return))
 
 

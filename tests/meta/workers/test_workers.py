@@ -128,5 +128,5 @@ def test_shares_are_all_copies_in_ranges_of_one_length(copies: int) -> None:
 
 
 def test_no_more_workers_than_copies() -> None:
-    with pytest.raises(ValueError, match="compute.workers=4 must be at least 1 and at most 3"):
+    with pytest.raises(ValueError, match=r"compute.workers=4 must be at least 1 and at most 3"):
         make(workers("multiprocess", COPIES + 1))

@@ -1,0 +1,60 @@
+"""A task of another kind goes through the commands as mazes do."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from proposer_rl.runs.folder import read_csv, read_jsonl
+from tests.same_run import assert_same_run
+
+ROOT = Path(__file__).parents[1]
+TRAIN = [
+    *("-m", "proposer_rl.cli.train", "--config-dir", str(ROOT / "examples" / "conf")),
+    *("task=mountain_car", "+method=perf_gain", "compute.progress=false", "schedule.updates=10"),
+    *("proposer.meta_episode_length=4", "proposer.action_repeat=2", "proposer.rollouts=3"),
+    *("task.levels=8", "schedule.checkpoint_every=2"),
+]
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": f"{ROOT / 'examples'}{os.pathsep}{ROOT}",
+    "OMP_NUM_THREADS": "1",
+}
+
+
+def call(*arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *arguments], env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_it_trains_is_killed_goes_on_and_is_looked_at(tmp_path: Path) -> None:
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    call(*TRAIN, f"hydra.run.dir={whole}")
+    process = subprocess.Popen(
+        [sys.executable, *TRAIN, f"hydra.run.dir={run}"],
+        env=ENVIRONMENT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while not list(run.glob("checkpoints/*.pt")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    call(*TRAIN, f"hydra.run.dir={run}")
+    assert_same_run(whole, run)
+    assert {"target_success", "all_success"} <= read_csv(run / "metrics.csv")[-1].keys()
+    picture = read_jsonl(run / "curriculum.jsonl")[-1]["levels"][0]["picture"]
+    assert "gravity" in call("-m", "proposer_rl.cli.watch", str(run), "--once")
+    call("-m", "proposer_rl.cli.report", str(run), "-o", str(tmp_path / "report"))
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "mountain cars" in page and "maze" not in page.casefold()
+    assert picture in page

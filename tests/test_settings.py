@@ -1,0 +1,117 @@
+"""Every setting's default stands in two places that agree, and changing it changes numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+import pytest
+
+from proposer_rl.cli.build import parts
+from proposer_rl.cli.config import CONFIG_FOLDER
+from proposer_rl.curricula import ProposerCurriculum
+from proposer_rl.mazes.settings import MazeSettings
+from proposer_rl.runs.signals import StopSignals
+from proposer_rl.settings import (
+    ComputeSettings,
+    MixtureSettings,
+    ProblemSettings,
+    ProposerSettings,
+    Schedule,
+    SolverSettings,
+)
+from proposer_rl.streams import Streams
+from tests.tiny import composed
+
+ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))
+
+
+def test_the_papers_values_are_the_defaults_of_the_code() -> None:
+    config = composed("+method=perf_gain")
+    assert config.solver == SolverSettings()
+    assert config.proposer == ProposerSettings()
+    assert config.schedule == Schedule()
+    assert config.compute == ComputeSettings()
+    assert config.task["maze"] == asdict(MazeSettings())
+    problems = composed("+method=perf_gain", "proposer/action=problems")
+    assert problems.proposer.action == ProblemSettings()
+    assert config.proposer.action == MixtureSettings()
+
+
+@cache
+def first_cycle(*overrides: str) -> str:
+    """The numbers of a first cycle: what is written of it, what came of Solver and Proposer."""
+    config = composed("+method=perf_gain", "+scale=smoke", "compute.progress=false", *overrides)
+    learner, curriculum = parts(config, StopSignals())[1:]
+    assert isinstance(curriculum, ProposerCurriculum) and curriculum.trainer is not None
+    outcome = curriculum.improve(learner, 0, [Streams(0, "cycle", 0)])
+    levels = [
+        curriculum.propose(learner, update, [Streams(0, "update", update)]).levels.to_text()
+        for update in range(2)
+    ]
+    learnt: list[Any] = [
+        [entry.double().sum().item() for entry in ppo.snapshot().values(True, True)]
+        for ppo in (learner, curriculum.trainer.learner)
+    ]
+    return json.dumps([outcome.metrics, outcome.evaluations, levels, learnt])
+
+
+def test_the_same_settings_give_the_same_numbers() -> None:
+    again = first_cycle.__wrapped__()
+    assert again == first_cycle()
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_changes_the_first_cycle(ablation: str) -> None:
+    # Of one update no mixture of two bins can be told from another: three, and an action for each.
+    assert first_cycle(f"+ablation={ablation}") != first_cycle()
+
+
+EPISODE = "proposer.action_repeat=1"
+GAE = "proposer.advantage=gae"
+PROBLEMS = "proposer/action=problems"
+# Another value of every key, and the settings under which it has a meaning.
+KEYS = [
+    ("proposer.rollouts=3", []),
+    ("proposer.meta_episode_length=4", []),
+    ("proposer.action_repeat=1", []),
+    ("proposer.validation_levels=8", []),
+    ("proposer.probe_levels=1", []),
+    ("proposer.observes=[return]", []),
+    ("proposer.own_action=sample", []),
+    ("proposer.advance=best", []),
+    ("proposer.advantage=gae", []),
+    ("proposer.context=4", []),
+    ("proposer.hidden=4", []),
+    ("proposer.ppo.updates=2", []),
+    ("proposer.ppo.epochs=3", []),
+    ("proposer.ppo.learning_rate=0.01", []),
+    ("proposer.ppo.adam_eps=0.1", []),
+    ("proposer.ppo.gamma=0.5", [EPISODE]),
+    ("proposer.ppo.lmbda=0.1", [EPISODE, GAE]),
+    ("proposer.ppo.clip_epsilon=0.001", ["proposer.ppo.learning_rate=0.1"]),
+    ("proposer.ppo.entropy_coeff=0.5", []),
+    ("proposer.ppo.critic_coeff=0.1", [GAE]),
+    ("proposer.ppo.max_grad_norm=0.001", []),
+    ("proposer.ppo.normalize_advantage=false", []),
+    ("proposer.action.spread=0.5", []),
+    ("proposer.action.ratio=joint", [PROBLEMS, "proposer.ppo.learning_rate=0.1"]),
+    ("proposer.action.bands=3", [PROBLEMS]),
+]
+
+
+@pytest.mark.parametrize(("change", "under"), KEYS, ids=[change for change, _ in KEYS])
+def test_every_key_of_the_proposer_changes_the_first_cycle(change: str, under: list[str]) -> None:
+    assert first_cycle(*under, change) != first_cycle(*under)
+
+
+def test_no_key_of_the_proposer_is_forgotten() -> None:
+    tried = {change.partition("=")[0] for change, _ in KEYS}
+    for kind in ("mixture", "problems"):
+        proposer = asdict(composed("+method=perf_gain", f"proposer/action={kind}").proposer)
+        nested = {key: proposer.pop(key) for key in ("ppo", "action")}
+        names = {f"proposer.{key}" for key in proposer}
+        names |= {f"proposer.{key}.{inner}" for key, value in nested.items() for inner in value}
+        assert names - {"proposer.action.kind"} <= tried
