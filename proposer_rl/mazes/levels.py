@@ -143,9 +143,7 @@ def validate_levels(level: Level) -> None:
 
 
 def _refuse(bad: Tensor, fault: str) -> None:
-    """Raises ValueError where any entry of a bool tensor is set."""
-    count = int(bad.sum())
-    if count:
+    if count := int(bad.sum()):
         raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
 
 

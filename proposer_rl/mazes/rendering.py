@@ -54,7 +54,12 @@ def draw_level(
     picture[:-1, :-1] = colours.repeat_interleave(cell, 0).repeat_interleave(cell, 1)
     picture[::cell] = picture[:, ::cell] = torch.tensor(LINE_COLOUR, dtype=torch.uint8)
     if path is not None:
-        _draw_path(picture, torch.as_tensor(path).cpu(), cell)
+        centre = torch.as_tensor(path).cpu() * cell + cell // 2  # [T, 2]
+        half = max(cell // 10, 1)
+        for here, there in zip(centre, torch.cat([centre[1:], centre[-1:]]), strict=True):
+            top, left = (torch.minimum(here, there) - half).tolist()
+            bottom, right = (torch.maximum(here, there) + half + 1).tolist()
+            picture[top:bottom, left:right] = torch.tensor(PATH_COLOUR, dtype=torch.uint8)
     if agent is not None:
         top, left = (int(place) * cell for place in agent)
         offset = torch.arange(cell) - cell // 2
@@ -62,14 +67,3 @@ def draw_level(
         square = picture[top : top + cell, left : left + cell]
         square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)
     return picture
-
-
-def _draw_path(picture: Tensor, path: Tensor, cell: int) -> None:
-    """Connects the centres of successive cells; changes the picture."""
-    centre = path * cell + cell // 2  # [T, 2]
-    half = max(cell // 10, 1)
-    colour = torch.tensor(PATH_COLOUR, dtype=torch.uint8)
-    for here, there in zip(centre, torch.cat([centre[1:], centre[-1:]]), strict=True):
-        top, left = (torch.minimum(here, there) - half).tolist()
-        bottom, right = (torch.maximum(here, there) + half + 1).tolist()
-        picture[top:bottom, left:right] = colour

@@ -46,11 +46,7 @@ def apply_batched(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """All copies in each kernel (convolutions become grouped ones): few launches, for a GPU."""
-
-    def one(member: tuple[Tensor, ...], slices: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return call(member, slices)
-
-    return vmap(one)(tuple(stacked), tuple(inputs))
+    return vmap(lambda *copy: call(*copy))(tuple(stacked), tuple(inputs))
 
 
 def apply_on_cores(
