@@ -23,9 +23,9 @@ from proposer_rl.curricula import (
     ScheduleCurriculum,
 )
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
+from proposer_rl.meta import rewards
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.rewards import Reward, log_success_gain
 from proposer_rl.meta.view import SolverView
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import (
@@ -107,7 +107,7 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
 
 
 def proposer(
-    parts: Parts, reward: Reward = log_success_gain, loss: MakeLoss | None = None
+    parts: Parts, reward: rewards.Reward = rewards.log_success_gain, loss: MakeLoss | None = None
 ) -> ProposerCurriculum:
     """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
 
@@ -142,6 +142,17 @@ def proposer(
         make_env = partial(_worker_env, make_task, chosen, streams, reward)
         copies = CopiesInWorkers(learner, make_env, settings)
     return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
+
+
+def task_difficulty(parts: Parts) -> ProposerCurriculum:
+    """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
+
+    The paper's ablation; no other reward can be put in its place.
+
+    Args:
+        parts: the task, and the Proposer's settings.
+    """
+    return proposer(parts, rewards.task_difficulty)
 
 
 def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
@@ -235,7 +246,7 @@ def _meta_env(
     task: Task,
     chosen: ProposerSettings,
     streams: Streams,
-    reward: Reward,
+    reward: rewards.Reward,
     share: range,
     on_update: Callable[[], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
@@ -257,7 +268,7 @@ def _worker_env(
     make_task: Callable[[str], Task],
     chosen: ProposerSettings,
     streams: Streams,
-    reward: Reward,
+    reward: rewards.Reward,
     *,
     share: range,
     device: str,

@@ -106,7 +106,7 @@ def make_task(config: RunConfig) -> Task:
         torch.set_num_threads(compute.threads)
     place = Place(device, config.precision, compute.cores)
     try:
-        task = make_in_place(task_maker(config), config.solver, place)
+        task = make_in_place(task_maker(config.task), config.solver, place)
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
     return recorded(task) if compute.graphs else task
@@ -225,7 +225,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     )
     place = Place(precision=task.precision, cores=cores)
     make: Callable[[str], Any] = partial(
-        _make_in_worker, task_maker(config), config.solver, place, compute.graphs
+        _make_in_worker, task_maker(config.task), config.solver, place, compute.graphs
     )
     return Workers(settings, make)
 

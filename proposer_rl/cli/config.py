@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 from hydra.errors import HydraException
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from proposer_rl.runs.folder import storage
@@ -104,24 +105,28 @@ def read_config(config: DictConfig) -> RunConfig:
     if config.method is None or config.curriculum is None:
         names = ", ".join(methods())
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {names}")
-    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    values = _resolved(config)
     for key, value in _leaves(values):
         if isinstance(value, int | float) and abs(value) > LARGEST:
             raise ConfigError(f"{key}={value!r}: must be finite and at most {LARGEST:,} in size")
+    if isinstance(values["task"], dict):  # before what is made of its values elsewhere
+        task_maker(values["task"])
     checked = _validated(RunConfig, values)
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
-    task_maker(checked)
     return checked
 
 
-def task_maker(config: RunConfig) -> TaskMaker:
+def task_maker(settings: Mapping[str, Any]) -> TaskMaker:
     """What makes the task, with its settings checked against the types that its maker asks for.
+
+    Args:
+        settings: ``task`` of the configuration.
 
     Raises:
         ConfigError: if there is no such maker, naming the first wrong key.
     """
-    values = dict(config.task)
+    values = dict(settings)
     target = values.pop("_target_", None)
     if not isinstance(target, str):
         raise ConfigError("task._target_: missing: the class or function that makes the task")
@@ -202,6 +207,26 @@ def check_order(overrides: Sequence[str]) -> None:
 def methods() -> list[str]:
     """Names of the methods in the configuration folder."""
     return sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
+
+
+def _resolved(config: DictConfig) -> Any:
+    """Plain values, with what they refer to put in its place.
+
+    Raises:
+        ConfigError: naming a value that is missing or refers to none.
+    """
+    try:
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        # Its key; where a value is missing, that one rather than those that refer to it.
+        leaves = _leaves(OmegaConf.to_container(config))
+        for key, value in sorted(leaves, key=lambda leaf: leaf[1] != "???"):
+            try:
+                OmegaConf.select(config, key, throw_on_missing=True)
+            except OmegaConfBaseException as found:
+                reason = "missing" if value == "???" else str(found).splitlines()[0]
+                raise ConfigError(f"{key}={value}: {reason}") from error
+        raise ConfigError(str(error)) from error
 
 
 def _validated(model: Any, values: Any, prefix: str = "") -> Any:

@@ -14,7 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
@@ -62,7 +62,7 @@ def _main(hydra_config: DictConfig) -> float:
     signals = StopSignals()
     try:
         forget_failure(path)
-        check_order(HydraConfig.get().overrides.task)
+        check_order(_overrides())
         config = read_config(hydra_config)
         made = parts(config, signals)  # whatever is wrong with the input is found here
         with locked(path), signals:
@@ -76,6 +76,11 @@ def _main(hydra_config: DictConfig) -> float:
         if exit_code(error) != UNFORESEEN:
             refuse(error)
         raise
+
+
+def _overrides() -> list[str]:
+    """As given on the command line: what they refer to is the run's, not Hydra's own."""
+    return list(map(str, OmegaConf.to_container(HydraConfig.get().overrides.task)))
 
 
 def _refuse_pickles(arguments: list[str]) -> None:
@@ -164,7 +169,7 @@ def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
 
 
 def _how_to_go_on(folder: RunFolder) -> str:
-    again = shlex.join([*HydraConfig.get().overrides.task, f"hydra.run.dir={folder.path}"])
+    again = shlex.join([*_overrides(), f"hydra.run.dir={folder.path}"])
     return f"To go on: bin/train {again}"
 
 

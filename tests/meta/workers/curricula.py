@@ -57,7 +57,7 @@ def make(
     elsewhere: WorkerSettings | None, reward: Reward = performance_gain, *overrides: str
 ) -> tuple[Task, ProposerCurriculum]:
     settings = config(*overrides)
-    maker, solver = task_maker(settings), settings.solver
+    maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
         return make_in_place(maker, solver, Place(torch.device(device)))
