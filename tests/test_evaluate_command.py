@@ -123,7 +123,8 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
         (["{run}", "-o", "rows.txt"], "--output rows.txt: must end in .json or .csv"),
         (["{run}", "-o", "no/rows.csv"], "--output no/rows.csv: there is no folder no"),
         (["{run}", "--pictures", "a.jpg"], "--pictures a.jpg: must end in .png"),
-        (["{run}", "--max-steps", "0"], "must be from 1 to 100,000, got 0"),
+        (["{run}", "--max-steps", "0"], "must be at least 1, got 0"),
+        (["{run}", "--max-steps", "100001"], "must be from 1 to 100,000, got 100001"),
         (["{run}", "--max-steps", "many"], "invalid"),
     ],
 )
@@ -147,7 +148,7 @@ def test_checkpoints_that_do_not_fit_are_refused(run: Path, tmp_path: Path, eval
     for solver in ({}, {**state["solver"], "more": state["solver"]}, 3):
         save_checkpoint(checkpoints, step, {**state, "solver": solver})
         code, said = evaluate(tmp_path / "run")
-        assert code == 2 and "holds no Solver with the network of its config.json" in said
+        assert code == 2 and "holds no Solver with the network of its run's" in said
     damaged = next(checkpoints.glob("*.pt"))
     damaged.write_bytes(damaged.read_bytes()[:-9])
     code, said = evaluate(damaged)

@@ -59,8 +59,11 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: holds no checkpoints"),
-        (["{run}", "--explorations", "all"], "--explorations: must be among even, problems"),
-        (["{run}", "--output", "no/where/snr.json"], "--output: there is no folder no/where"),
+        (["{run}", "--explorations", "all"], "argument --explorations: invalid choice: 'all'"),
+        (
+            ["{run}", "--output", "no/where/snr.json"],
+            "--output no/where/snr.json: there is no folder no/where",
+        ),
         (["{run}", "--copies", "1", "--explorations", "even"], "at least 2 proposals and 2 copies"),
         (["{run}", "--levels", "0"], "must be at least 1, got 0"),
     ],
@@ -79,11 +82,11 @@ def test_look_shows_every_stage_and_what_changes(run: Path, tmp_path: Path, caps
     for row in rows:
         assert sum(map(sum, row["shares"])) == pytest.approx(1)
         assert 0 <= row["distance"] <= 1
-        assert 2 <= row["path_length"] <= 4 and 0 <= row["obstacle_fraction"] <= 0.2
+        assert 2 <= row["path length"] <= 4 and 0 <= row["obstacle fraction"] <= 0.2
     assert all(row["distance"] == 0 for row in asis)
     # The first stage cannot be shown its own probes, nor the last its own.
     assert [row["seen"] for row in rows if row["updates"] == 4] == [
-        "as it is", "probes of the last", "validation_return of the last",
+        "as it is", "probes of the last", "log_success of the last",
     ]  # fmt: skip
     assert "as it is" in capsys.readouterr().out
 
@@ -106,7 +109,7 @@ def test_folders_of_something_else_are_refused(tmp_path: Path, run: Path, capsys
         (tmp_path / "config.json").write_text(json.dumps({**settings, **change}))
         assert call(look, str(tmp_path), str(run)) == 2
         assert message in capsys.readouterr().err
-    del settings["maze"]
+    del settings["task"]
     (tmp_path / "config.json").write_text(json.dumps(settings))
     assert call(look, str(tmp_path), str(run)) == 2
-    assert "maze: missing" in capsys.readouterr().err
+    assert "task: missing" in capsys.readouterr().err

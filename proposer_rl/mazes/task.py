@@ -275,6 +275,8 @@ class MazeTask:
     def _named_levels(self, name: str) -> tuple[dict[str, Level], int]:
         """Levels, and the steps that they allow for each move of the shortest path."""
         if Path(name).suffix in SUFFIXES:
+            if not Path(name).exists():
+                raise ValueError(f"--levels {name}: there is no such file")
             return read_levels(name), SLACK
         for distribution in self.distributions:
             if name.casefold() == distribution.casefold():

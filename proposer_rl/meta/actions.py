@@ -63,6 +63,14 @@ class ProblemChoices(Actions):
 
     The P draws are independent, so that all batches of one policy look alike: the composition of
     a batch varies by about 1 / sqrt(P) only.
+
+    Example:
+        Of a space only the number of its bins is asked, until levels are generated:
+
+        >>> from types import SimpleNamespace
+        >>> choices = ProblemChoices(SimpleNamespace(size=4))
+        >>> choices.draw(torch.tensor([[0, 3, 3]]), 3, [torch.Generator()])
+        tensor([[0, 3, 3]])
     """
 
     def spec(self, copies: int, batch_size: int, device: torch.device) -> TensorSpec:
@@ -91,6 +99,17 @@ class Mixture(Actions):
 
     Raises:
         ValueError: if ``directions`` is no finite matrix with a column for every bin.
+
+    Example:
+        Three bins along one axis, and an action that prefers its upper end:
+
+        >>> from types import SimpleNamespace
+        >>> space = SimpleNamespace(size=3, coordinates=torch.tensor([[-1.0], [0.0], [1.0]]))
+        >>> mixture = Mixture(space)
+        >>> mixture.shares(torch.tensor([[2.0]]))
+        tensor([[0.0159, 0.1173, 0.8668]])
+        >>> mixture.draw(torch.tensor([[0.0]]), 6, [torch.Generator()])[0].bincount()
+        tensor([2, 2, 2])
     """
 
     def __init__(self, space: Space, directions: Tensor | None = None) -> None:

@@ -51,6 +51,9 @@ class CopiesInWorkers:
         self._make_env = make_env
         self._settings = settings
         self._shares = shares(self._env.batch_size[0], settings.workers)
+        # Of each copy its place, [K], among those of all workers: in the first that has it.
+        every = [copy for share in self._shares for copy in share]
+        self._first = [every.index(copy) for copy in range(self._env.batch_size[0])]
         self._collector: BaseCollector | None = None
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
@@ -89,15 +92,19 @@ class CopiesInWorkers:
     def trained(self, copy: int) -> Trained:
         """See :meth:`~proposer_rl.meta.copies.Copies.trained`.
 
-        In the means over all copies, those that two workers have in common count twice.
+        Metrics that are told of every copy are means over the copies, the others over the workers.
         """
         assert self._collector is not None, "there has been no episode"
         orders = [(copy,)] * len(self._shares)
         reports: list[Report] = self._collector.map_fn("env.report", orders)
         own = next(report.copy for report in reports if report.copy)
-        metrics = TensorDict.stack([report.metrics for report in reports]).mean(0)
+        steps = TensorDict.stack([report.gradient_steps for report in reports], 1)  # [S, W(, k)]
+        metrics = {
+            key: (taken.flatten(1)[:, self._first] if taken.ndim == 3 else taken).mean()
+            for key, taken in steps.items()
+        }
         solver, levels, rollout = (entry.to(self._env.device) for entry in own)
-        return Trained(solver, levels, Update(rollout, metrics))
+        return Trained(solver, levels, Update(rollout, TensorDict(metrics)))
 
     def close(self) -> None:
         """End the workers; the next episode starts others."""
@@ -136,8 +143,7 @@ class CopiesInWorkers:
 
     def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
         """The rollout [K, T] of all copies, each from the first worker that has it."""
-        at = {copy: i for i, copy in reversed([*enumerate(c for s in self._shares for c in s)])}
-        rollout: Any = rollouts.flatten(0, 1)[[at[copy] for copy in sorted(at)]]
+        rollout: Any = rollouts.flatten(0, 1)[self._first]
         rollout = rollout.exclude("collector").to(self._env.device)
         rollout.names = [None, "time"]
         return rollout

@@ -18,12 +18,13 @@ class Report(NamedTuple):
     """What a worker tells of the last update of an episode, on the CPU.
 
     Attributes:
-        metrics: of the training, means over the worker's copies.
+        gradient_steps: of the training, [S]: what each step was like, for each of the worker's k
+            copies [S, k] where told.
         copy: snapshot, levels and rollout of the copy that was asked for, each with a first
             dimension of one; nothing from a worker that does not have it.
     """
 
-    metrics: TensorDictBase
+    gradient_steps: TensorDictBase
     copy: tuple[Any, ...]
 
 
@@ -45,12 +46,13 @@ class WorkerEnv(SolverTrainingEnv):
 
     def report(self, copy: int) -> Report:
         """Tell of the last update, and all of one copy if it is here."""
-        levels, (rollout, metrics) = self.last_training
+        levels, (rollout, _) = self.last_training
+        steps = self.solvers.gradient_steps.cpu().consolidate()
         if copy not in self._copies:
-            return Report(metrics.cpu(), ())
+            return Report(steps, ())
         here = [copy - self._copies.start]
         solver = self.solvers.snapshot()[here].cpu().consolidate()
-        return Report(metrics.cpu(), (solver, levels[here].cpu(), rollout[here].cpu()))
+        return Report(steps, (solver, levels[here].cpu(), rollout[here].cpu()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:

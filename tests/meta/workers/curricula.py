@@ -88,6 +88,7 @@ def cycles(
         for value in metrics.values():
             numbers += value if isinstance(value, list) else [] if value is None else [value]
         numbers += update.rollout["next", "state_value"].flatten().tolist()
+        numbers += [float(update.metrics[name]) for name in ("loss_critic", "grad_norm")]
         between()
     for learner in (solver, curriculum.trainer.learner):
         for entry in learner.snapshot().values(True, True):

@@ -100,7 +100,7 @@ def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None
     started: list[int] = []
     curriculum.trainer.env.on_update = lambda: checked.append(1)
 
-    def start(*_: object) -> None:
+    def start(*_: object, **__: object) -> None:
         started.append(1)
         raise RuntimeError("Traceback of the worker\nof many lines\nit fell off")
 
