@@ -140,7 +140,7 @@ def _command(run: Run) -> str | None:
     if not isinstance(overrides, list) or not isinstance(arguments, dict):
         return None
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
-    own = ("seed=", "seeds=", "hydra.", "+sweep=", "progress=")
+    own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
     words = [word for word in overrides if not (isinstance(word, str) and word.startswith(own))]
     if not all(
         isinstance(word, str) and word.isprintable() and len(word) <= LONGEST_WORD
