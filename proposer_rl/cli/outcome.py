@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 from rich.console import Console
 from tqdm import tqdm
 
@@ -28,6 +29,11 @@ def run_name(config: RunConfig) -> str:
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
+def overrides() -> list[str]:
+    """As given on the command line: what they refer to is the run's, not Hydra's own."""
+    return list(map(str, OmegaConf.to_container(HydraConfig.get().overrides.task)))
+
+
 def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     """What the run is, and what it is made with: method, seeds, machine, versions."""
     device = experiment.task.device
@@ -40,7 +46,7 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "ablation": config.ablation,
         "seed": config.seed,
         "seeds": config.seeds,
-        "overrides": list(HydraConfig.get().overrides.task),
+        "overrides": overrides(),
         "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
         "solver_parameters": parameters,
         "device": f"{device.type} {name}".strip(),

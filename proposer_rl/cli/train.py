@@ -14,14 +14,14 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.errors import SIGNALLED, UNFORESEEN, command, exit_code, one_line, refuse
-from proposer_rl.cli.outcome import announce, identity, run_name
+from proposer_rl.cli.outcome import announce, identity, overrides, run_name
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.experiment import Experiment
@@ -62,7 +62,7 @@ def _main(hydra_config: DictConfig) -> float:
     signals = StopSignals()
     try:
         forget_failure(path)
-        check_order(_overrides())
+        check_order(overrides())
         config = read_config(hydra_config)
         made = parts(config, signals)  # whatever is wrong with the input is found here
         with locked(path), signals:
@@ -76,11 +76,6 @@ def _main(hydra_config: DictConfig) -> float:
         if exit_code(error) != UNFORESEEN:
             refuse(error)
         raise
-
-
-def _overrides() -> list[str]:
-    """As given on the command line: what they refer to is the run's, not Hydra's own."""
-    return list(map(str, OmegaConf.to_container(HydraConfig.get().overrides.task)))
 
 
 def _refuse_pickles(arguments: list[str]) -> None:
@@ -169,7 +164,7 @@ def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
 
 
 def _how_to_go_on(folder: RunFolder) -> str:
-    again = shlex.join([*_overrides(), f"hydra.run.dir={folder.path}"])
+    again = shlex.join([*overrides(), f"hydra.run.dir={folder.path}"])
     return f"To go on: bin/train {again}"
 
 
