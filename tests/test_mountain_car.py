@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from signal import SIGKILL
 
 import pytest
 
@@ -18,12 +19,7 @@ TRAIN = [
     *("-m", "proposer_rl.cli.train", "--config-dir", str(ROOT / "examples" / "conf")),
     *("task=mountain_car", "+method=perf_gain", "compute.progress=false", "schedule.updates=6"),
     *("proposer.meta_episode_length=2", "proposer.action_repeat=1", "proposer.rollouts=2"),
-    *(
-        "task.levels=8",
-        "proposer.validation_levels=8",
-        "solver.ppo.horizon=10",
-        "schedule.checkpoint_every=2",
-    ),
+    *("task.levels=8", "solver.ppo.horizon=10", "schedule.checkpoint_every=2"),
 ]
 ENVIRONMENT = os.environ | {
     "PYTHONPATH": f"{ROOT / 'examples'}{os.pathsep}{ROOT}",
@@ -53,7 +49,7 @@ def test_it_trains_is_killed_goes_on_and_is_looked_at(tmp_path: Path) -> None:
         assert process.poll() is None
         time.sleep(0.01)
     process.kill()
-    process.wait()
+    assert process.wait() == -SIGKILL
     call(*TRAIN, f"hydra.run.dir={run}")
     assert_same_run(whole, run)
     assert {"target_success", "all_success"} <= read_csv(run / "metrics.csv")[-1].keys()
