@@ -80,7 +80,7 @@ def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> Non
 
 def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> None:
     for seed, override in [(0, "cores=1"), (1, "cores=1"), (2, "cores=2")]:
-        overrides = ["+method=target", f"seed={seed}", override, "progress=false"]
+        overrides = ["+method=target", f"seed={seed}", override, "compute.progress=false"]
         write_run(tmp_path / str(seed), "target", [seed], facts={"overrides": overrides})
     (study,), _ = read(tmp_path)
     assert commands(study) == [
