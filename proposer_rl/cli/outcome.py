@@ -31,7 +31,8 @@ def run_name(config: RunConfig) -> str:
 
 def overrides() -> list[str]:
     """As given on the command line: what they refer to is the run's, not Hydra's own."""
-    return list(map(str, OmegaConf.to_container(HydraConfig.get().overrides.task)))
+    given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
+    return list(given)
 
 
 def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
