@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import subprocess
 import sys
@@ -60,10 +59,10 @@ def test_it_trains_is_killed_goes_on_and_is_looked_at(tmp_path: Path) -> None:
     call("-m", "proposer_rl.cli.report", str(run), "-o", str(tmp_path / "report"))
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "mountain cars" in page and "maze" not in page.casefold()
-    for figure in ("levels", "samples"):
-        file = tmp_path / "report" / "figures" / f"{figure}.svg"
-        assert base64.b64encode(file.read_bytes()).decode() in page
-        drawn = np.asarray(Image.open(file.with_suffix(".png")).convert("RGB")).astype(int)
+    for figure, heading in (("levels", "Cars along training"), ("samples", "Sample cars")):
+        assert heading in page
+        file = tmp_path / "report" / "figures" / f"{figure}.png"
+        drawn = np.asarray(Image.open(file).convert("RGB")).astype(int)
         # The valley's ground and its top, in the task's own colours.
         ground, top = (np.abs(drawn - c).max(-1) <= 3 for c in ((250, 250, 250), (230, 159, 0)))
         assert ground.mean() > 0.1 and top.any()
