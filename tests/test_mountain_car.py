@@ -9,9 +9,11 @@ import time
 from pathlib import Path
 from signal import SIGKILL
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from proposer_rl.runs.folder import read_csv, read_jsonl
+from proposer_rl.runs.folder import read_csv
 from tests.same_run import assert_same_run
 
 ROOT = Path(__file__).parents[1]
@@ -53,9 +55,14 @@ def test_it_trains_is_killed_goes_on_and_is_looked_at(tmp_path: Path) -> None:
     call(*TRAIN, f"hydra.run.dir={run}")
     assert_same_run(whole, run)
     assert {"target_success", "all_success"} <= read_csv(run / "metrics.csv")[-1].keys()
-    picture = read_jsonl(run / "curriculum.jsonl")[-1]["levels"][0]["picture"]
     assert "gravity" in call("-m", "proposer_rl.cli.watch", str(run), "--once")
     call("-m", "proposer_rl.cli.report", str(run), "-o", str(tmp_path / "report"))
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "mountain cars" in page and "maze" not in page.casefold()
-    assert picture in page
+    for figure, heading in (("levels", "Cars along training"), ("samples", "Sample cars")):
+        assert heading in page
+        file = tmp_path / "report" / "figures" / f"{figure}.png"
+        drawn = np.asarray(Image.open(file).convert("RGB")).astype(int)
+        # The valley's ground and its top, in the task's own colours.
+        ground, top = (np.abs(drawn - c).max(-1) <= 3 for c in ((250, 250, 250), (230, 159, 0)))
+        assert ground.mean() > 0.1 and top.any()
