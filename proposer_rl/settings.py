@@ -170,6 +170,33 @@ class Schedule:
 
 
 @settings
+class HandMadeSettings:
+    """A curriculum by hand.
+
+    Attributes:
+        distributions: of the task, in order.
+        until: updates after which each but the last ends.
+    """
+
+    distributions: list[str]
+    until: list[Annotated[int, Ge(1)]]
+
+
+@settings
+class LoggerSettings:
+    """Where rows of metrics go besides the run's folder.
+
+    Attributes:
+        type: ``csv`` for nowhere.
+        project, mode: of Weights & Biases.
+    """
+
+    type: Literal["csv", "tensorboard", "wandb"]
+    project: str = "proposer_rl"
+    mode: Literal["online", "offline", "disabled"] = "online"
+
+
+@settings
 class ComputeSettings:
     """Where and how a run is computed, which changes no numbers beyond rounding.
 

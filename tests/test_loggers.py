@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from proposer_rl.cli.config import ConfigError, LoggerSettings
+from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.loggers import make_log, require_logger
+from proposer_rl.settings import LoggerSettings
 from tests.report.folders import LEVEL, PIXELS, cycle, write_run
 
 

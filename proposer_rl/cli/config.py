@@ -16,7 +16,14 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ComputeSettings, ProposerSettings, Schedule, SolverSettings
+from proposer_rl.settings import (
+    ComputeSettings,
+    HandMadeSettings,
+    LoggerSettings,
+    ProposerSettings,
+    Schedule,
+    SolverSettings,
+)
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # In a wheel the configuration lies in the package, in a checkout beside it.
@@ -41,25 +48,6 @@ class ConfigError(ValueError):
     """The configuration is wrong; the message is one line."""
 
     exit_code = 2
-
-
-class HandMadeSettings(BaseModel):
-    """A curriculum by hand: distributions of the task, and the updates after which each ends."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    distributions: list[str]
-    until: list[Annotated[int, Field(ge=1)]]
-
-
-class LoggerSettings(BaseModel):
-    """Where rows of metrics go besides the run's folder."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    type: Literal["csv", "tensorboard", "wandb"]
-    project: str = "proposer_rl"
-    mode: Literal["online", "offline", "disabled"] = "online"
 
 
 class RunConfig(BaseModel):

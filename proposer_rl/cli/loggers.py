@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torchrl.record.loggers import get_logger
 
-from proposer_rl.cli.config import ConfigError, LoggerSettings
+from proposer_rl.cli.config import ConfigError
 from proposer_rl.experiment import Log
 from proposer_rl.report.proposals import last_map
 from proposer_rl.report.records import numbers, picture
+from proposer_rl.settings import LoggerSettings
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 
