@@ -13,13 +13,10 @@ from benchmarks.scales import QUICK, TINY, Scale
 from benchmarks.timing import interleave, ratio, threads
 from proposer_rl.streams import Streams
 
-# Episodes of a few updates: an update takes as long in any.
-SHORT = QUICK.but("proposer.meta_episode_length=5")
-
 
 def throughput(options: Options) -> Result:
     """Throughput per worker of two against one, each on one core of this machine."""
-    scale = TINY if options.tiny else SHORT
+    scale = TINY if options.tiny else QUICK
     engines = ["multiprocess"]
     if not options.tiny and find_spec("ray") is not None:
         engines.append("ray")
@@ -32,7 +29,7 @@ def throughput(options: Options) -> Result:
                 "one worker": _cycle(scale, options, stack, *_workers(engine, 1, options)),
                 "two workers": _cycle(scale, options, stack, *_workers(engine, 2, options)),
             }
-            seconds = interleave(rounds, options.repeats, options.device)
+            seconds = interleave(rounds, options.few, options.device)
         rows.append(
             Row(
                 f"throughput per worker of two {engine} workers, {copies}",
