@@ -38,21 +38,11 @@ class WorkerEnv(SolverTrainingEnv):
     """
 
     diverged: str | None = None
-    _ordered: tuple[TensorDictBase, Streams] | None = None
 
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
-        """See :meth:`SolverTrainingEnv.fork`; done at the next reset, when all workers are at it.
-
-        A collector gives its orders to one worker after the other.
-        """
+        """See :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
-        self._ordered = (solver, streams)
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        ordered, self._ordered = self._ordered, None
-        if ordered is not None:
-            super().fork(*ordered)
-        return super()._reset(tensordict)
+        super().fork(solver, streams)
 
     def report(self, copy: int) -> Report:
         """Tell of the last update, and all of one copy if it is here."""
