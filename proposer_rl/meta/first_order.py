@@ -41,11 +41,9 @@ from torchrl.objectives.value import GAE
 
 from proposer_rl.learning import PPO
 from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
 from proposer_rl.task import DifferentiableTask, Levels
-
-LEAST_SUCCESS = 1e-3
-"""Below it, success hardly counts for the logarithm."""
 
 SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 
@@ -67,7 +65,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
         ValueError: for another measure.
     """
     if measure == "return":
-        return performance["return"].mean(1)
+        return mean_return(performance)
     if measure != "log_success":
         raise ValueError(f"measure must be log_success or return, got {measure!r}")
     success = performance["success"]
@@ -78,7 +76,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
             f"copy {which}: the probability of success is exactly 0 on each of {success.shape[1]} "
             "levels of the target, so that nothing points towards it; measure=return may"
         )
-    return (success + LEAST_SUCCESS).log().mean(1)
+    return mean_log_success(performance)
 
 
 def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
