@@ -142,7 +142,7 @@ class MountainCarTask:
         self, agent: ActorCritic, levels: TensorDictBase, generator: torch.Generator
     ) -> TensorDict:
         """Whether the most probable actions lead to the top in time, and their return."""
-        env = MountainCar(levels.expand(agent.copies, *levels.batch_size))
+        env = MountainCar(levels.expand(agent.copies, levels.batch_size[-1]))
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             after = env.rollout(self._solver.ppo.horizon, agent.actor(), break_when_any_done=False)
         done = after["next", "terminated"].squeeze(-1).long()
@@ -160,12 +160,18 @@ class MountainCarTask:
         return nn.Linear(3, features)
 
     def measure(self, agent: ActorCritic) -> TensorDict:
-        measured = {}
-        for name, levels in self._measured_on.items():
-            performance = self.performance(agent, levels, torch.Generator())
-            for what in ("success", "return"):
-                measured[f"{name}_{what}"] = performance[what].mean(1)
+        measured = {
+            f"{name}_{what}": performance[what].mean(1)
+            for name, performance in self.performances(agent).items()
+            for what in ("success", "return")
+        }
         return TensorDict(measured, [agent.copies])
+
+    def performances(self, agent: ActorCritic) -> dict[str, TensorDict]:
+        return {
+            name: self.performance(agent, levels, torch.Generator())
+            for name, levels in self._measured_on.items()
+        }
 
     def statistics(self, levels: TensorDictBase, rollout: TensorDictBase) -> TensorDict:
         means = {name: levels[name].mean(-1) for name in ("gravity", "power")}

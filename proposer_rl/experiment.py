@@ -140,6 +140,7 @@ class Experiment:
                         self._update()
                 bar.set_postfix_str(self._headline_text(), refresh=False)
                 bar.update(self.updates - before)
+        self._measure_levels()
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
@@ -219,6 +220,14 @@ class Experiment:
         self._headline = measured[self.schedule.headline].tolist()
         for seed, values in self._per_copy(measured):
             self._append("metrics.csv", seed, {**self.costs, **values})
+
+    def _measure_levels(self) -> None:
+        """Append what every copy reaches on each single level that it was measured on."""
+        for name, performance in self.task.performances(self.learner.agent).items():
+            for copy, seed in enumerate(self.seeds):
+                reached = {str(key): value[copy].tolist() for key, value in performance.items()}
+                row = {"seed": seed, "updates": self.updates, "distribution": name, **reached}
+                self.folder.append("levels.jsonl", row)
 
     def _record(self, levels: Any, update: Update) -> None:
         """Append how the training went and samples of its levels, for every copy."""

@@ -114,7 +114,7 @@ class Task(Protocol):
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator
     ) -> TensorDictBase:
-        """What K Solvers reach on levels [E]: a tensordict [K, E].
+        """What K Solvers reach on levels [E], or each on its own [K, E]: a tensordict [K, E].
 
         ``return`` float [K, E] is the expected return of an episode or an estimate of it,
         ``success`` the probability of success, where that has a meaning. An exact evaluation has no
@@ -129,6 +129,12 @@ class Task(Protocol):
 
     def measure(self, agent: ActorCritic) -> TensorDictBase:
         """Measurements of K Solvers by name, each float [K]: the columns of ``metrics.csv``."""
+
+    def performances(self, agent: ActorCritic) -> Mapping[str, TensorDictBase]:
+        """What K Solvers reach on each of the levels behind the measurements.
+
+        By the names of the distributions measured on, a :meth:`performance` each, [K, E].
+        """
 
     def statistics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
         """What Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K]."""
@@ -150,6 +156,22 @@ class DifferentiableTask(Protocol):
 
         Where gradients are enabled, with gradients towards the agent's parameters.
         """
+
+
+@runtime_checkable
+class OptimalTask(Protocol):
+    """A task that knows what could be reached: regret without an antagonist."""
+
+    def optimal_return(self, levels: Levels) -> Tensor:
+        """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
+
+
+@runtime_checkable
+class EditableTask(Protocol):
+    """A task whose levels can be changed a little."""
+
+    def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
+        """Levels [K, n] after ``count`` small random edits each; copy k's from generator k."""
 
 
 class Score(NamedTuple):

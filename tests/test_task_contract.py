@@ -124,7 +124,12 @@ def test_solvers_are_measured_and_seen(task: Task) -> None:
     assert one.batch_size == (K, E) and one["return"].dtype == torch.float32
     assert same(one, again)
     assert ((one["success"] >= 0) & (one["success"] <= 1)).all()
+    own = torch.stack([levels, levels.flip(0)])
+    with torch.no_grad():
+        each = task.performance(agent, own, Streams(1).generator())
+    assert each.batch_size == (K, E) and same(each[0], one[0])
     if task.exact_performance:
+        torch.testing.assert_close(each["return"][1].flip(0), one["return"][1])
         assert same(one, task.performance(agent, levels, Streams(2).generator()))
     assert probes.shape[:2] == (K, C) and probes.is_floating_point()
     assert task.probe(agent, levels[:0]).shape == (K, 0, *probes.shape[2:])
@@ -132,6 +137,9 @@ def test_solvers_are_measured_and_seen(task: Task) -> None:
     assert encoder(probes).shape == (K, C, 6)
     measured = task.measure(agent)
     assert measured.batch_size == (K,) and set(measured.keys()) == set(task.measurements)
+    for name, performance in task.performances(agent).items():
+        assert performance.batch_size[0] == K
+        torch.testing.assert_close(performance["success"].mean(1), measured[f"{name}_success"])
 
 
 def test_what_a_reader_is_told(task: Task) -> None:

@@ -183,7 +183,7 @@ class MazeTask:
     def performance(
         self, agent: ActorCritic, levels: Level, generator: torch.Generator
     ) -> TensorDictBase:
-        """Return and success of K Solvers on levels [E], [K, E], as the settings ask for it."""
+        """Return and success of K Solvers on levels [E] or [K, E], as the settings ask for it."""
         return self._evaluator(*_with_logits(agent, levels), generator)
 
     def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
@@ -217,6 +217,13 @@ class MazeTask:
                     results[f"{prefix}_{kind}"] = measured[kind].mean(1)
             results[f"{name}_success_worst10"] = worst_mean(sampled["success"], WORST)
         return TensorDict(results, [agent.copies])
+
+    def performances(self, agent: ActorCritic) -> dict[str, TensorDictBase]:
+        """The sampled policy's, exact, on the fixed levels of each distribution measured on."""
+        return {
+            name: self._sampled(*_with_logits(agent, levels))
+            for name, levels in self._measured_on.items()
+        }
 
     def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
         """What the Solvers trained on and how they fared there, each [K] from [K, P]."""
@@ -383,8 +390,8 @@ def _named(key: str, make: Any, *arguments: Any) -> Any:
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
-    """Levels [E] once for each of K Solvers, [K, E], with the logits of every cell."""
-    copies = levels.expand(agent.copies, *levels.batch_size)
+    """Levels [E], the same for all K Solvers, or [K, E]; [K, E] with the logits of every cell."""
+    copies = levels.expand(agent.copies, levels.batch_size[-1])
     return copies, cell_logits(agent, planes(copies))
 
 
