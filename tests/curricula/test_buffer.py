@@ -1,0 +1,303 @@
+"""The level buffer against hand-computed tables, a brute-force simulation and its properties."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from proposer_rl.curricula.buffer import (
+    ReplayRule,
+    draw_slots,
+    empty_buffer,
+    insert,
+    level_keys,
+    replay_weights,
+    rescore,
+    score_weights,
+    staleness_weights,
+)
+
+# Five levels of a buffer; the same in every test that says "the table".
+SCORE = torch.tensor([0.9, 0.1, 0.5, 0.5, -0.2], dtype=torch.float64)
+AGE = torch.tensor([0, 3, 1, 4, 2])
+FULL = torch.ones(5, dtype=torch.bool)
+RANK = ReplayRule(temperature=1.0)
+BY_SCORE = {
+    "rank, T = 1": (RANK, [0.437956, 0.109489, 0.218978, 0.145985, 0.087591]),
+    "rank, T = 0.3": (
+        ReplayRule(temperature=0.3),
+        [0.877644, 0.008639, 0.087073, 0.022538, 0.004106],
+    ),
+    "proportional, T = 1": (
+        ReplayRule(prioritization="proportional", temperature=1.0),
+        [0.45, 0.05, 0.25, 0.25, 0.0],
+    ),
+    "proportional, T = 0.5": (
+        ReplayRule(prioritization="proportional", temperature=0.5),
+        [0.613636, 0.007576, 0.189394, 0.189394, 0.0],
+    ),
+    "softmax of two": (
+        ReplayRule(prioritization="softmax", temperature=1.0, best=2),
+        [0.598688, 0.0, 0.401312, 0.0, 0.0],
+    ),
+}
+TOGETHER = {
+    1.0: ([0.306569, 0.166642, 0.183285, 0.222190, 0.121314], 4),
+    0.3: ([0.614351, 0.096047, 0.090951, 0.135777, 0.062874], 4),
+    0.1: ([0.699305, 0.090001, 0.030683, 0.120012, 0.060000], 2),  # rank 2, but fresh
+}
+
+rules = st.builds(
+    ReplayRule,
+    prioritization=st.sampled_from(["rank", "proportional", "softmax"]),
+    temperature=st.floats(0.05, 20),
+    best=st.none() | st.integers(1, 8),
+    staleness=st.floats(0, 1),
+)
+scores = st.lists(st.floats(-3, 3).map(lambda x: round(x, 3)), min_size=1, max_size=12)
+
+
+def close(found: Tensor, expected: list[float]) -> None:
+    torch.testing.assert_close(found, torch.tensor(expected).double(), atol=6e-7, rtol=0)
+
+
+@pytest.mark.parametrize("name", BY_SCORE)
+def test_shares_by_score_are_those_of_the_table(name: str) -> None:
+    rule, expected = BY_SCORE[name]
+    close(score_weights(SCORE, FULL, rule), expected)
+
+
+@pytest.mark.parametrize("temperature", TOGETHER)
+def test_the_distribution_and_who_goes_first_are_those_of_the_table(temperature: float) -> None:
+    expected, evicted = TOGETHER[temperature]
+    found = replay_weights(SCORE, AGE, FULL, ReplayRule(temperature=temperature))
+    close(found, expected)
+    assert int(found.argmin()) == evicted
+
+
+def test_the_shares_by_age_are_those_of_the_table() -> None:
+    close(staleness_weights(AGE, FULL), [0, 0.3, 0.1, 0.4, 0.2])
+    close(staleness_weights(torch.zeros_like(AGE), FULL), [0.2] * 5)
+
+
+@given(scores, rules, st.integers(0, 4), st.randoms())
+def test_empty_slots_change_nothing(values: list[float], rule: ReplayRule, more: int, random: Any):
+    score = torch.tensor(values)
+    known = score_weights(score, torch.ones_like(score, dtype=torch.bool), rule)
+    wide = torch.tensor([*values, *[random.uniform(-5, 5) for _ in range(more)]])
+    filled = torch.arange(len(wide)) < len(values)
+    torch.testing.assert_close(score_weights(wide, filled, rule)[: len(values)], known)
+    assert (score_weights(wide, filled, rule)[len(values) :] == 0).all()
+
+
+@given(scores, rules, st.randoms())
+def test_shares_are_a_distribution_that_follows_the_scores(
+    values: list[float], rule: ReplayRule, random: Any
+) -> None:
+    score, full = torch.tensor(values), torch.ones(len(values), dtype=torch.bool)
+    weight = score_weights(score, full, rule)
+    assert (weight >= 0).all()
+    torch.testing.assert_close(weight.sum(), torch.ones((), dtype=torch.float64))
+    by_score = weight[score.argsort(dim=-1, descending=True, stable=True)]
+    assert (by_score.diff() <= 1e-12).all()
+    if len(set(values)) == len(values):  # else slots decide between equal scores
+        order = list(range(len(values)))
+        random.shuffle(order)
+        torch.testing.assert_close(score_weights(score[order], full, rule), weight[order])
+
+
+@pytest.mark.parametrize("kind", ["rank", "proportional", "softmax"])
+def test_temperature_goes_from_the_best_alone_to_all_alike(kind: Any) -> None:
+    positive, five = SCORE + 0.3, torch.full((5,), 0.2, dtype=torch.float64)
+    hot = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e6))
+    torch.testing.assert_close(hot, five, atol=1e-5, rtol=0)
+    cold = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e-2))
+    assert cold[0] > 1 - 1e-9
+    same = score_weights(torch.zeros(5), FULL, ReplayRule(prioritization=kind))
+    torch.testing.assert_close(same, five)
+
+
+@pytest.mark.parametrize(("temperature", "top"), [(1.0, 0.1127), (0.3, 0.8716), (0.1, 0.9990)])
+def test_the_first_of_4000_has_the_share_of_the_zeta_distribution(temperature, top) -> None:
+    weight = score_weights(
+        torch.rand(4000, generator=torch.Generator().manual_seed(0)),
+        torch.ones(4000, dtype=torch.bool),
+        ReplayRule(temperature=temperature),
+    )
+    assert float(weight.max()) == pytest.approx(top, abs=6e-5)
+
+
+def levels(*numbers: int) -> TensorDict:
+    """Levels [1, n] that are equal where their numbers are."""
+    shape = (1, len(numbers))
+    return TensorDict({"a": torch.tensor([numbers]), "b": torch.zeros(*shape, 2)}, shape)
+
+
+def new(numbers: list[int], score: list[float], **more: Any) -> TensorDict:
+    known = {"best": torch.tensor([score]), **{k: torch.tensor([v]) for k, v in more.items()}}
+    return TensorDict(
+        {"level": levels(*numbers), "score": torch.tensor([score]), **known}, (1, len(numbers))
+    )
+
+
+def filled(numbers: list[int], score: list[float], capacity: int, rule: ReplayRule) -> TensorDict:
+    return insert(empty_buffer(levels(0)[0, 0], 1, capacity), new(numbers, score), rule)
+
+
+class Simulation:
+    """One Solver's buffer, in plain Python."""
+
+    def __init__(self, capacity: int, rule: ReplayRule) -> None:
+        self.slots: list[dict[str, Any]] = []
+        self.capacity, self.rule, self.clock = capacity, rule, 0
+
+    def shares(self) -> list[float]:
+        n, t = len(self.slots), self.rule.temperature
+        order = sorted(range(n), key=lambda i: (-self.slots[i]["score"], i))
+        weight = [(order.index(i) + 1) ** (-1 / t) for i in range(n)]
+        if len({slot["score"] for slot in self.slots}) == 1:
+            weight = [1.0] * n
+        age = [self.clock - slot["touched"] for slot in self.slots]
+        stale = [a / sum(age) if sum(age) else 1 / n for a in age]
+        rho, total = self.rule.staleness, sum(weight)
+        return [(1 - rho) * w / total + rho * u for w, u in zip(weight, stale, strict=True)]
+
+    def insert(self, number: int, score: float) -> None:
+        self.clock += 1
+        here = {"number": number, "score": score, "touched": self.clock}
+        for i, slot in enumerate(self.slots):
+            if slot["number"] == number:
+                self.slots[i] = here
+                return
+        if len(self.slots) < self.capacity:
+            self.slots.append(here)
+            return
+        shares = self.shares()
+        worst = shares.index(min(shares))
+        if score > self.slots[worst]["score"]:
+            self.slots[worst] = here
+
+    def draw(self, mark: float) -> int:
+        chosen, total = 0, 0.0
+        for i, share in enumerate(self.shares()):
+            total += share
+            if mark < total:
+                chosen = i
+                break
+        self.clock += 1
+        self.slots[chosen]["touched"] = self.clock
+        return chosen
+
+
+@given(st.data())
+def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
+    capacity = data.draw(st.integers(1, 6))
+    rule = ReplayRule(
+        temperature=data.draw(st.sampled_from([0.1, 0.3, 1.0])),
+        staleness=data.draw(st.sampled_from([0.0, 0.3, 0.9])),
+    )
+    plain, buffer = Simulation(capacity, rule), empty_buffer(levels(0)[0, 0], 1, capacity)
+    for step in range(data.draw(st.integers(1, 8))):
+        if plain.slots and data.draw(st.booleans()):
+            generator = torch.Generator().manual_seed(step)
+            marks = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+            slots, buffer = draw_slots(buffer, 3, rule, [generator.manual_seed(step)])
+            assert slots[0].tolist() == [plain.draw(mark) for mark in marks]
+        else:
+            numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
+            score = [data.draw(st.integers(-4, 4)) / 4 for _ in numbers]
+            buffer = insert(buffer, new(numbers, score), rule)
+            for number, value in zip(numbers, score, strict=True):
+                plain.insert(number, value)
+        n = len(plain.slots)
+        assert buffer["filled"][0].tolist() == [True] * n + [False] * (capacity - n)
+        here = buffer[0, :n]
+        assert here["level", "a"].tolist() == [slot["number"] for slot in plain.slots]
+        assert here["score"].tolist() == [slot["score"] for slot in plain.slots]
+        assert here["touched"].tolist() == [slot["touched"] for slot in plain.slots]
+        assert len(set(here["key"].tolist())) == n  # no two equal levels
+
+
+def test_what_is_evicted_leaves_nothing_behind() -> None:
+    rule = replace(RANK, staleness=0.0)
+    buffer = filled([1, 2], [0.5, 0.1], 2, rule)
+    _, buffer = draw_slots(buffer, 5, rule, [torch.Generator().manual_seed(0)])
+    after = insert(buffer, new([3], [0.3], parent=[77], generation=[4]), rule)
+    assert after["level", "a"].tolist() == [[1, 3]]
+    row = after[0, 1]
+    assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
+    assert float(row["best"]) == pytest.approx(0.3)
+    assert int(row["touched"]) == int(after["clock"][0, 1]) == 2 + 5 + 1  # age 0
+    assert buffer["level", "a"].tolist() == [[1, 2]]  # what was given stays as it was
+
+
+def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
+    rule = replace(RANK, staleness=0.0)
+    buffer = filled([1, 2], [0.5, 0.1], 2, rule)
+    for score in (0.1, -torch.inf, torch.nan):
+        assert insert(buffer, new([3], [score]), rule)["level", "a"].tolist() == [[1, 2]]
+
+
+def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
+    for numbers, score in (([7, 8, 7], [0.2, 0.9, 0.6]), ([7, 7, 8], [0.6, 0.2, 0.9])):
+        buffer = filled(numbers, score, 5, RANK)
+        assert int(buffer["filled"].sum()) == 2
+        assert float(buffer["score"][buffer["level", "a"] == 7]) == pytest.approx(0.4)
+
+
+def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:
+    buffer = filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)
+    score = torch.tensor([[1.0, 2.0, -torch.inf]])
+    after = rescore(buffer, torch.tensor([[0, 0, 2]]), score, torch.tensor([[-9.0, 0.7, 0.0]]))
+    assert after["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
+    assert after["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
+
+
+def test_with_staleness_alone_every_level_comes_up() -> None:
+    rule = ReplayRule(staleness=1.0)
+    buffer = filled(list(range(1, 21)), [float(i) for i in range(20)], 25, rule)
+    slots, _ = draw_slots(buffer, 200, rule, [torch.Generator().manual_seed(0)])
+    assert set(slots[0].tolist()) == set(range(20))
+    for slot in range(20):
+        seen = (slots[0] == slot).nonzero().flatten()
+        assert int(seen.diff().max()) <= 5 * 20
+
+
+def test_draws_without_staleness_follow_the_shares() -> None:
+    rule = replace(RANK, staleness=0.0)
+    buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, rule)
+    slots, after = draw_slots(buffer, 20_000, rule, [torch.Generator().manual_seed(0)])
+    expected = 20_000 * torch.tensor(BY_SCORE["rank, T = 1"][1])
+    counts = slots[0].bincount(minlength=5)
+    assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
+    assert after["draws"][0, :5].equal(counts)
+
+
+def test_copies_do_not_see_each_other() -> None:
+    both = torch.cat([filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)] * 2)
+    batch = torch.cat([new([4, 5], [0.5, 0.6]), new([6, 7], [0.9, 0.05])])
+    only = insert(both, batch, RANK, wanted=torch.tensor([False, True]))
+    assert (only[0] == both[0]).all()
+    assert (insert(both[1:], batch[1:], RANK)[0] == only[1]).all()
+
+
+def test_keys_tell_levels_apart() -> None:
+    generator = torch.Generator().manual_seed(0)
+    many = TensorDict(
+        {
+            "walls": torch.rand(20_000, 6, 6, generator=generator) < 0.4,
+            "start": torch.randint(2, (20_000, 2), generator=generator),
+            "gravity": torch.randint(3, (20_000,), generator=generator) / 7,
+        },
+        [20_000],
+    )
+    rows = torch.cat([many["walls"].flatten(1), many["start"], 7 * many["gravity"][:, None]], 1)
+    assert len(level_keys(many).unique()) == len(rows.unique(dim=0))
+    assert level_keys(many[:5]).equal(level_keys(many.clone())[:5])
