@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,10 +18,16 @@ from proposer_rl.curricula import (
     FirstOrderProposer,
     ProposerCurriculum,
     ProposerTrainer,
+    ReplayCurriculum,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
     ScheduleCurriculum,
+    Scorer,
+    SelectionCurriculum,
 )
+from proposer_rl.curricula.batches import SomeBins
+from proposer_rl.curricula.buffer import Prioritization, ReplayRule
+from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.meta import rewards
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
@@ -210,6 +216,59 @@ def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurric
     """
     _no_copies(parts)
     return SampledFirstOrderCurriculum(parts.task, **numbers)
+
+
+def replay(
+    parts: Parts,
+    score: str,
+    source: Source,
+    rollouts: int,
+    prioritization: Prioritization,
+    temperature: float,
+    best: int | None,
+    staleness: float,
+    new_levels: Mapping[str, Sequence[float]] | None,
+    **numbers: Any,
+) -> ReplayCurriculum:
+    """Train on levels that are kept by their scores.
+
+    Args:
+        parts: the task.
+        score: of a level; see :class:`~proposer_rl.curricula.scores.Scorer`.
+        source: of the score.
+        rollouts: on each level that is only scored, from episodes.
+        prioritization: see :class:`~proposer_rl.curricula.buffer.ReplayRule`.
+        temperature: the same.
+        best: the same.
+        staleness: the same.
+        new_levels: the bins that they come from: for some of the space's axes, by name, the values
+            that count; None for the whole space.
+        numbers: see :class:`ReplayCurriculum`.
+    """
+    _no_copies(parts)
+    rule = ReplayRule(
+        prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
+    )
+    scorer = Scorer(parts.task, score, source, rollouts)
+    space = parts.task.space
+    new = space if new_levels is None else SomeBins(space, new_levels)
+    return ReplayCurriculum(scorer, rule, new, **numbers)
+
+
+def learnability(
+    parts: Parts, score: str, source: Source, rollouts: int, **numbers: Any
+) -> SelectionCurriculum:
+    """Train on levels that stood out among many, and on new ones.
+
+    Args:
+        parts: the task.
+        score: of a level; see :class:`~proposer_rl.curricula.scores.Scorer`.
+        source: of the score.
+        rollouts: on each candidate, from episodes.
+        numbers: see :class:`SelectionCurriculum`.
+    """
+    _no_copies(parts)
+    return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
 
 
 def first_order_proposer(

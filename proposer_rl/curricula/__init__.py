@@ -8,8 +8,11 @@ from proposer_rl.curricula.first_order import (
 )
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
+from proposer_rl.curricula.replay import ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum
 from proposer_rl.curricula.schedule import ScheduleCurriculum
+from proposer_rl.curricula.scores import Scorer
+from proposer_rl.curricula.selection import SelectionCurriculum
 
 __all__ = [
     "Advance",
@@ -20,8 +23,11 @@ __all__ = [
     "Proposal",
     "ProposerCurriculum",
     "ProposerTrainer",
+    "ReplayCurriculum",
     "SampledFirstOrderCurriculum",
     "SamplingCurriculum",
     "ScheduleCurriculum",
+    "Scorer",
+    "SelectionCurriculum",
     "require_gradients",
 ]

@@ -31,6 +31,8 @@ from torch import Tensor
 
 from proposer_rl.settings import settings
 
+Prioritization = Literal["rank", "proportional", "softmax"]
+
 
 @settings
 class ReplayRule:
@@ -45,7 +47,7 @@ class ReplayRule:
         staleness: share of the draws that go by the time since the last one.
     """
 
-    prioritization: Literal["rank", "proportional", "softmax"] = "rank"
+    prioritization: Prioritization = "rank"
     temperature: Annotated[float, Gt(0)] = 0.3
     best: Annotated[int, Ge(1)] | None = None
     staleness: Annotated[float, Interval(ge=0, le=1)] = 0.3

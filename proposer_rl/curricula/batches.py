@@ -1,0 +1,82 @@
+"""Batches of levels, whatever a task takes as a level."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from proposer_rl.streams import Streams
+from proposer_rl.task import Distribution, Levels, Space
+
+
+class SomeBins:
+    """Levels of some of a space's bins, drawn evenly.
+
+    Args:
+        space: with the bins.
+        values: for some of its axes, by name, those values whose bins count.
+
+    Raises:
+        ValueError: for an axis or a value that the space does not have.
+
+    Example:
+        >>> from proposer_rl.mazes.distributions import SpecificationSpace
+        >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
+        >>> empty = SomeBins(space, {"obstacle fraction": [0.0]})
+        >>> empty.bins
+        tensor([0, 1, 2])
+    """
+
+    def __init__(self, space: Space, values: Mapping[str, Sequence[float]]) -> None:
+        counts = []
+        for name, wanted in values.items():
+            known = list(space.axes.get(name, ()))
+            if not wanted or any(value not in known for value in wanted):
+                axes = {axis: list(all_) for axis, all_ in space.axes.items()}
+                raise ValueError(f"{name!r}: {list(wanted)} must be among the space's axes {axes}")
+        for name, there in space.axes.items():
+            counts.append(torch.tensor([value in values.get(name, there) for value in there]))
+        # The last axis runs fastest.
+        grid = torch.cartesian_prod(*counts).reshape(-1, len(counts)).all(-1)
+        self.bins = grid.nonzero().flatten()
+        self._space = space
+
+    def sample(self, count: int, generator: torch.Generator, /) -> Levels:
+        """Draw levels [count]."""
+        which = torch.randint(len(self.bins), (1, count), generator=generator)
+        return self._space.generate(self.bins[which], [generator])[0]
+
+
+def fresh_levels(
+    distribution: Distribution, count: int, streams: Sequence[Streams], *purpose: str | int
+) -> Levels:
+    """New levels [K, count], those of each Solver from its own stream."""
+    draws = [stream.generator(*purpose) for stream in streams]
+    return torch.stack([distribution.sample(count, generator) for generator in draws])
+
+
+def levels_at(levels: Levels, index: Tensor) -> Levels:
+    """Levels [K, P] out of [K, N], by their places int64 [K, P]."""
+    return levels[torch.arange(len(index)).unsqueeze(-1), index]
+
+
+def plain_levels(levels: Levels) -> dict[str, Any]:
+    """Levels as tensors by name, for a checkpoint."""
+    return levels.to_dict(convert_tensors=False)
+
+
+def restored_levels(like: Levels, entries: Mapping[str, Any], shape: Sequence[int]) -> Levels:
+    """Levels of what :func:`plain_levels` returned.
+
+    Args:
+        like: a level of the same kind, [].
+        entries: tensors by name.
+        shape: that the levels had.
+    """
+    levels = like.expand(shape).clone()
+    for name, entry in entries.items():
+        levels.set(name, entry.clone())
+    return levels

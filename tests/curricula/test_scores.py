@@ -1,0 +1,177 @@
+"""Scores of levels against hand-computed tables, a plain loop over episodes and closed forms."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from proposer_rl.curricula.scores import Scorer, episodes
+from proposer_rl.mazes import Level
+from proposer_rl.streams import Streams
+from tests.tiny import TASK, evaluate, learners
+
+LEARNER: Any = SimpleNamespace(
+    settings=SimpleNamespace(gamma=0.9, lmbda=0.5), agent=SimpleNamespace(value_key="state_value")
+)
+FIRST = ([-0.01, -0.01, 0.99], [0.7, 0.4, 0.9])
+SECOND = ([-0.01, -0.01, 0.99], [0.8, 0.9, 0.6])
+SHORT = ([0.99], [0.5])
+FAILED = ([-0.01] * 3, [0.2] * 3)
+NONE = torch.full((1, 1), -torch.inf)
+
+Episode = tuple[list[float], list[float]]
+
+
+def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int = 0) -> TensorDict:
+    """A rollout [1, 1, T] of those episodes.
+
+    Args:
+        parts: rewards and values of each.
+        success: whether they terminate, rather than are truncated.
+        after: the value after the last step of each.
+        cut: steps of the last episode that have not been played yet.
+    """
+    reward = [r for rewards, _ in parts for r in rewards]
+    value = [v for _, values in parts for v in values]
+    ends = [i == len(rewards) - 1 for rewards, _ in parts for i in range(len(rewards))]
+    following = [after if end else v for end, v in zip(ends, [*value[1:], 0.0], strict=True)]
+    length = len(reward) - cut
+
+    def column(values: list[Any]) -> Tensor:
+        return torch.tensor(values[:length]).view(1, 1, length, 1)
+
+    step = {
+        "reward": column(reward),
+        "state_value": column(following),
+        "done": column(ends),
+        "terminated": column([end and success for end in ends]),
+    }
+    return TensorDict({"state_value": column(value), "next": step}, (1, 1, length))
+
+
+def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
+    return float(Scorer(TASK, name, "episodes").of_rollouts(LEARNER, rollouts, best).score)
+
+
+@pytest.mark.parametrize(
+    ("name", "rollout", "expected"),
+    [
+        ("positive_value_loss", played(FIRST), 0.176833),
+        ("l1_value_loss", played(FIRST), 0.227425),
+        ("max_mc", played(FIRST), 0.303333),
+        ("positive_value_loss", played(SECOND), 0.13),
+        ("positive_value_loss", played(FIRST, SHORT), 0.333417),  # 0.255125 over pooled steps
+        ("positive_value_loss", played(FAILED, success=True), 0.0),  # nothing is bootstrapped
+        ("positive_value_loss", played(FAILED, success=False, after=0.3), 0.02),
+        ("max_mc", played(FAILED, success=False), -0.23),  # -0.20 if the maximum began at 0
+        ("learnability", played(FIRST, SHORT), 0.0),
+        ("regret", played(FIRST, SHORT), 0.01),  # 0.99 - (0.97 + 0.99) / 2
+    ],
+)
+def test_scores_are_those_of_the_table(name: str, rollout: TensorDict, expected: float) -> None:
+    assert score(name, rollout) == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_best_return_of_a_level_is_remembered() -> None:
+    best = torch.tensor([[0.98]])
+    assert score("max_mc", played(FIRST), best=best) == pytest.approx(0.313333, abs=1e-6)
+    assert score("regret", played(FIRST), best=best) == pytest.approx(0.01, abs=1e-6)
+    found = Scorer(TASK, "max_mc", "episodes").of_rollouts(LEARNER, [played(FAILED)], best)
+    assert float(found.best) == pytest.approx(0.98)
+
+
+def test_only_episodes_that_end_count() -> None:
+    whole, cut = played(FIRST), played(FIRST, SECOND, cut=1)
+    for name in ("positive_value_loss", "l1_value_loss", "max_mc", "regret"):
+        assert score(name, cut) == pytest.approx(score(name, whole), abs=1e-6)
+    assert score("l1_value_loss", played(FIRST, cut=1)) == -torch.inf
+
+
+def test_rollouts_are_pooled_by_episodes() -> None:
+    failed = played(FAILED, success=False)
+    assert score("learnability", played(FIRST, SHORT), failed) == pytest.approx(2 / 9)
+    together = score("positive_value_loss", played(FIRST, SHORT))
+    assert score("positive_value_loss", played(FIRST), played(SHORT)) == pytest.approx(together)
+
+
+lists = st.lists(st.tuples(st.integers(1, 5), st.booleans()), min_size=1, max_size=4)
+
+
+@given(lists, st.integers(0, 4), st.integers(0, 2**31))
+def test_episodes_are_those_of_a_plain_loop(
+    ends: list[tuple[int, bool]], rest: int, seed: int
+) -> None:
+    steps = sum(length for length, _ in ends) + rest
+    reward = torch.randn(steps, generator=torch.Generator().manual_seed(seed))
+    done, terminated = torch.zeros(2, steps, dtype=torch.bool)
+    returns, weight, start = [], torch.zeros(steps), 0
+    for length, success in ends:
+        stop = start + length
+        done[stop - 1], terminated[stop - 1] = True, success
+        returns.append(float(reward[start:stop].sum()))
+        weight[start:stop] = 1 / length
+        start = stop
+    after = {"reward": reward, "done": done, "terminated": terminated}
+    found = episodes(
+        TensorDict({"next": {k: v.view(1, 1, -1, 1) for k, v in after.items()}}, (1, 1, steps))
+    )
+    assert int(found.ended) == len(ends)
+    assert int(found.successes) == sum(success for _, success in ends)
+    assert float(found.total) == pytest.approx(sum(returns), abs=1e-5)
+    assert float(found.best) == pytest.approx(max(returns), abs=1e-6)
+    torch.testing.assert_close(found.weight.flatten().float(), weight)
+
+
+def test_a_perfect_critic_leaves_nothing_to_learn() -> None:
+    rewards = torch.tensor([-0.01, -0.01, 0.99])
+    values = [float((rewards[t:] * 0.9 ** torch.arange(3 - t)).sum()) for t in range(3)]
+    for name in ("positive_value_loss", "l1_value_loss"):
+        assert score(name, played((rewards.tolist(), values))) == pytest.approx(0, abs=1e-6)
+
+
+def streams(copies: int) -> list[Streams]:
+    return [Streams(copy) for copy in range(copies)]
+
+
+def test_exact_scores_are_those_of_the_definitions() -> None:
+    learner = learners(2)
+    levels = torch.stack([TASK.space.sample(5, torch.Generator().manual_seed(k)) for k in (0, 1)])
+    for copy in range(2):
+        known = evaluate(learner.agent, levels[copy])
+        chance = known["success"][copy].double()
+        best = TASK.optimal_return(levels[copy]).double()
+        for name, expected in (
+            ("learnability", chance * (1 - chance)),
+            ("regret", best - known["return"][copy].double()),
+        ):
+            found, cost = Scorer(TASK, name, "exact").ask(learner, levels, streams(2))
+            assert cost == 5
+            torch.testing.assert_close(found.score[copy], expected, atol=1e-6, rtol=0)
+
+
+def test_what_is_played_estimates_what_is_exact() -> None:
+    """E[p (1 - p)] of n episodes is (n - 1) / n of the true one."""
+    learner = learners(1)
+    levels = Level.from_text(["S.G..\n.....\n.....\n.....\n....."] * 4).unsqueeze(0)
+    exact, _ = Scorer(TASK, "learnability", "exact").ask(learner, levels, streams(1))
+    scorer = Scorer(TASK, "learnability", "episodes", rollouts=2000)
+    found, frames = scorer.play(learner, levels, streams(1))
+    assert frames == 2000 * 4 * 8
+    torch.testing.assert_close(found.score, exact.score, atol=0.01, rtol=0)
+
+
+def test_what_cannot_be_scored_is_refused_in_one_line() -> None:
+    with pytest.raises(ValueError, match=r"score='luck': from source=exact there are \['learn"):
+        Scorer(TASK, "luck", "exact")
+    with pytest.raises(ValueError, match="source='oracle': must be one of"):
+        Scorer(TASK, "regret", "oracle")  # type: ignore[arg-type]
+    blind: Any = SimpleNamespace()
+    with pytest.raises(TypeError, match="SimpleNamespace does not know the largest return"):
+        Scorer(blind, "regret", "exact")
