@@ -158,6 +158,10 @@ class DifferentiableTask(Protocol):
         """
 
 
+class ExactTask(Task, DifferentiableTask, Protocol):
+    """A whole task whose performance has gradients."""
+
+
 @runtime_checkable
 class OptimalTask(Protocol):
     """A task that knows what could be reached: regret without an antagonist."""

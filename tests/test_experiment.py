@@ -70,7 +70,13 @@ def test_a_run_is_a_plain_loop_of_updates(tmp_path: Path) -> None:
 # PPO's own metrics in training.csv are means over the population.
 PER_COPY = {
     "metrics.csv": ["id_success", "id_return", "id_greedy_success", "id_greedy_return"],
-    "training.csv": ["obstacle_fraction", "path_length", "path_length_sd", "train_success"],
+    "training.csv": [
+        "obstacle_fraction",
+        "path_length",
+        "path_length_sd",
+        "solvable",
+        "train_success",
+    ],
 }
 
 

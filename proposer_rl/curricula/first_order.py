@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,11 +22,7 @@ from proposer_rl.meta.first_order import (
     target_direction,
 )
 from proposer_rl.streams import Streams
-from proposer_rl.task import DifferentiableTask, Task
-
-
-class ExactTask(Task, DifferentiableTask, Protocol):
-    """A task whose performance has gradients."""
+from proposer_rl.task import DifferentiableTask, ExactTask, Task
 
 
 class BinCurriculum(Curriculum):

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
-from proposer_rl.mazes.distance import cells_first, padded_index
+from proposer_rl.mazes.distance import cells_first, padded_index, shortest_path_length
 from proposer_rl.mazes.dynamics import MOVES, successors
 from proposer_rl.mazes.env import MazeEnv
 from proposer_rl.mazes.levels import Level, cell_index, cell_position
@@ -203,6 +203,33 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
     for _ in range(max_steps):
         path.append(following.gather(-1, path[-1]))
     return cell_position(torch.cat(path, dim=-1), width)
+
+
+def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.01) -> Tensor:
+    """The largest expected return of any policy, that of a shortest path.
+
+    With d moves on it, T the step limit and c the step's penalty it is 1 - c d if d <= T: the step
+    that reaches the goal costs, too, and none of fewer steps does. Otherwise every policy plays to
+    the limit and gets -c T. As d <= T implies 1 - c d > -c T, reaching the goal pays at any
+    penalty.
+
+    Args:
+        levels: Levels ``[*B]``; the goal need not be reachable.
+        max_steps: Step limit of an episode.
+        step_penalty: Cost of a step.
+
+    Returns:
+        float32 ``[*B]``.
+
+    Example:
+        Two moves, and a goal that cannot be reached:
+
+        >>> optimal_return(Level.from_text(["S.G", "S#G"]), max_steps=2)
+        tensor([ 0.9800, -0.0200])
+    """
+    length = shortest_path_length(levels)
+    reached = (length >= 0) & (length <= max_steps)
+    return reached.float() - step_penalty * length.where(reached, max_steps)
 
 
 def worst_mean(values: Tensor, fraction: float) -> Tensor:

@@ -14,8 +14,14 @@ from torch import Tensor, nn
 from proposer_rl.learning import PPO, first_episode_success
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.mazes.edits import edit_levels
 from proposer_rl.mazes.env import MazeEnv
-from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator, worst_mean
+from proposer_rl.mazes.evaluation import (
+    ExactEvaluator,
+    RolloutEvaluator,
+    optimal_return,
+    worst_mean,
+)
 from proposer_rl.mazes.level_files import SUFFIXES, read_levels, shipped_levels, shipped_sets
 from proposer_rl.mazes.level_scores import score_levels
 from proposer_rl.mazes.levels import Level, planes
@@ -191,6 +197,14 @@ class MazeTask:
         logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
         return self._sampled.differentiable(levels, logits)
 
+    def optimal_return(self, levels: Level) -> Tensor:
+        """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
+        return optimal_return(levels, self.maze.max_steps, self.maze.step_penalty)
+
+    def edit(self, levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
+        """Levels [K, n] after random edits; see :func:`~proposer_rl.mazes.edits.edit_levels`."""
+        return edit_levels(levels, count, generators)
+
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
         copies, logits = _with_logits(agent, levels)
@@ -226,13 +240,23 @@ class MazeTask:
         }
 
     def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
-        """What the Solvers trained on and how they fared there, each [K] from [K, P]."""
-        lengths = shortest_path_length(levels).float()
+        """What the Solvers trained on and how they fared there, each [K] from [K, P].
+
+        - ``obstacle_fraction``: obstacles per cell;
+        - ``path_length``, ``path_length_sd``: mean and standard deviation of the moves on the
+          shortest path, over the levels that have a path; both 0 where none has;
+        - ``solvable``: share of the levels whose goal can be reached within the step limit;
+        - ``train_success``: share of the levels whose goal the first episode reached.
+        """
+        length = shortest_path_length(levels)
+        mean, deviation = _moments(length.float(), length >= 0)
+        solvable = (length >= 0) & (length <= self.maze.max_steps)
         return TensorDict(
             {
                 "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
-                "path_length": lengths.mean(-1),
-                "path_length_sd": lengths.std(-1, correction=0),
+                "path_length": mean,
+                "path_length_sd": deviation,
+                "solvable": solvable.float().mean(-1),
                 "train_success": first_episode_success(rollout).float().mean(-1),
             },
             levels.batch_size[:1],
@@ -393,6 +417,14 @@ def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
     """Levels [E], the same for all K Solvers, or [K, E]; [K, E] with the logits of every cell."""
     copies = levels.expand(agent.copies, levels.batch_size[-1])
     return copies, cell_logits(agent, planes(copies))
+
+
+def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of some of the values [*B, P], 0 of none: float [*B] each."""
+    count = which.sum(-1).clamp_min(1)
+    mean = (values * which).sum(-1) / count
+    square = (values - mean.unsqueeze(-1)).square()
+    return mean, ((square * which).sum(-1) / count).sqrt()
 
 
 def _first_episode(steps: TensorDictBase) -> list[list[int]]:

@@ -113,10 +113,14 @@ def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
     return {name: entry / _per_copy(size, entry) for name, entry in direction.items()}
 
 
+def squared_length(direction: Direction) -> Tensor:
+    """Sum of squares over all the parameters of each Solver: float [K]."""
+    return torch.stack([entry.square().flatten(1).sum(1) for entry in direction.values()]).sum(0)
+
+
 def root_mean_square(direction: Direction) -> Tensor:
     """Over all the parameters of each Solver: float [K]."""
-    squares = torch.stack([entry.square().flatten(1).sum(1) for entry in direction.values()])
-    return (squares.sum(0) / sum(entry[0].numel() for entry in direction.values())).sqrt()
+    return (squared_length(direction) / sum(e[0].numel() for e in direction.values())).sqrt()
 
 
 @contextmanager

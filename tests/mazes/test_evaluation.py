@@ -8,8 +8,14 @@ from scipy.stats import binom, norm
 from torch import Tensor
 
 from proposer_rl.mazes import Level, generate_levels
-from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator, policy_path, worst_mean
-from tests.mazes.oracles import moved, play, random_levels
+from proposer_rl.mazes.evaluation import (
+    ExactEvaluator,
+    RolloutEvaluator,
+    optimal_return,
+    policy_path,
+    worst_mean,
+)
+from tests.mazes.oracles import distances, moved, play, random_levels
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -199,6 +205,71 @@ def test_logits_of_an_expanded_batch_are_left_as_they_were() -> None:
 def test_no_episodes_are_refused() -> None:
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
         RolloutEvaluator(episodes=0)
+
+
+def best_play(level: Level, max_steps: int, step_penalty: float) -> float:
+    """The largest return by trying all sequences of actions, without those that repeat a state."""
+    goal, best = tuple(level.goal.tolist()), -step_penalty * max_steps
+    here = {tuple(level.start.tolist())}
+    for step in range(1, max_steps + 1):
+        here = {moved(level, cell, action) for cell in here for action in range(4)}
+        if goal in here:
+            best = max(best, 1 - step_penalty * step)
+            here.remove(goal)  # the episode ends there
+    return best
+
+
+@settings(max_examples=60)
+@given(
+    size=st.tuples(st.integers(1, 4), st.integers(2, 4)),
+    fraction=st.sampled_from([0.0, 0.3, 0.6]),
+    max_steps=st.integers(1, 12),
+    step_penalty=st.sampled_from([0.0, 0.01, 0.5, 3.0]),
+    seed=st.integers(0, 10_000),
+)
+def test_the_optimum_is_what_the_best_sequence_of_actions_gets(
+    size: tuple[int, int], fraction: float, max_steps: int, step_penalty: float, seed: int
+) -> None:
+    levels = random_levels(4, *size, fraction, seed)
+    expected = [best_play(level, max_steps, step_penalty) for level in levels]
+    found = optimal_return(levels.reshape(2, 2), max_steps, step_penalty)
+    assert (found.shape, found.dtype) == ((2, 2), torch.float32)
+    assert found.flatten().tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def shortest_path_logits(level: Level) -> Tensor:
+    """A policy that goes to a neighbour which is nearer to the goal: float [4, H, W]."""
+    logits = torch.zeros(4, *level.walls.shape)
+    away = distances(Level(level.walls, level.goal, level.start, batch_size=[]))
+    for cell, distance in away.items():
+        for action in range(4):
+            if away[moved(level, cell, action)] < distance:
+                logits[(action, *cell)] = 1.0
+    return logits
+
+
+@settings(max_examples=30)
+@given(max_steps=st.integers(1, 15), seed=st.integers(0, 10_000))
+def test_the_optimum_is_reached_on_a_shortest_path_and_passed_by_no_policy(
+    max_steps: int, seed: int
+) -> None:
+    levels = random_levels(6, 4, 5, 0.3, seed)
+    optimum = optimal_return(levels, max_steps, 0.02)
+    shortest = torch.stack([shortest_path_logits(level) for level in levels])
+    reached = ExactEvaluator(max_steps, 0.02, greedy=True)(levels, shortest)["return"]
+    torch.testing.assert_close(reached, optimum, rtol=0, atol=1e-5)
+    some = ExactEvaluator(max_steps, 0.02)(levels, random_logits(6, 4, 4, 5, seed=seed, scale=3.0))
+    assert (some["return"] <= optimum + 1e-5).all()
+
+
+def test_the_numbers_of_a_corridor_under_the_uniform_policy() -> None:
+    level = Level.from_text("SG")
+    reached = ExactEvaluator(max_steps=2)(level, torch.zeros(4, 1, 2))
+    success, optimum = reached["success"].item(), optimal_return(level, max_steps=2).item()
+    assert success == 0.4375 and success * (1 - success) == 0.24609375
+    assert reached["return"].item() == pytest.approx(0.42)
+    assert optimum == pytest.approx(0.99)
+    assert optimum - reached["return"].item() == pytest.approx(0.57)
 
 
 @given(

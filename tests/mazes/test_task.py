@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
-from proposer_rl.mazes import LevelSpec, shortest_path_length
+from proposer_rl.mazes import Level, LevelSpec, shortest_path_length
 from proposer_rl.mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
@@ -23,6 +23,7 @@ from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
+from proposer_rl.task import EditableTask, OptimalTask
 from tests.graphs import NoHostReads
 from tests.tiny import TASK, evaluate, learners, tiny_task
 
@@ -127,6 +128,49 @@ def test_statistics_and_records_of_what_was_trained_on() -> None:
             assert record["text"][0].replace(" ", "").replace("•", ".") == first
             solved.append(record["path"][-1] == level.goal.tolist())
         assert statistics["train_success"][k] == sum(solved) / 4
+
+
+def test_statistics_of_levels_that_have_no_path_or_too_long_a_one() -> None:
+    rows = ["#" * 5] * 4
+    near, far, walled = (
+        Level.from_text("\n".join(text))
+        for text in (
+            ["SG...", *rows],
+            ["S....", "####.", ".....", ".####", "G...."],  # 12 moves, of at most 8
+            ["S#G..", *rows],
+        )
+    )
+    levels = torch.stack([torch.stack([near, far, walled, near]), torch.stack([walled] * 4)])
+    ppo = learners(2)
+    ppo.env.set_levels(levels)
+    statistics = TASK.statistics(levels, ppo.collect())
+    assert statistics["path_length"].tolist() == pytest.approx([14 / 3, 0])
+    variance = (2 * (1 - 14 / 3) ** 2 + (12 - 14 / 3) ** 2) / 3
+    assert statistics["path_length_sd"].tolist() == pytest.approx([variance**0.5, 0])
+    assert statistics["solvable"].tolist() == [0.5, 0.0]
+
+
+def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
+    assert isinstance(TASK, EditableTask) and isinstance(TASK, OptimalTask)
+    ppo, generators = learners(2), [Streams(k).generator() for k in (0, 1)]
+    levels = TASK.space.generate(torch.tensor([[0, 1, 2, 3]] * 2), generators)
+    edited = TASK.edit(levels, 60, generators)
+    assert not (edited == levels).all()
+    ppo.env.set_levels(edited)
+    rollout = ppo.update([Streams(k).generator("actions") for k in (0, 1)]).rollout
+    statistics = TASK.statistics(edited, rollout)
+    assert all(bool(value.isfinite().all()) for value in statistics.values())
+    assert (statistics["train_success"] <= statistics["solvable"]).all()
+    assert statistics["solvable"].min() < 1
+    for record, level in zip(TASK.record(edited[0], rollout[0]), edited[0], strict=True):
+        drawn = [row.replace(" ", "").replace("•", ".") for row in record["text"]]
+        assert (Level.from_text("\n".join(drawn)) == level).all()
+    with torch.no_grad():
+        reached = TASK.performance(ppo.agent, edited, torch.Generator())["return"]
+    optimum = TASK.optimal_return(edited)
+    assert optimum.shape == (2, 4) and (reached <= optimum + 1e-5).all()
+    unsolvable = statistics["solvable"] < 1
+    assert torch.equal((optimum < 0).any(1), unsolvable)  # eight steps of 0.01, for nothing
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,116 @@
+"""Lengths of gradients against derivatives that are taken in other ways."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.learning.ppo import PPO
+from proposer_rl.mazes import Level
+from proposer_rl.meta.first_order import moved
+from proposer_rl.meta.gradient_norms import squared_gradients
+from proposer_rl.models import ActorCritic
+from proposer_rl.streams import Streams
+from tests.meta.test_first_order import learner, performance, some_levels
+from tests.tiny import TASK
+
+
+class Precise:
+    """Policies of a few numbers in double precision, as much of a task as is asked of one here."""
+
+    device = torch.device("cpu")
+
+    def learner(self, streams: Sequence[Streams]) -> PPO:
+        return learner(some_levels(len(streams), 1), len(streams))
+
+    def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
+        return performance(agent, levels)
+
+
+def numerical(ppo: PPO, levels: Level) -> Tensor:
+    """Sums of squared central differences over every single parameter: float [K, n]."""
+    total = torch.zeros(levels.batch_size, dtype=torch.float64)
+    for name, parameter in ppo.agent.named_parameters():
+        for i in range(parameter[0].numel()):  # the same number of all Solvers at once
+            returns = []
+            for change in (1e-6, -1e-6):
+                one = {n: torch.zeros_like(p) for n, p in ppo.agent.named_parameters()}
+                one[name].flatten(1)[:, i] = change
+                with torch.no_grad(), moved(ppo.agent, one, 1.0):
+                    returns.append(performance(ppo.agent, levels)["return"])
+            total += ((returns[0] - returns[1]) / 2e-6).square()
+    return total
+
+
+def one_by_one(ppo: PPO, levels: Level) -> Tensor:
+    """A backward pass of its own for every level, and nothing else that has to do with it."""
+    found = torch.zeros(levels.batch_size)
+    for k in range(found.shape[0]):
+        for i in range(found.shape[1]):
+            ppo.agent.zero_grad()
+            TASK.differentiable_performance(ppo.agent, levels)["return"][k, i].backward()
+            for parameter in ppo.agent.parameters():
+                if parameter.grad is not None:
+                    found[k, i] += parameter.grad.square().sum()
+    return found
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 8])
+def test_they_are_those_of_finite_differences(chunk: int) -> None:
+    ppo, levels = learner(some_levels(2, 1)), some_levels(2, 4)
+    found = squared_gradients(Precise(), chunk)(ppo, levels)
+    torch.testing.assert_close(found, numerical(ppo, levels), rtol=1e-6, atol=1e-12)
+    assert not found.requires_grad and (found[0] != found[1]).all()
+
+
+def test_they_are_those_of_single_levels_also_after_training() -> None:
+    ppo = TASK.learner([Streams(0), Streams(1)])
+    score = squared_gradients(TASK, 3)
+    levels = torch.stack([TASK.space.sample(5, Streams(k).generator()) for k in (0, 1)])
+    for _ in range(2):  # the same population serves Solvers that have changed
+        before = ppo.snapshot()
+        found = score(ppo, levels)
+        assert (ppo.snapshot() == before).all()
+        torch.testing.assert_close(found, one_by_one(ppo, levels), rtol=1e-4, atol=1e-9)
+        ppo.update([Streams(k).generator("actions") for k in (0, 1)])
+
+
+def test_nothing_is_drawn_at_random() -> None:
+    ppo, levels = TASK.learner([Streams(0)]), TASK.space.sample(2, Streams(0).generator())[None]
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    squared_gradients(TASK, 2)(ppo, levels)
+    assert torch.equal(torch.rand(4), expected)
+
+
+def test_where_the_return_cannot_change_it_is_zero() -> None:
+    solvable, walled = "S..\n...\n..G", "S#.\n##.\n..G"
+    levels = Level.from_text([walled, solvable, walled]).reshape(1, 3)
+    found = squared_gradients(Precise(), 2)(learner(levels, 1), levels)
+    assert found[0, 0] == found[0, 2] == 0 < found[0, 1]
+
+
+def test_the_uniform_policy_next_to_the_goal_in_closed_form() -> None:
+    """With p = 1/4 to go right, J = 1 - (1 - p)^8 - 0.01 * sum over t < 8 of (1 - p)^t.
+
+    The slope towards the logit of action a is dJ/dp p (1[a = right] - p). A logit has a bias and
+    two weights whose inputs are 1: of the start here, and of the goal to the right.
+    """
+    levels = Level.from_text("SG").reshape(1, 1)
+    ppo = learner(levels, 1)
+    for parameter in ppo.agent.parameters():
+        parameter.data.zero_()
+    slope = 8 * 0.75**7 + 0.01 * sum(t * 0.75 ** (t - 1) for t in range(8))
+    expected = 3 * slope**2 * sum((0.25 * ((a == 3) - 0.25)) ** 2 for a in range(4))
+    found = squared_gradients(Precise(), 1)(ppo, levels)
+    assert found.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_chunk_has_a_level() -> None:
+    with pytest.raises(ValueError, match="chunk must be at least 1, got 0"):
+        squared_gradients(TASK, 0)
