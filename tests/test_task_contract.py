@@ -6,32 +6,18 @@ import base64
 import io
 import json
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from PIL import Image
 
-from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
-from tests.tiny import tiny_task
+from proposer_rl.task import Task
+from tests.tiny import mountain_cars, tiny_task
 
-EXAMPLES = str(Path(__file__).parents[1] / "examples")
 K, P, C, E = 2, 4, 3, 5
-
-
-def mountain_cars() -> Task:
-    sys.path.insert(0, EXAMPLES)
-    try:
-        from mountain_car import MountainCarTask
-    finally:
-        sys.path.remove(EXAMPLES)
-    solver = SolverSettings(batch_size=P, ppo=PPOSettings(horizon=8, epochs=2))
-    return MountainCarTask(levels=8, solver=solver, place=Place())
 
 
 @pytest.fixture(params=[tiny_task, mountain_cars], ids=["mazes", "cars"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,8 +26,9 @@ from proposer_rl.mazes.task import MazeTask
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place
+from proposer_rl.task import Place, Task
 
+EXAMPLES = str(Path(__file__).parents[1] / "examples")
 EVALUATE = ExactEvaluator(max_steps=8)
 
 
@@ -47,6 +50,16 @@ def tiny_task(**changed: Any) -> MazeTask:
 
 
 TASK = tiny_task()
+
+
+def mountain_cars() -> Task:
+    sys.path.insert(0, EXAMPLES)
+    try:
+        from mountain_car import MountainCarTask
+    finally:
+        sys.path.remove(EXAMPLES)
+    solver = SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2))
+    return MountainCarTask(levels=8, solver=solver, place=Place())
 
 
 def learners(copies: int) -> PPO:

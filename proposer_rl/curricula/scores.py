@@ -27,7 +27,7 @@ discounted and R is not, so that ``max_mc`` is biased even at the optimum.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -35,8 +35,9 @@ from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.learning.advantages import gae
+from proposer_rl.meta.gradient_norms import squared_gradients
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, OptimalTask, Task
+from proposer_rl.task import DifferentiableTask, ExactTask, Levels, OptimalTask, Task
 
 Source = Literal["episodes", "exact"]
 
@@ -137,8 +138,8 @@ class Scorer:
             raise ValueError(f"source={source!r}: must be one of {sorted(there_are)}")
         if name not in there_are[source]:
             raise ValueError(f"score={name!r}: from source={source} there are {there_are[source]}")
-        if not self.from_episodes and name == "regret":
-            self._optimal = _optimum(task)
+        if not self.from_episodes:
+            self._exact = _exact_score(task, name)
 
     def of_rollouts(self, learner: PPO, rollouts: Sequence[TensorDictBase], best: Tensor) -> Scored:
         """Score levels [K, P] by rollouts on them, [K, P, T] each.
@@ -223,17 +224,30 @@ class Scorer:
         advantage, values = (played[key].squeeze(-1).double() for key in ("advantage", value))
         return STEPWISE[self._name](advantage, values, best)
 
-    def _exact(self, learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
-        performance = self.task.performance(learner.agent, levels, generator)
-        if self._name == "learnability":
-            return performance["success"] * (1 - performance["success"])
-        return self._optimal(levels) - performance["return"]
 
+def _exact_score(task: Task, name: str) -> Callable[[PPO, Levels, torch.Generator], Tensor]:
+    """Asks the task; gives float [K, n] for levels [K, n]."""
+    if name == "gradient_norm":
+        if not isinstance(task, DifferentiableTask):
+            raise TypeError(
+                f"score=gradient_norm needs gradients: {type(task).__name__} must define "
+                "differentiable_performance(agent, levels)"
+            )
+        norms = squared_gradients(cast(ExactTask, task))
+        return lambda learner, levels, _: norms(learner, levels)
+    if name == "learnability":
 
-def _optimum(task: Task) -> Callable[[Levels], Tensor]:
+        def learnability(learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
+            success = task.performance(learner.agent, levels, generator)["success"]
+            return success * (1 - success)
+
+        return learnability
     if not isinstance(task, OptimalTask):
         raise TypeError(
             f"{type(task).__name__} does not know the largest return (optimal_return), which "
             "score=regret from source=exact needs; source=episodes takes the best that was seen"
         )
-    return task.optimal_return
+    optimum = task.optimal_return
+    return lambda learner, levels, generator: (
+        optimum(levels) - task.performance(learner.agent, levels, generator)["return"]
+    )

@@ -13,7 +13,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.curricula.scores import Scorer, episodes
-from proposer_rl.mazes import Level
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
@@ -156,15 +155,24 @@ def test_exact_scores_are_those_of_the_definitions() -> None:
             torch.testing.assert_close(found.score[copy], expected, atol=1e-6, rtol=0)
 
 
-def test_what_is_played_estimates_what_is_exact() -> None:
-    """E[p (1 - p)] of n episodes is (n - 1) / n of the true one."""
-    learner = learners(1)
-    levels = Level.from_text(["S.G..\n.....\n.....\n.....\n....."] * 4).unsqueeze(0)
-    exact, _ = Scorer(TASK, "learnability", "exact").ask(learner, levels, streams(1))
-    scorer = Scorer(TASK, "learnability", "episodes", rollouts=2000)
-    found, frames = scorer.play(learner, levels, streams(1))
-    assert frames == 2000 * 4 * 8
-    torch.testing.assert_close(found.score, exact.score, atol=0.01, rtol=0)
+def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
+    learner = learners(2)
+    levels = torch.stack([TASK.space.sample(8, torch.Generator().manual_seed(k)) for k in (0, 1)])
+    scorer = Scorer(TASK, "learnability", "episodes", rollouts=3)
+    found, frames = scorer.play(learner, levels, streams(2), "why")
+    assert frames == 3 * 8 * 8
+    for batch in range(2):
+        some = levels[:, 4 * batch : 4 * batch + 4]
+        won, ended = torch.zeros(2, 2, 4)
+        for again in range(3):
+            learner.env.set_levels(some)
+            draws = [s.generator("score", "why", batch, again) for s in streams(2)]
+            after = learner.collect(draws)["next"]
+            won += after["terminated"].sum((-2, -1))
+            ended += after["done"].sum((-2, -1))
+        share = (won / ended).double()
+        here = found.score[:, 4 * batch : 4 * batch + 4]
+        torch.testing.assert_close(here, share * (1 - share), atol=1e-6, rtol=0)
 
 
 def test_what_cannot_be_scored_is_refused_in_one_line() -> None:

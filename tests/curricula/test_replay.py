@@ -1,0 +1,311 @@
+"""PLR, robust PLR, ACCEL, NCC and replay by regret: what is trained on, scored, kept and paid."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import torch
+
+from proposer_rl.curricula import ReplayCurriculum, Scorer
+from proposer_rl.curricula.batches import SomeBins
+from proposer_rl.curricula.buffer import (
+    ReplayRule,
+    draw_slots,
+    empty_buffer,
+    level_keys,
+    score_weights,
+)
+from proposer_rl.mazes import planes
+from proposer_rl.streams import Streams
+from tests.curricula.living import (
+    check_a_new_life_begins,
+    check_each_lives_alone,
+    check_it_resumes,
+    live,
+    solvers,
+)
+from tests.tiny import TASK, evaluate, mountain_cars
+
+P, T = 4, 8
+SMALL = {"capacity": 16, "fill": 0.5, "replay_probability": 0.6}
+
+
+def replay(
+    score: str = "positive_value_loss",
+    source: Any = "episodes",
+    *,
+    rule: ReplayRule | None = None,
+    rollouts: int = 1,
+    **options: Any,
+) -> ReplayCurriculum:
+    scorer = Scorer(TASK, score, source, rollouts)
+    return ReplayCurriculum(
+        scorer, rule or ReplayRule(temperature=1.0), TASK.space, **{**SMALL, **options}
+    )
+
+
+def plr() -> ReplayCurriculum:
+    return replay(train_on_new=True, synchronous=False)
+
+
+def robust() -> ReplayCurriculum:
+    return replay(synchronous=False)
+
+
+def accel(**options: Any) -> ReplayCurriculum:
+    return replay(edits=3, **options)
+
+
+def ncc() -> ReplayCurriculum:
+    rule = ReplayRule(prioritization="softmax", temperature=0.05, staleness=0.0)
+    return replay("learnability", "exact", rule=rule, renew=True)
+
+
+def traced() -> ReplayCurriculum:
+    return replay("regret", "exact", co_learnability=0.5, edits=2)
+
+
+MADE = {
+    "plr": plr,
+    "robust": robust,
+    "synchronous": replay,
+    "accel": accel,
+    "easy": lambda: accel(parents="easy"),
+    "regret": lambda: replay("regret", "exact"),
+    "plr of regret": lambda: replay("regret", "exact", train_on_new=True, synchronous=False),
+    "ncc": ncc,
+    "traced": traced,
+    "gradients": lambda: replay("gradient_norm", "exact"),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_it_resumes(name: str) -> None:
+    check_it_resumes(MADE[name])
+
+
+@pytest.mark.parametrize("name", [name for name in MADE if name != "robust"])
+def test_each_solver_lives_as_if_alone(name: str) -> None:
+    check_each_lives_alone(MADE[name])
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_a_new_life_begins(name: str) -> None:
+    check_a_new_life_begins(MADE[name])
+
+
+def test_every_step_of_training_is_on_the_proposed_level() -> None:
+    lived = live(plr(), solvers([0]), [0], range(6))
+    for levels, update in zip(lived.levels, lived.updates, strict=True):
+        seen = update.rollout["planes"]
+        assert (seen == planes(levels).unsqueeze(2)).all() and seen.shape[2] == T
+
+
+def test_plr_trains_on_new_levels_and_on_old_ones() -> None:
+    curriculum = plr()
+    lived = live(curriculum, solvers([0]), [0], range(12))
+    seen: set[int] = set()
+    old = []
+    for levels in lived.levels:
+        keys = set(level_keys(levels)[0].tolist())
+        old.append(len(keys & seen) / len(keys))
+        seen |= keys
+    assert old[0] == old[1] == 0  # 8 of 16 are to be scored before any is replayed
+    assert 1 in old[2:] and min(old[2:]) < 1
+    assert set(lived.frames) == {0}
+    assert set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist()) <= seen
+
+
+def streams_of(number: int) -> Streams:
+    return Streams(0, "update", number)
+
+
+def test_robust_plr_trains_on_replayed_levels_alone() -> None:
+    curriculum, learner = robust(), solvers([0])
+    known: list[set[int]] = []
+    before = learner.snapshot()
+    frames = []
+    for number in range(8):
+        proposal = curriculum.propose(learner, number, [streams_of(number)])
+        assert (learner.snapshot() == before).all()  # whatever was played on
+        known.append(set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist()))
+        assert set(level_keys(proposal.levels)[0].tolist()) <= known[-1]
+        frames.append(proposal.frames)
+        learner.env.set_levels(proposal.levels)
+        update = learner.update([streams_of(number).generator("actions")])
+        curriculum.observe(learner, proposal.levels, update)
+        before = learner.snapshot()
+    assert frames[0] >= 2 * P * T and all(cost % (P * T) == 0 for cost in frames)
+    assert sum(frames) == P * T * curriculum._scored / P  # every new batch is one rollout
+    assert 0 in frames[1:] and max(frames[1:]) > 0  # q = 0.6
+
+
+def test_the_synchronous_form_scores_one_batch_beside_every_update() -> None:
+    frames = live(replay(), solvers([0, 1]), [0, 1], range(5)).frames
+    assert frames == [2 * P * T, *[P * T] * 4]
+    frames = live(accel(), solvers([0]), [0], range(5)).frames
+    assert frames == [2 * P * T, *[2 * P * T] * 4]  # ... and one of children
+
+
+def test_what_is_exact_costs_evaluations_and_no_frames() -> None:
+    lived = live(replay("regret", "exact"), solvers([0]), [0], range(4))
+    assert set(lived.frames) == {0}
+    assert lived.evaluations == [2 * P, *[2 * P] * 3]  # new ones, and those trained on before
+
+
+def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
+    curriculum, learner = replay("regret", "exact"), solvers([0])
+    for number in range(6):
+        curriculum.improve(learner, number, [])
+        proposal = curriculum.propose(learner, number, [streams_of(number)])
+        assert curriculum._last is not None
+        fresh = ~torch.isin(torch.arange(16), curriculum._last["slot"][0])
+        learner.env.set_levels(proposal.levels)
+        update = learner.update([streams_of(number).generator("actions")])
+        curriculum.observe(learner, proposal.levels, update)
+        trained = curriculum._last["slot"][0]
+        curriculum._cost = [0, 0]
+        after = curriculum.buffer.clone()
+        curriculum._finish(learner, [streams_of(number)])
+        levels = curriculum.buffer["level"][0]
+        regret = TASK.optimal_return(levels) - evaluate(learner.agent, levels)["return"][0]
+        torch.testing.assert_close(
+            curriculum.buffer["score"][0, trained].float(), regret[trained], atol=1e-5, rtol=0
+        )
+        assert curriculum.buffer["score"][0, fresh].equal(after["score"][0, fresh])
+
+
+def test_children_differ_from_their_parents_by_their_edits() -> None:
+    curriculum = accel(capacity=64)
+    live(curriculum, solvers([0]), [0], range(10))
+    buffer = curriculum.buffer[0][curriculum.buffer["filled"][0]]
+    children = buffer[buffer["generation"] > 0]
+    assert len(children) > 8 and int(children["generation"].max()) > 1
+    found = 0
+    for child in children:
+        parent = buffer[buffer["key"] == child["parent"]]
+        if len(parent):
+            found += 1
+            level, origin = child["level"], parent["level"][0]
+            walls = int((level.walls ^ origin.walls).sum())
+            moved = int((level.start != origin.start).any() + (level.goal != origin.goal).any())
+            assert 0 < walls + moved <= 3
+            assert int(child["generation"]) == int(parent["generation"][0]) + 1
+    assert found > 4
+
+
+def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
+    curriculum, learner = accel(parents="easy"), solvers([0])
+    lived = live(curriculum, learner, [0], range(4))
+    rollout, last = lived.updates[-1].rollout, curriculum._last
+    assert last is not None
+    loss = Scorer(TASK, "l1_value_loss", "episodes")
+    lost = loss.of_rollouts(learner, [rollout], torch.full((1, P), -torch.inf)).score[0]
+    after = rollout["next"][0]
+    for p in range(P):
+        total, count, reached = 0.0, 0, 0.0
+        for step in after[p]:
+            total += float(step["reward"])
+            if bool(step["done"]):
+                reached, count, total = reached + total, count + 1, 0.0
+        assert float(last["easy"][0, p]) == pytest.approx(float(lost[p]) - reached / count)
+
+
+def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
+    score = torch.tensor([0.25, 0.16, 0.0])
+    rule = ReplayRule(prioritization="softmax", temperature=0.05, staleness=0.0)
+    found = score_weights(score, score >= 0, rule).float()
+    torch.testing.assert_close(found, torch.tensor([0.853216, 0.141036, 0.005749]))
+    curriculum, learner = ncc(), solvers([0])
+    lived = live(curriculum, learner, [0], range(3))
+    assert lived.evaluations == [2 * P + 16, P + 16, P + 16]
+    curriculum.propose(learner, 3, [streams_of(3)])
+    filled = curriculum.buffer["filled"][0]
+    chance = evaluate(learner.agent, curriculum.buffer["level"][0])["success"][0]
+    expected = (chance * (1 - chance))[filled].double()
+    found = curriculum.buffer["score"][0][filled]
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+def test_credit_goes_to_the_levels_trained_on_before() -> None:
+    curriculum = traced()
+    live(curriculum, solvers([0]), [0], range(4))
+    old = curriculum.buffer.clone()
+    slots, before = torch.tensor([[0, 1, 2, 2]]), torch.tensor([[4, 5, 6, 7]])
+    keys = old["key"].gather(1, before).clone()
+    keys[0, 3] += 1  # this one has been evicted since
+    curriculum._before = type(old)({"slot": before, "key": keys}, (1, P))
+    after = old.clone()
+    after["score"][0, :3] -= torch.tensor([0.4, 0.8, 0.2])
+    credited = curriculum._credit(old, after.clone(), slots)
+    fell = (0.4 + 0.8 + 0.2 + 0.2) / 4
+    expected = after["score"][0].clone()
+    expected[4:7] += 0.5 * fell
+    torch.testing.assert_close(credited["score"][0], expected)
+
+
+def test_what_is_told_is_json_and_shows_levels() -> None:
+    lived = live(accel(), solvers([0, 1]), [0, 1], range(7))
+    told = json.loads(json.dumps(lived.told))
+    assert told[0] == {} and set(told[-1]["levels"]) > {"highest scores", "most replayed"}
+    assert all("picture" in r for records in told[-1]["levels"].values() for r in records)
+    assert told[-1]["replayed"] == 1 and len(told[-1]["effective_levels"]) == 2
+    assert all(1 <= n <= 16 for n in told[-1]["effective_levels"])
+
+
+def test_a_batch_collapses_at_the_published_temperature() -> None:
+    """128 draws from 4,000 levels at T = 0.3 have about 42 distinct ones, at T = 1 about 102."""
+    buffer = empty_buffer(TASK.space.sample(1, torch.Generator())[0], 1, 4000)
+    generator = torch.Generator().manual_seed(0)
+    buffer["filled"] = torch.ones(1, 4000, dtype=torch.bool)
+    buffer["score"] = torch.rand(1, 4000, generator=generator, dtype=torch.float64)
+    for temperature, distinct, effective in ((0.3, 42, 2.7), (1.0, 102, 96)):
+        rule = ReplayRule(temperature=temperature)
+        drawn = [draw_slots(buffer, 128, rule, [generator])[0] for _ in range(10)]
+        assert abs(sum(len(slots.unique()) for slots in drawn) / 10 - distinct) < 6
+        shares = 0.7 * score_weights(buffer["score"], buffer["filled"], rule) + 0.3 / 4000
+        assert float(1 / shares.square().sum()) == pytest.approx(effective, rel=0.05)
+
+
+def test_some_bins_are_those_of_the_values() -> None:
+    empty = SomeBins(TASK.space, {"obstacle fraction": [0.0]})
+    levels = empty.sample(50, torch.Generator().manual_seed(0))
+    assert not levels.walls.any()
+    both = SomeBins(TASK.space, {"obstacle fraction": [0.2], "path length": [4]})
+    assert both.bins.tolist() == [3]
+    with pytest.raises(ValueError, match=r"'walls': \[1\] must be among the space's axes"):
+        SomeBins(TASK.space, {"walls": [1]})
+    with pytest.raises(ValueError, match=r"'path length': \[3\] must be among"):
+        SomeBins(TASK.space, {"path length": [3]})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"capacity": 0}, "capacity must be at least 1"),
+        ({"fill": 0.0}, "fill must be above 0 and at most 1, got 0.0"),
+        ({"replay_probability": 1.5}, "replay_probability must be above 0"),
+        ({"edits": -1}, "edits at least 0"),
+        ({"train_on_new": True}, "train_on_new=true, synchronous=true"),
+        ({"parents": "hard"}, "parents='hard': must be batch or easy"),
+        ({"renew": True, "capacity": 15}, "capacity=15 must be a multiple of the 4 levels"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replay(**options)
+
+
+def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:
+    with pytest.raises(ValueError, match="set synchronous=true"):
+        live(robust(), solvers([0, 1]), [0, 1], range(1))
+
+
+def test_a_task_without_edits_is_told_so() -> None:
+    cars = mountain_cars()
+    scorer = Scorer(cars, "positive_value_loss", "episodes")
+    with pytest.raises(TypeError, match="MountainCarTask has no edit"):
+        ReplayCurriculum(scorer, ReplayRule(), cars.space, edits=1)
+    ReplayCurriculum(scorer, ReplayRule(), cars.space, capacity=8)

@@ -1,0 +1,100 @@
+"""Sampling for learnability: what is kept is what a brute force would keep."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from proposer_rl.curricula import Scorer, SelectionCurriculum
+from proposer_rl.curricula.batches import fresh_levels
+from proposer_rl.curricula.buffer import level_keys
+from proposer_rl.streams import Streams
+from tests.curricula.living import (
+    check_a_new_life_begins,
+    check_each_lives_alone,
+    check_it_resumes,
+    live,
+    solvers,
+)
+from tests.tiny import TASK, evaluate
+
+P, T = 4, 8
+
+
+def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> SelectionCurriculum:
+    numbers = {"candidates": 16, "keep": 6, "every": 3, "new": 0.5, **options}
+    return SelectionCurriculum(Scorer(TASK, "learnability", source, rollouts), **numbers)
+
+
+@pytest.mark.parametrize("source", ["exact", "episodes"])
+def test_it_lives_as_a_curriculum_should(source: str) -> None:
+    check_it_resumes(lambda: selection(source))
+    check_each_lives_alone(lambda: selection(source))
+    check_a_new_life_begins(lambda: selection(source))
+
+
+def test_the_best_are_kept_and_half_of_a_batch_is_drawn_from_them() -> None:
+    curriculum, learner, stream = selection(), solvers([0]), Streams(0, "update", 0)
+    proposal = curriculum.propose(learner, 0, [stream])
+    candidates = fresh_levels(TASK.space, 16, [stream], "candidates")[0]
+    chance = evaluate(learner.agent, candidates)["success"][0]
+    worth = [float(p * (1 - p)) for p in chance]
+    best = sorted(range(16), key=lambda i: -worth[i])[:6]
+    keys = level_keys(candidates)
+    assert level_keys(curriculum.kept)[0].tolist() == keys[best].tolist()
+    drawn = level_keys(proposal.levels)[0].tolist()
+    assert all(key in keys[best].tolist() for key in drawn[:2])
+    assert proposal[1:] == (0, 16)
+
+
+def test_it_selects_every_few_updates_and_says_what_that_costs() -> None:
+    lived = live(selection(), solvers([0]), [0], range(7))
+    assert lived.evaluations == [16, 0, 0, 16, 0, 0, 16] and set(lived.frames) == {0}
+    lived = live(selection("episodes"), solvers([0]), [0], range(4))
+    assert lived.frames == [2 * 16 * T, 0, 0, 2 * 16 * T] and set(lived.evaluations) == {0}
+    told = lived.told[-1]
+    assert told["highest_score"][0] >= told["mean_score"][0] >= told["lowest_kept_score"][0]
+    assert len(told["levels"]["highest scores"]) == 6
+
+
+def test_what_is_mastered_or_hopeless_is_not_kept_while_there_is_else() -> None:
+    curriculum = selection(keep=3)
+    found = torch.tensor([[0.0, 0.25, 0.0, 0.2, 0.0, -torch.inf, 0.1] + [0.0] * 9])
+    scored = type("Scored", (), {"score": found.double(), "best": found})
+
+    class Told:
+        """A scorer that knows."""
+
+        from_episodes, task = False, TASK
+
+        @staticmethod
+        def ask(*_: Any) -> Any:
+            return scored, 16
+
+    curriculum.scorer = Told()  # type: ignore[assignment]
+    curriculum.propose(solvers([0]), 0, [Streams(0)])
+    assert curriculum.scores[0].tolist() == pytest.approx([0.25, 0.2, 0.1])
+
+
+@pytest.mark.parametrize(("new", "fresh"), [(0.0, 0), (1.0, 4), (0.25, 1)])
+def test_the_mixture_is_exact(new: float, fresh: int) -> None:
+    curriculum = selection(new=new)
+    proposal = curriculum.propose(solvers([0]), 0, [Streams(0)])
+    kept = torch.isin(level_keys(proposal.levels), level_keys(curriculum.kept))
+    assert bool(kept[0, : P - fresh].all()) and proposal.levels.batch_size == (1, P)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"candidates": 10}, "candidates=10 must be a multiple of the 4 levels"),
+        ({"every": 0}, "every=0 at least 1"),
+        ({"keep": 17}, "keep=17 must be from 1 to candidates=16"),
+        ({"new": -0.1}, "new=-0.1 must be from 0 to 1"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        selection(**options)
