@@ -16,6 +16,7 @@ from proposer_rl.curricula import (
     Curriculum,
     FirstOrderCurriculum,
     FirstOrderProposer,
+    PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
     ReplayCurriculum,
@@ -271,15 +272,42 @@ def learnability(
     return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
 
 
-def first_order_proposer(
-    parts: Parts, target_levels: int, epochs: int, learning_rate: float, entropy_coeff: float
-) -> FirstOrderProposer:
+def first_order_proposer(parts: Parts, target_levels: int, **numbers: Any) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
     Args:
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
             them the probes, the network and PPO's other numbers.
         target_levels: see :class:`FirstOrderProposer`.
+        numbers: see :func:`_problem_policy`.
+    """
+    agent, settings = _problem_policy(parts, **numbers)
+    probes = parts.proposer.probe_levels
+    return FirstOrderProposer(
+        parts.task, agent, settings, probe_levels=probes, target_levels=target_levels
+    )
+
+
+def paired(parts: Parts, **numbers: Any) -> PairedProposer:
+    """Train on the draws of a policy that is paid the regret against a second Solver.
+
+    Args:
+        parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
+        numbers: see :func:`_problem_policy`.
+    """
+    agent, settings = _problem_policy(parts, **numbers)
+    streams = Streams(parts.seeds[0], "antagonist")
+    probes = parts.proposer.probe_levels
+    return PairedProposer(parts.task, agent, settings, streams=streams, probe_levels=probes)
+
+
+def _problem_policy(
+    parts: Parts, epochs: int, learning_rate: float, entropy_coeff: float
+) -> tuple[ActorCritic, PPOSettings]:
+    """A policy that draws each problem by itself, and how it learns.
+
+    Args:
+        parts: the task, and the Proposer's settings.
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
         entropy_coeff: of the policy.
@@ -292,13 +320,7 @@ def first_order_proposer(
     numbers = replace(
         chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
-    return FirstOrderProposer(
-        task,
-        agent,
-        PPOSettings(horizon=1, **asdict(numbers)),
-        probe_levels=chosen.probe_levels,
-        target_levels=target_levels,
-    )
+    return agent, PPOSettings(horizon=1, **asdict(numbers))
 
 
 def _meta_env(

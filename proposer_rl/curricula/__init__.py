@@ -7,6 +7,8 @@ from proposer_rl.curricula.first_order import (
     require_gradients,
 )
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
+from proposer_rl.curricula.paired import PairedProposer
+from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum
@@ -20,6 +22,8 @@ __all__ = [
     "FirstOrderCurriculum",
     "FirstOrderProposer",
     "Improvement",
+    "PairedProposer",
+    "ProblemProposer",
     "Proposal",
     "ProposerCurriculum",
     "ProposerTrainer",

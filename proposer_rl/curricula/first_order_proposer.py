@@ -1,39 +1,24 @@
-"""The paper's Proposer, paid for each problem with its own share of the gain, without copies."""
+"""The paper's Proposer, paid for each problem with its own first-order share of the gain."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import torch
-from tensordict import TensorDict
-from torch import nn
-from torchrl.objectives import ClipPPOLoss
-
-from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.first_order import require_gradients
+from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
 from proposer_rl.learning import PPO
 from proposer_rl.meta.first_order import exact_alignment, exact_direction
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import Levels, Task
 
 
-class FirstOrderProposer(Curriculum):
-    """Draws each of P problems from a policy over probes, and learns what each was worth.
-
-    At every update the policy sees what the Solver would do on probe levels of the target, draws
-    the bin of each problem, and is paid for each with the alignment of the level made of it,
-    standardised over the batch. A few gradient steps follow on the clipped objective of each
-    problem (Schulman et al. 2017, eq. 7): no copies of the Solver, no critic.
+class FirstOrderProposer(ProblemProposer):
+    """A problem is worth its alignment with the target direction.
 
     Args:
-        task: whose target is to be mastered, and whose space has the bins.
-        agent: from ``probes`` [1, C, ...] to logits [1, P, N] of independent categoricals, as
-            :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
-        settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
-            ``entropy_coeff`` and ``max_grad_norm`` count.
+        task: whose target is to be mastered.
+        agent: see :class:`ProblemProposer`.
+        settings: the same.
         probe_levels: probes C.
         target_levels: fresh levels E of the target that the direction is taken from.
         measure: of the target's performance; see
@@ -53,111 +38,19 @@ class FirstOrderProposer(Curriculum):
         target_levels: int = 256,
         measure: str = "log_success",
     ) -> None:
-        self.agent = agent
-        self._task = require_gradients(task)
-        self._settings = settings
-        self._probe_levels = probe_levels
-        self._target_levels = target_levels
-        self._measure = measure
-        actor, _ = agent.readout()
-        self._loss = ClipPPOLoss(
-            actor,
-            None,
-            clip_epsilon=settings.clip_epsilon,
-            entropy_coeff=settings.entropy_coeff,
-            normalize_advantage=True,
-            functional=False,
-        )
-        self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
-        self._parameters = [p for p in agent.parameters() if p.requires_grad]
-        self._adam = torch.optim.Adam(
-            self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
-        )
-        self._proposed = torch.zeros(task.space.size, dtype=torch.int64)
-        self._told: dict[str, float] = {}
+        self._exact = require_gradients(task)
+        super().__init__(task, agent, settings, probe_levels=probe_levels)
+        self._target_levels, self._measure = target_levels, measure
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [1, P] of the policy's draws, from which it has learnt already.
-
-        Raises:
-            ValueError: for several Solvers: a Proposer learns from one.
-        """
-        if len(streams) != 1:
-            raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
-        (stream,) = streams
-        task, agent = self._task, self.agent
-        probes = task.target.sample(self._probe_levels, stream.generator("probes"))
-        with torch.no_grad():
-            seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [1])
-            policy = agent.distribution(agent(seen.copy()))
-            noise = torch.rand(1, task.batch_size, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(task.device))  # [1, P]
-            log_prob = policy.log_prob(choices)
-        levels = task.space.generate(choices.cpu(), [stream.generator("levels")])
-        target = task.target.sample(self._target_levels, stream.generator("target")).unsqueeze(0)
+    def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:
+        """The alignment of each level, which is evaluated on either side of the Solver."""
+        task, count = self._exact, self._target_levels
+        target = task.target.sample(count, stream.generator("target")).unsqueeze(0)
         reached, direction = exact_direction(task, learner, target, self._measure)
-        worth = exact_alignment(task, learner, direction, levels)
-        played = TensorDict(
-            {
-                agent.action_key: choices[0],
-                agent.log_prob_key: log_prob[0],
-                "advantage": worth[0].unsqueeze(-1),
-            },
-            [task.batch_size],
-        )
-        self._learn(seen, played)
-        self._proposed += choices[0].cpu().bincount(minlength=len(self._proposed))
-        self._told |= {
+        paid = exact_alignment(task, learner, direction, levels)[0]
+        told = {
             "target_performance": float(reached),
-            "alignment": float(worth.mean()),
-            "alignment_sd": float(worth.std()),
+            "alignment": float(paid.mean()),
+            "alignment_sd": float(paid.std()),
         }
-        return Proposal(levels, evaluations=self._target_levels + 2 * task.batch_size)
-
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Tell of the last cycle."""
-        if not self._told:
-            return Improvement()
-        shape = [len(values) for values in self._task.space.axes.values()]
-        metrics = {**self._told, "histogram": self._proposed.view(shape).tolist()}
-        self._proposed = torch.zeros_like(self._proposed)
-        return Improvement(metrics)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Weights and Adam's state, and what is told of the cycle."""
-        moments = {
-            name: self._adam.state[parameter]
-            for name, parameter in self.agent.named_parameters()
-            if parameter in self._adam.state
-        }
-        return {
-            "proposer": {
-                name: {"value": parameter.detach().clone()}
-                | {key: value.clone() for key, value in moments.get(name, {}).items()}
-                for name, parameter in self.agent.named_parameters()
-            },
-            "proposed": self._proposed.clone(),
-            "told": dict(self._told),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        for name, parameter in self.agent.named_parameters():
-            entry = dict(state["proposer"][name])
-            parameter.data.copy_(entry.pop("value"))
-            self._adam.state[parameter] = {key: value.clone() for key, value in entry.items()}
-        self._proposed = state["proposed"].clone()
-        self._told = dict(state["told"])
-
-    def _learn(self, seen: TensorDict, played: TensorDict) -> None:
-        """A few steps on one batch: the clipped objective of each problem, with its advantage."""
-        for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key][0]  # [P, N]
-            losses = self._loss(played.copy().set(self.agent.logits_key, logits))
-            self._adam.zero_grad()
-            (losses["loss_objective"] + losses["loss_entropy"]).backward()
-            nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)
-            self._adam.step()
-        self._told |= {
-            key: float(losses[key].detach()) for key in ("entropy", "kl_approx", "clip_fraction")
-        }
+        return Worth(paid, told, evaluations=count + 2 * len(paid))

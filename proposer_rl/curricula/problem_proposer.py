@@ -1,0 +1,164 @@
+"""The paper's Proposer, paid for each problem by itself, without copies of the Solver."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss
+
+from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.learning import PPO
+from proposer_rl.models import ActorCritic, draw
+from proposer_rl.settings import PPOSettings
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels, Task
+
+
+class Worth(NamedTuple):
+    """What problems are worth.
+
+    Attributes:
+        paid: for each, float [P].
+        told: of the whole batch, by name.
+        frames: environment steps that it cost.
+        evaluations: of a policy on a level.
+    """
+
+    paid: Tensor
+    told: dict[str, float]
+    frames: int = 0
+    evaluations: int = 0
+
+
+class ProblemProposer(Curriculum):
+    """Draws each of P problems from a policy over probes, and learns what each was worth.
+
+    At every update the policy sees what the Solver would do on probe levels of the target, draws
+    the bin of each problem, and is paid for each, standardised over the batch. A few gradient steps
+    follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7), with no critic.
+
+    Args:
+        task: whose target is seen, and whose space has the bins.
+        agent: from ``probes`` [1, C, ...] to logits [1, P, N] of independent categoricals, as
+            :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
+        settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
+            ``entropy_coeff`` and ``max_grad_norm`` count.
+        probe_levels: probes C.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        *,
+        probe_levels: int = 16,
+    ) -> None:
+        self.agent, self.task = agent, task
+        self._settings = settings
+        self._probe_levels = probe_levels
+        actor, _ = agent.readout()
+        self._loss = ClipPPOLoss(
+            actor,
+            None,
+            clip_epsilon=settings.clip_epsilon,
+            entropy_coeff=settings.entropy_coeff,
+            normalize_advantage=True,
+            functional=False,
+        )
+        self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
+        self._parameters = [p for p in agent.parameters() if p.requires_grad]
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
+        )
+        self._proposed = torch.zeros(task.space.size, dtype=torch.int64)
+        self._told: dict[str, float] = {}
+
+    @abstractmethod
+    def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:
+        """What each of the levels [1, P] is worth to the Solver, who has not trained on it yet."""
+
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
+        """Levels [1, P] of the policy's draws, from which it has learnt already.
+
+        Raises:
+            ValueError: for several Solvers: a Proposer learns from one.
+        """
+        if len(streams) != 1:
+            raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
+        (stream,) = streams
+        task, agent = self.task, self.agent
+        probes = task.target.sample(self._probe_levels, stream.generator("probes"))
+        with torch.no_grad():
+            seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [1])
+            policy = agent.distribution(agent(seen.copy()))
+            noise = torch.rand(1, task.batch_size, generator=stream.generator("choices"))
+            choices = draw(policy, noise.to(task.device))  # [1, P]
+            log_prob = policy.log_prob(choices)
+        levels = task.space.generate(choices.cpu(), [stream.generator("levels")])
+        worth = self.worth(learner, levels, stream)
+        played = TensorDict(
+            {
+                agent.action_key: choices[0],
+                agent.log_prob_key: log_prob[0],
+                "advantage": worth.paid.unsqueeze(-1),
+            },
+            [task.batch_size],
+        )
+        self._learn(seen, played)
+        self._proposed += choices[0].cpu().bincount(minlength=len(self._proposed))
+        self._told |= worth.told
+        return Proposal(levels, worth.frames, worth.evaluations)
+
+    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
+        """Tell of the last cycle."""
+        if not self._told:
+            return Improvement()
+        shape = [len(values) for values in self.task.space.axes.values()]
+        metrics = {**self._told, "histogram": self._proposed.view(shape).tolist()}
+        self._proposed = torch.zeros_like(self._proposed)
+        return Improvement(metrics)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights and Adam's state, and what is told of the cycle."""
+        moments = {
+            name: self._adam.state[parameter]
+            for name, parameter in self.agent.named_parameters()
+            if parameter in self._adam.state
+        }
+        return {
+            "proposer": {
+                name: {"value": parameter.detach().clone()}
+                | {key: value.clone() for key, value in moments.get(name, {}).items()}
+                for name, parameter in self.agent.named_parameters()
+            },
+            "proposed": self._proposed.clone(),
+            "told": dict(self._told),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        for name, parameter in self.agent.named_parameters():
+            entry = dict(state["proposer"][name])
+            parameter.data.copy_(entry.pop("value"))
+            self._adam.state[parameter] = {key: value.clone() for key, value in entry.items()}
+        self._proposed = state["proposed"].clone()
+        self._told = dict(state["told"])
+
+    def _learn(self, seen: TensorDict, played: TensorDict) -> None:
+        """A few steps on one batch: the clipped objective of each problem, with its advantage."""
+        for _ in range(self._settings.epochs):
+            logits = self.agent(seen.copy())[self.agent.logits_key][0]  # [P, N]
+            losses = self._loss(played.copy().set(self.agent.logits_key, logits))
+            self._adam.zero_grad()
+            (losses["loss_objective"] + losses["loss_entropy"]).backward()
+            nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)
+            self._adam.step()
+        self._told |= {
+            key: float(losses[key].detach()) for key in ("entropy", "kl_approx", "clip_fraction")
+        }
