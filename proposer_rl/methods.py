@@ -16,11 +16,14 @@ from proposer_rl.curricula import (
     Curriculum,
     FirstOrderCurriculum,
     FirstOrderProposer,
+    LearningProgressCurriculum,
+    MixtureCurriculum,
     ProposerCurriculum,
     ProposerTrainer,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
     ScheduleCurriculum,
+    TransportCurriculum,
 )
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.meta import rewards
@@ -240,6 +243,39 @@ def first_order_proposer(
         probe_levels=chosen.probe_levels,
         target_levels=target_levels,
     )
+
+
+def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculum:
+    """Train on the bins in which the Solver's success changes fastest.
+
+    Args:
+        parts: the task.
+        numbers: see :class:`LearningProgressCurriculum`.
+    """
+    _no_copies(parts)
+    return LearningProgressCurriculum(parts.task, **numbers)
+
+
+def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
+    """Train on levels from Gaussians in the space with much absolute learning progress.
+
+    Args:
+        parts: the task.
+        numbers: see :class:`MixtureCurriculum`.
+    """
+    _no_copies(parts)
+    return MixtureCurriculum(parts.task, **numbers)
+
+
+def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
+    """Train on a distribution over bins that moves to the target through what is mastered.
+
+    Args:
+        parts: the task, which must know where its target lies.
+        numbers: see :class:`TransportCurriculum`.
+    """
+    _no_copies(parts)
+    return TransportCurriculum(parts.task, **numbers)
 
 
 def _meta_env(

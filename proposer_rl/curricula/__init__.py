@@ -1,12 +1,15 @@
 """What the Solver trains on."""
 
+from proposer_rl.curricula.alp_gmm import MixtureCurriculum
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.first_order import (
     FirstOrderCurriculum,
     SampledFirstOrderCurriculum,
     require_gradients,
 )
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
+from proposer_rl.curricula.learning_progress import LearningProgressCurriculum
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.sampling import SamplingCurriculum
 from proposer_rl.curricula.schedule import ScheduleCurriculum
@@ -17,11 +20,14 @@ __all__ = [
     "FirstOrderCurriculum",
     "FirstOrderProposer",
     "Improvement",
+    "LearningProgressCurriculum",
+    "MixtureCurriculum",
     "Proposal",
     "ProposerCurriculum",
     "ProposerTrainer",
     "SampledFirstOrderCurriculum",
     "SamplingCurriculum",
     "ScheduleCurriculum",
+    "TransportCurriculum",
     "require_gradients",
 ]
