@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from typing import Any
 
+MOST = 1_000_000
+"""Of what is counted: more would not fit in memory, or never come to pass."""
+
 
 def whole(name: str, value: Any, least: int) -> int:
-    """The value, if it is a whole number of at least ``least``.
+    """The value, if it is a whole number from ``least`` to :data:`MOST`.
 
     Raises:
         ValueError: otherwise.
     """
-    if type(value) is not int or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    if type(value) is not int or not least <= value <= MOST:
+        raise ValueError(f"{name} must be a whole number from {least} to {MOST:,}, got {value!r}")
     return value
 
 

@@ -269,9 +269,9 @@ def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.Monk
     ("options", "message"),
     [
         ({"source": "both"}, "source must be episodes or performance, got 'both'"),
-        ({"components": 1}, "components must be a whole number of at least 2, got 1"),
-        ({"refit": 2.5}, "refit must be a whole number of at least 2, got 2.5"),
-        ({"warmup": None}, "warmup must be a whole number of at least 2, got None"),
+        ({"components": 1}, "components must be a whole number from 2 to 1,000,000, got 1"),
+        ({"refit": 2.5}, "refit must be a whole number from 2 to 1,000,000, got 2.5"),
+        ({"warmup": None}, "warmup must be a whole number from 2 to 1,000,000, got None"),
         ({"exploration": 1.1}, "exploration must be from 0 to 1, got 1.1"),
         ({"components": 65}, "components=65 must be at most refit=64, and that at most warmup=64"),
         ({"warmup": 63}, "components=4 must be at most refit=64, and that at most warmup=63"),

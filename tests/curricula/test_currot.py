@@ -185,8 +185,8 @@ def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
         ({"epsilon": 0.0}, "epsilon must be a finite number above 0, got 0.0"),
         ({"delta": float("inf")}, "delta must be a finite number, got inf"),
         ({"delta": "low"}, "delta must be a finite number, got 'low'"),
-        ({"probes": 0}, "probes must be a whole number of at least 1, got 0"),
-        ({"every": -1}, "every must be a whole number of at least 1, got -1"),
+        ({"probes": 0}, "probes must be a whole number from 1 to 1,000,000, got 0"),
+        ({"every": -1}, "every must be a whole number from 1 to 1,000,000, got -1"),
         ({"measure": "joy"}, "measure must be success or return, got 'joy'"),
     ],
 )

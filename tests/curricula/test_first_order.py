@@ -213,7 +213,7 @@ def test_a_task_without_gradients_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"every": 0}, "every must be a whole number of at least 1, got 0"),
+        ({"every": 0}, "every must be a whole number from 1 to 1,000,000, got 0"),
         ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
         ({"smoothing": 1.0}, "smoothing must be from 0 to below 1, got 1.0"),
         ({"candidates": 0}, "target_levels and candidates must be at least 1, got 8, 0"),

@@ -181,9 +181,10 @@ def test_a_task_without_success_is_told_what_to_give() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"every": 0}, "every must be a whole number of at least 1, got 0"),
-        ({"every": 1.5}, "every must be a whole number of at least 1, got 1.5"),
-        ({"probes": True}, "probes must be a whole number of at least 1, got True"),
+        ({"every": 0}, "every must be a whole number from 1 to 1,000,000, got 0"),
+        ({"every": 1.5}, "every must be a whole number from 1 to 1,000,000, got 1.5"),
+        ({"probes": 10**30}, "probes must be a whole number from 1 to 1,000,000, got 1000"),
+        ({"probes": True}, "probes must be a whole number from 1 to 1,000,000, got True"),
         ({"source": "dreams"}, "source must be probes or episodes, got 'dreams'"),
         ({"measure": None}, "measure must be success or return, got None"),
         ({"fast": 1.0}, "fast must be from 0 to below 1, got 1.0"),
