@@ -99,6 +99,7 @@ class MountainCarTask:
     def __init__(self, *, levels: int, solver: SolverSettings, place: Place) -> None:
         self.batch_size = solver.batch_size
         self.space, self.target = Cars(torch.arange(len(KINDS))), Cars(TARGET)
+        self.target_shares = torch.bincount(TARGET, minlength=len(KINDS)).float()
         self.distributions = {"target": self.target, "all": self.space}
         self.measurements = [
             f"{name}_{what}" for name in self.distributions for what in ("success", "return")

@@ -16,6 +16,8 @@ from proposer_rl.curricula import (
     Curriculum,
     FirstOrderCurriculum,
     FirstOrderProposer,
+    LearningProgressCurriculum,
+    MixtureCurriculum,
     PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
@@ -25,6 +27,7 @@ from proposer_rl.curricula import (
     ScheduleCurriculum,
     Scorer,
     SelectionCurriculum,
+    TransportCurriculum,
 )
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import Prioritization, ReplayRule
@@ -321,6 +324,39 @@ def _problem_policy(
         chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
     return agent, PPOSettings(horizon=1, **asdict(numbers))
+
+
+def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculum:
+    """Train on the bins in which the Solver's success changes fastest.
+
+    Args:
+        parts: the task.
+        numbers: see :class:`LearningProgressCurriculum`.
+    """
+    _no_copies(parts)
+    return LearningProgressCurriculum(parts.task, **numbers)
+
+
+def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
+    """Train on levels from Gaussians in the space with much absolute learning progress.
+
+    Args:
+        parts: the task.
+        numbers: see :class:`MixtureCurriculum`.
+    """
+    _no_copies(parts)
+    return MixtureCurriculum(parts.task, **numbers)
+
+
+def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
+    """Train on a distribution over bins that moves to the target through what is mastered.
+
+    Args:
+        parts: the task, which must know where its target lies.
+        numbers: see :class:`TransportCurriculum`.
+    """
+    _no_copies(parts)
+    return TransportCurriculum(parts.task, **numbers)
 
 
 def _meta_env(

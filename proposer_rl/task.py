@@ -163,6 +163,17 @@ class ExactTask(Task, DifferentiableTask, Protocol):
 
 
 @runtime_checkable
+class LocatedTarget(Protocol):
+    """A task whose target lies in the Proposer's space: a way from other bins to it.
+
+    Attributes:
+        target_shares: the target as shares of the bins, float [N] on the CPU; they add up to one.
+    """
+
+    target_shares: Tensor
+
+
+@runtime_checkable
 class OptimalTask(Protocol):
     """A task that knows what could be reached: regret without an antagonist."""
 

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import LocatedTarget, Task
 from tests.tiny import mountain_cars, tiny_task
 
 K, P, C, E = 2, 4, 3, 5
@@ -59,6 +59,22 @@ def test_the_space_is_the_product_of_its_axes(task: Task) -> None:
         column = space.coordinates[:, axis].reshape(-1, len(values), inner)
         assert (column == column[:1, :, :1]).all()
         assert (column[0, :, 0].diff() > 0).all()
+
+
+def test_the_target_is_in_the_space(task: Task) -> None:
+    assert isinstance(task, LocatedTarget)
+    shares = task.target_shares
+    assert shares.shape == (task.space.size,) and shares.dtype == torch.float32
+    assert (shares >= 0).all() and float(shares.sum()) == pytest.approx(1)
+
+
+def test_the_cars_target_is_one_of_its_bins() -> None:
+    task: Any = mountain_cars()
+    (target,) = task.target_shares.nonzero().flatten().tolist()
+    made = task.space.generate(torch.full((1, E), target), [Streams(0).generator()])[0]
+    wanted = task.target.sample(E, Streams(1).generator())
+    for name in ("gravity", "power"):
+        assert torch.equal(made[name], wanted[name])
 
 
 def test_coordinates_fill_the_square(task: Task) -> None:

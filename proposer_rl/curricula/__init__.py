@@ -1,12 +1,15 @@
 """What the Solver trains on."""
 
+from proposer_rl.curricula.alp_gmm import MixtureCurriculum
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.first_order import (
     FirstOrderCurriculum,
     SampledFirstOrderCurriculum,
     require_gradients,
 )
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
+from proposer_rl.curricula.learning_progress import LearningProgressCurriculum
 from proposer_rl.curricula.paired import PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
@@ -22,6 +25,8 @@ __all__ = [
     "FirstOrderCurriculum",
     "FirstOrderProposer",
     "Improvement",
+    "LearningProgressCurriculum",
+    "MixtureCurriculum",
     "PairedProposer",
     "ProblemProposer",
     "Proposal",
@@ -33,5 +38,6 @@ __all__ = [
     "ScheduleCurriculum",
     "Scorer",
     "SelectionCurriculum",
+    "TransportCurriculum",
     "require_gradients",
 ]

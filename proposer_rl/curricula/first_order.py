@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.curricula.base import Improvement
+from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
+from proposer_rl.curricula.checks import part, real
 from proposer_rl.learning import PPO, Update
-from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.meta.first_order import (
     advantages,
     alignment,
@@ -25,7 +25,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask, ExactTask, Task
 
 
-class BinCurriculum(Curriculum):
+class _AlignedBins(BinCurriculum):
     """Draws each Solver's batch from bins by their scores.
 
     With s_n the exponential moving average of the n-th bin's score, its share of the batch is
@@ -43,34 +43,9 @@ class BinCurriculum(Curriculum):
     """
 
     def __init__(self, task: Task, *, every: int, temperature: float, smoothing: float) -> None:
-        if every < 1 or not temperature > 0 or not 0 <= smoothing < 1:
-            raise ValueError(
-                "every must be at least 1, temperature above 0 and smoothing from 0 to below 1; "
-                f"got {every}, {temperature}, {smoothing}"
-            )
-        self.task = task
-        self.smoothing = smoothing
-        self._every = every
-        self._temperature = temperature
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget the last Solver's scores."""
-        self.scores: dict[str, Tensor] = {}  # by name: "score" float [K, N], on the CPU, and others
-        self._proposed = torch.zeros(self.task.space.size, dtype=torch.int64)
-
-    @abstractmethod
-    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
-        """Look at the Solvers; return the frames and evaluations that it took for each."""
-
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P], drawn systematically from the shares."""
-        first = not self.scores
-        cost = self.look(learner, streams) if first or updates % self._every == 0 else (0, 0)
-        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
-        self._choices = systematic_draw(self.shares(), self.task.batch_size, draws)
-        self._proposed += self._choices.flatten().bincount(minlength=len(self._proposed))
-        return Proposal(self.task.space.generate(self._choices, levels), *cost)
+        self._temperature = real("temperature", temperature, above=0)
+        self.smoothing = part("smoothing", smoothing, below_one=True)
+        super().__init__(task, every=every)
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
@@ -78,39 +53,18 @@ class BinCurriculum(Curriculum):
         largest = score.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(score.dtype).tiny)
         return (score / (self._temperature * largest)).softmax(-1)
 
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Tell of the last cycle: counts, and of each Solver scores and how even its shares are."""
-        if not self.scores:
-            return Improvement()
-        shape = [len(values) for values in self.task.space.axes.values()]
-        shares = self.shares()
-        metrics = {
-            "histogram": self._proposed.view(shape).tolist(),
-            "score": self.scores["score"].unflatten(-1, shape).tolist(),
-            "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
-            "effective_bins": (1 / shares.square().sum(-1)).tolist(),
-        }
-        self._proposed = torch.zeros_like(self._proposed)
-        return Improvement(metrics)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The scores, and how often each bin was proposed in the cycle."""
-        return {"scores": dict(self.scores), "proposed": self._proposed.clone()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        self.scores = dict(state["scores"])
-        self._proposed = state["proposed"].clone()
-
-
-class FirstOrderCurriculum(BinCurriculum):
+class FirstOrderCurriculum(_AlignedBins):
     """Scores each bin with the mean alignment of fresh levels of it, which nobody plays.
 
     The alignments are exact (:mod:`proposer_rl.meta.first_order`): no frames are spent.
 
     Args:
         task: whose target is to be mastered.
-        every, temperature, smoothing: see :class:`BinCurriculum`.
+        every: updates between two looks at the Solvers.
+        temperature: the share of bin n is proportional to exp(s_n / (temperature * max |s|)), with
+            s its averaged score.
+        smoothing: share of the old score in the average.
         target_levels: fresh levels E of the target that the direction is taken from.
         candidates: levels C of each bin.
         measure: of the target's performance; see
@@ -176,7 +130,7 @@ class FirstOrderCurriculum(BinCurriculum):
         return told
 
 
-class SampledFirstOrderCurriculum(BinCurriculum):
+class SampledFirstOrderCurriculum(_AlignedBins):
     """The same from episodes, with any environment.
 
     The direction is the policy gradient of episodes that are played on the target, whose frames
@@ -188,7 +142,10 @@ class SampledFirstOrderCurriculum(BinCurriculum):
 
     Args:
         task: whose target is to be mastered.
-        every, temperature, smoothing: see :class:`BinCurriculum`.
+        every: updates between two looks at the Solvers.
+        temperature: the share of bin n is proportional to exp(s_n / (temperature * max |s|)), with
+            s its averaged score.
+        smoothing: share of the old score in the average.
         exploration: part of each batch that is drawn evenly.
 
     Raises:
@@ -204,10 +161,8 @@ class SampledFirstOrderCurriculum(BinCurriculum):
         smoothing: float = 0.9,
         exploration: float = 0.2,
     ) -> None:
-        if not 0 <= exploration <= 1:
-            raise ValueError(f"exploration must be from 0 to 1, got {exploration}")
         super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
-        self._exploration = exploration
+        self._exploration = part("exploration", exploration)
 
     def begin(self) -> None:
         """Forget the last Solver's scores and direction."""
@@ -242,8 +197,7 @@ class SampledFirstOrderCurriculum(BinCurriculum):
             learner.settings.learning_rate,
             lambda: surrogate(learner.agent, rollout, advantage),
         ).to(score)
-        counts = torch.zeros_like(score).scatter_add_(1, self._choices, torch.ones_like(found))
-        means = torch.zeros_like(score).scatter_add_(1, self._choices, found) / counts
+        means, counts = means_of_bins(self._choices, found, score.shape[-1])
         averaged = self.smoothing * score + (1 - self.smoothing) * means
         self.scores = {"score": torch.where(counts > 0, averaged, score)}
 

@@ -4,7 +4,11 @@ from proposer_rl.learning.advantages import LeaveOneOutBaseline
 from proposer_rl.learning.divergence import DivergedError, located
 from proposer_rl.learning.losses import MakeLoss
 from proposer_rl.learning.ppo import PPO, Update
-from proposer_rl.learning.rollout import RolloutPolicy, first_episode_success
+from proposer_rl.learning.rollout import (
+    RolloutPolicy,
+    first_episode_return,
+    first_episode_success,
+)
 from proposer_rl.learning.snapshot import load_agent
 
 __all__ = [
@@ -14,6 +18,7 @@ __all__ = [
     "MakeLoss",
     "RolloutPolicy",
     "Update",
+    "first_episode_return",
     "first_episode_success",
     "load_agent",
     "located",

@@ -136,6 +136,26 @@ class _WithoutLevel(TransformedEnv):
         return self.base_env.maybe_reset(tensordict).exclude(*self.transform.excluded_keys)
 
 
+def first_episode_return(rollout: TensorDictBase) -> Tensor:
+    """The sum of the rewards of every environment's first episode, as far as the rollout has it.
+
+    Args:
+        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
+
+    Returns:
+        float [*B].
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
+        >>> rewards = torch.tensor([[1.0, 2.0, 4.0, 8.0]]).unsqueeze(-1)
+        >>> first_episode_return(TensorDict({"next": {"done": ends, "reward": rewards}}, [1, 4]))
+        tensor([3.])
+    """
+    return (rollout["next", "reward"].squeeze(-1) * _in_first_episode(rollout)).sum(-1)
+
+
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
     """Whether the first episode of every environment terminated, rather than was truncated or cut.
 
@@ -154,6 +174,10 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
         >>> first_episode_success(rollout)  # the second one does not count
         tensor([False])
     """
+    return (rollout["next", "terminated"].squeeze(-1) & _in_first_episode(rollout)).any(-1)
+
+
+def _in_first_episode(rollout: TensorDictBase) -> Tensor:
+    """Steps up to and including the first end, bool [*B, T]."""
     done = rollout["next", "done"].squeeze(-1).long()
-    first = done.cumsum(-1) - done == 0  # up to and including the first end
-    return (rollout["next", "terminated"].squeeze(-1) & first).any(-1)
+    return done.cumsum(-1) - done == 0

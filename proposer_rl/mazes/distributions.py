@@ -161,9 +161,25 @@ class SpecificationSpace(LevelDistribution):
 
         Of an axis with a single value the coordinate is 0.
         """
-        axes = []
-        for values in self.axes.values():
-            axis = torch.tensor(values, dtype=torch.float32)
-            middle, reach = (axis.max() + axis.min()) / 2, (axis.max() - axis.min()) / 2
-            axes.append((axis - middle) / reach.clamp(min=torch.finfo(axis.dtype).tiny))
-        return torch.cartesian_prod(*axes)
+        return torch.cartesian_prod(
+            *(self._scaled(torch.tensor(values), axis) for axis, values in self.axes.items())
+        )
+
+    def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
+        """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
+
+        Of equally near ones it is the first; other pairs than the space has are rounded, also such
+        that lie outside of it.
+        """
+        wanted = zip(*specifications, strict=True)
+        scaled = [
+            self._scaled(torch.tensor(values), axis)
+            for axis, values in zip(self.axes, wanted, strict=True)
+        ]
+        return torch.cdist(torch.stack(scaled, -1), self.coordinates).argmin(-1)
+
+    def _scaled(self, values: Tensor, axis: str) -> Tensor:
+        """Values along an axis, which goes from -1 to 1; 0 where it has a single value."""
+        known = torch.tensor(self.axes[axis], dtype=torch.float32)
+        middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
+        return (values - middle) / reach if reach > 0 else torch.zeros(len(values))

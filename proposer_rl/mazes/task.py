@@ -136,6 +136,12 @@ class MazeTask:
         self.measurements = [f"{name}_{kind}" for name in self._measured_on for kind in kinds]
 
     @property
+    def target_shares(self) -> Tensor:
+        """The target's specifications, each rounded to the nearest bin, float [N]."""
+        nearest = self.space.nearest(self.target.specifications)
+        return nearest.bincount(minlength=self.space.size) / len(nearest)
+
+    @property
     def facts(self) -> dict[str, Any]:
         """See :class:`~proposer_rl.task.Task`."""
         size = f"{self.maze.height}×{self.maze.width}"

@@ -213,9 +213,9 @@ def test_a_task_without_gradients_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"every": 0}, "every must be at least 1, .* got 0, 0.1, 0.9"),
-        ({"temperature": 0.0}, "temperature above 0 .* got 1, 0.0, 0.9"),
-        ({"smoothing": 1.0}, "smoothing from 0 to below 1; got 1, 0.1, 1.0"),
+        ({"every": 0}, "every must be a whole number from 1 to 1,000,000, got 0"),
+        ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
+        ({"smoothing": 1.0}, "smoothing must be from 0 to below 1, got 1.0"),
         ({"candidates": 0}, "target_levels and candidates must be at least 1, got 8, 0"),
     ],
 )

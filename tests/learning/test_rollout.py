@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.learning.rollout import first_episode_success
+from proposer_rl.learning.rollout import first_episode_return, first_episode_success
 
 
 def rollout(*episodes: str) -> TensorDict:
@@ -17,3 +17,15 @@ def rollout(*episodes: str) -> TensorDict:
 def test_only_the_first_episode_counts() -> None:
     solved = first_episode_success(rollout("..G.", "..TG", "....", "G.T.", "T..G", "...G"))
     assert solved.tolist() == [[True, False, False, True, False, True]]
+
+
+def test_a_return_is_that_of_the_first_episode() -> None:
+    rows = ["..G.", "T.G.", "....", "G..T"]
+    rewards = torch.randn(1, 4, 4, generator=torch.Generator().manual_seed(0))
+    played = rollout(*rows)
+    played["next", "reward"] = rewards.unsqueeze(-1)
+    expected = [
+        sum(rewards[0, i, : next((t + 1 for t in range(4) if row[t] != "."), 4)].tolist())
+        for i, row in enumerate(rows)
+    ]
+    torch.testing.assert_close(first_episode_return(played), torch.tensor([expected]))

@@ -1,0 +1,60 @@
+"""Numbers from settings: wrong ones are refused in one line that names them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+MOST = 1_000_000
+"""Of what is counted: more would not fit in memory, or never come to pass."""
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """The value, if it is a whole number from ``least`` to :data:`MOST`.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if type(value) is not int or not least <= value <= MOST:
+        raise ValueError(f"{name} must be a whole number from {least} to {MOST:,}, got {value!r}")
+    return value
+
+
+def real(name: str, value: Any, *, least: float | None = None, above: float = -math.inf) -> float:
+    """The value as a float, if it is a finite number, not below ``least`` and above ``above``.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    asked = "a finite number"
+    if least is not None:
+        asked = f"a finite number of at least {least:g}"
+    elif above > -math.inf:
+        asked = f"a finite number above {above:g}"
+    wrong = isinstance(value, bool) or not isinstance(value, int | float)
+    if wrong or not math.isfinite(value) or value <= above or (least is not None and value < least):
+        raise ValueError(f"{name} must be {asked}, got {value!r}")
+    return float(value)
+
+
+def part(name: str, value: Any, *, below_one: bool = False) -> float:
+    """The value as a float, if it is from 0 to 1, or to below 1.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1
+    if not fits or (below_one and value == 1):
+        raise ValueError(f"{name} must be from 0 to {'below ' * below_one}1, got {value!r}")
+    return float(value)
+
+
+def one_of(name: str, value: Any, known: tuple[str, ...]) -> str:
+    """The value, if it is among the known ones.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if value not in known:
+        raise ValueError(f"{name} must be {' or '.join(known)}, got {value!r}")
+    return str(value)

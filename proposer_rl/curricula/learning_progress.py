@@ -1,0 +1,168 @@
+"""A bandit that trains each Solver on the bins in which it gets better, or worse, fastest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
+from proposer_rl.curricula.checks import one_of, part
+from proposer_rl.curricula.probes import Probes
+from proposer_rl.learning import PPO, Update, first_episode_return, first_episode_success
+from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+
+Q = 0.1  # the success that is stretched to one half
+SOURCES = ("probes", "episodes")
+
+
+class LearningProgressCurriculum(BinCurriculum):
+    """Draws each Solver's batch from bins by their bidirectional learning progress.
+
+    With p the Solver's success in a bin at a look, f and s a fast and a slow average of it and g
+    the function :func:`stretched`,
+
+        f <- fast f + (1 - fast) p,    s <- slow s + (1 - slow) f,    LP = |g(f) - g(s)|,
+        share of a bin = (1 - exploration) LP / (sum of all LP) + exploration / N,
+
+    and even shares where there is no progress at all. Both averages begin with the first p
+    (Kanitscheider et al. 2021, arXiv 2106.14876, section on learning progress; Zhang et al. 2023,
+    OMNI, arXiv 2306.01711).
+
+    Args:
+        task: whose space has the bins.
+        every: updates between two looks at the Solvers.
+        source: of p: ``"probes"`` for fixed levels of every bin, which is exact where the task's
+            performance is and costs evaluations; ``"episodes"`` for the first episodes of the
+            Solver's own training on the bin since the last look, which cost nothing. Of a bin
+            without one, the averages stay.
+        probes: levels of each bin.
+        measure: ``"success"``; or ``"return"``, for tasks without success, and then without g,
+            which is of probabilities.
+        fast, slow: share of the old in either average.
+        exploration: part of each batch that is drawn evenly.
+
+    Raises:
+        ValueError: if a value is out of range.
+    """
+
+    told = ("score", "performance")
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        every: int = 1,
+        source: str = "probes",
+        probes: int = 16,
+        measure: str = "success",
+        fast: float = 0.9,
+        slow: float = 0.9,
+        exploration: float = 0.2,
+    ) -> None:
+        self._source = one_of("source", source, SOURCES)
+        self._probes = Probes(task, probes, measure)
+        self._fast = part("fast", fast, below_one=True)
+        self._slow = part("slow", slow, below_one=True)
+        self._exploration = part("exploration", exploration)
+        super().__init__(task, every=every)
+
+    def begin(self) -> None:
+        """Forget the last Solver: its averages, its episodes and its probes."""
+        super().begin()
+        self._probes.forget()
+        self._episodes: list[Tensor] = []  # sum and number in each bin since the last look, [K, N]
+
+    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
+        """Move the averages by the performance on the probes, or in the episodes since."""
+        shape = (len(streams), self.task.space.size)
+        seen, evaluations = torch.full(shape, torch.nan), 0
+        if self._source == "probes":
+            seen, evaluations = self._probes.performance(learner, streams)
+        elif self._episodes:
+            seen = self._episodes[0] / self._episodes[1]
+        self._episodes = []
+        self._average(seen)
+        return 0, evaluations
+
+    def _average(self, seen: Tensor) -> None:
+        """Take in what was seen in each bin, [K, N], NaN where nothing was."""
+        unknown = torch.full_like(seen, torch.nan)
+        fast, slow = (self.scores.get(name, unknown) for name in ("fast", "slow"))
+        new_fast = torch.where(fast.isnan(), seen, fast.lerp(seen, 1 - self._fast))
+        new_slow = torch.where(slow.isnan(), new_fast, slow.lerp(new_fast, 1 - self._slow))
+        fast, slow = (
+            torch.where(seen.isnan(), old, new) for old, new in ((fast, new_fast), (slow, new_slow))
+        )
+        shown = stretched if self._probes.measure == "success" else torch.Tensor.clone
+        progress = (shown(fast) - shown(slow)).abs()
+        self.scores = {
+            "score": progress.nan_to_num(0.0),
+            "performance": fast.nan_to_num(0.0),
+            "fast": fast,
+            "slow": slow,
+        }
+
+    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
+        """Remember the episodes, where they are what progress is read from."""
+        if self._source == "probes":
+            return
+        first = {"success": first_episode_success, "return": first_episode_return}
+        reached = first[self._probes.measure](update.rollout).float().cpu()  # [K, P]
+        means, counts = means_of_bins(self._choices, reached, self.task.space.size)
+        totals = [(means * counts).nan_to_num(0.0), counts]
+        before = self._episodes or [torch.zeros_like(total) for total in totals]
+        self._episodes = [one + other for one, other in zip(before, totals, strict=True)]
+
+    def shares(self) -> Tensor:
+        """Of the bins in the next batch, float [K, N]."""
+        return progress_shares(self.scores["score"], self._exploration)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The episodes since the last look and the probes too."""
+        more = {"episodes": list(self._episodes), "probes": self._probes.state_dict()}
+        return {**super().state_dict(), **more}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        super().load_state_dict(state)
+        self._episodes = list(state["episodes"])
+        self._probes.load_state_dict(state["probes"])
+
+
+def stretched(success: Tensor, q: float = Q) -> Tensor:
+    """Success p as p (1 - q) / (p + q (1 - 2 p)): small probabilities count for more.
+
+    Kanitscheider et al. 2021 (arXiv 2106.14876), with q = 0.1: a success of q is stretched to one
+    half, 0 and 1 stay.
+
+    Args:
+        success: probabilities, float [*B].
+        q: above 0, below 1.
+
+    Example:
+        >>> stretched(torch.tensor([0.0, 0.1, 0.5, 1.0]))
+        tensor([0.0000, 0.5000, 0.9000, 1.0000])
+    """
+    return success * (1 - q) / (success + q * (1 - 2 * success))
+
+
+def progress_shares(progress: Tensor, exploration: float) -> Tensor:
+    """Shares [K, N] in proportion to progress [K, N], a part of them even.
+
+    Args:
+        progress: not negative.
+        exploration: the part that is even; all of it for a Solver without any progress.
+
+    Example:
+        >>> progress_shares(torch.tensor([[3.0, 1.0], [0.0, 0.0]]), 0.2)
+        tensor([[0.7000, 0.3000],
+                [0.5000, 0.5000]])
+    """
+    total = progress.sum(-1, keepdim=True)
+    even = torch.full_like(progress, 1 / progress.shape[-1])
+    greedy = torch.where(total > 0, progress / total, even)
+    return (1 - exploration) * greedy + exploration * even
