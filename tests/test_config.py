@@ -78,6 +78,8 @@ WRONG = [
         "task.network.channels=[8,0]",
         "task.network.channels.1=0: input should be greater than or equal to 1",
     ),
+    ("task.encoder_channels=[]", "task.encoder_channels=[]: list should have at least 1 item"),
+    ("task.encoder_channels=[8,0]", "task.encoder_channels.1=0: input should be greater than or"),
     ("task.network.groups=0", "task.network.groups=0: input should be greater than or equal to 1"),
     ("task.maze.height=0", "task.maze.height=0: input should be greater than or equal to 1"),
     ("task.maze.max_steps=0", "task.maze.max_steps=0: input should be greater than or equal to 1"),

@@ -121,7 +121,8 @@ def task_maker(settings: Mapping[str, Any]) -> TaskMaker:
     try:
         make = get_object(target)
         parameters = inspect.signature(make).parameters
-        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+        typed = make.__init__ if inspect.isclass(make) else make
+        hints = get_type_hints(typed, include_extras=True)  # bounds, too
     except (HydraException, ImportError, AttributeError, TypeError, ValueError, NameError) as error:
         raise ConfigError(f"task._target_={target}: {' '.join(str(error).split())}") from error
     missing = [name for name in GIVEN_TO_TASKS if name not in parameters]

@@ -8,6 +8,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import reward2go
 
+LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from none
+
 
 def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
     """TorchRL's generalised advantage estimation, of values that stand in the rollout."""
@@ -53,7 +55,12 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
         copies = tensordict.batch_size[0]
         if copies < 2:
             raise ValueError("a baseline from the other copies needs at least 2 copies, got 1")
-        following = reward2go(tensordict["next", "reward"], tensordict["next", "done"], self.gamma)
+        reward = tensordict["next", "reward"]
+        # TorchRL's sum breaks off where a power of the discount is lost in rounding: here before
+        # the first term.
+        following = reward.clone()
+        if self.gamma >= LEAST_DISCOUNT:
+            following = reward2go(reward, tensordict["next", "done"], self.gamma)
         others = (following.sum(0, keepdim=True) - following) / (copies - 1)
         tensordict.set("advantage", following - others)
         return tensordict.set("value_target", following)

@@ -15,7 +15,7 @@ def episodes(rewards: torch.Tensor) -> TensorDict:
     return TensorDict({"next": following}, rewards.shape)
 
 
-@pytest.mark.parametrize("gamma", [1.0, 0.9])
+@pytest.mark.parametrize("gamma", [1.0, 0.9, 1e-6, 1e-8, 5e-324, 0.0])
 def test_the_return_to_come_minus_the_mean_of_the_others(gamma: float) -> None:
     rewards = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
     out = LeaveOneOutBaseline(gamma)(episodes(rewards))
