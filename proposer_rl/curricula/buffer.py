@@ -22,19 +22,19 @@ Functions return a changed copy and leave the buffer that they are given as it w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import torch
-from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.settings import settings
+from proposer_rl.curricula.checks import one_of, part, real, whole
 
 Prioritization = Literal["rank", "proportional", "softmax"]
 
 
-@settings
+@dataclass(frozen=True, kw_only=True)
 class ReplayRule:
     """How levels are drawn from a buffer.
 
@@ -45,12 +45,22 @@ class ReplayRule:
         temperature: T; towards 0 the best level takes all, towards infinity all are alike.
         best: the number of levels with the highest scores that get weights at all; None for all.
         staleness: share of the draws that go by the time since the last one.
+
+    Raises:
+        ValueError: if a number is out of range.
     """
 
     prioritization: Prioritization = "rank"
-    temperature: Annotated[float, Gt(0)] = 0.3
-    best: Annotated[int, Ge(1)] | None = None
-    staleness: Annotated[float, Interval(ge=0, le=1)] = 0.3
+    temperature: float = 0.3
+    best: int | None = None
+    staleness: float = 0.3
+
+    def __post_init__(self) -> None:
+        one_of("prioritization", self.prioritization, get_args(Prioritization))
+        real("temperature", self.temperature, above=0)
+        part("staleness", self.staleness)
+        if self.best is not None:
+            whole("best", self.best, 1)
 
 
 def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:

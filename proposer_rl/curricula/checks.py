@@ -37,15 +37,16 @@ def real(name: str, value: Any, *, least: float | None = None, above: float = -m
     return float(value)
 
 
-def part(name: str, value: Any, *, below_one: bool = False) -> float:
-    """The value as a float, if it is from 0 to 1, or to below 1.
+def part(name: str, value: Any, *, below_one: bool = False, above_zero: bool = False) -> float:
+    """The value as a float, if it is from 0, or above 0, to 1, or to below 1.
 
     Raises:
         ValueError: otherwise.
     """
     fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1
-    if not fits or (below_one and value == 1):
-        raise ValueError(f"{name} must be from 0 to {'below ' * below_one}1, got {value!r}")
+    if not fits or (below_one and value == 1) or (above_zero and value == 0):
+        least = "above" if above_zero else "from"
+        raise ValueError(f"{name} must be {least} 0 to {'below ' * below_one}1, got {value!r}")
     return float(value)
 
 

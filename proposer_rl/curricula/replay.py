@@ -39,6 +39,7 @@ from proposer_rl.curricula.buffer import (
     replay_weights,
     rescore,
 )
+from proposer_rl.curricula.checks import one_of, part, real, whole
 from proposer_rl.curricula.scores import Scored, Scorer, episodes
 from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
@@ -89,9 +90,15 @@ class ReplayCurriculum(Curriculum):
         renew: bool = False,
         co_learnability: float = 0.0,
     ) -> None:
-        _check(capacity, fill, replay_probability, train_on_new, synchronous, edits, parents)
+        if train_on_new and synchronous:
+            raise ValueError(
+                "train_on_new=true, synchronous=true: new levels are either trained on or only "
+                "scored, beside every update"
+            )
+        one_of("parents", parents, ("batch", "easy"))
         self.scorer, self.task = scorer, scorer.task
-        if edits and not isinstance(self.task, EditableTask):
+        self._capacity = whole("capacity", capacity, 1)
+        if whole("edits", edits, 0) and not isinstance(self.task, EditableTask):
             raise TypeError(
                 f"edits={edits}: {type(self.task).__name__} has no edit(levels, count, generators) "
                 "of its levels; set edits=0, as robust_plr does"
@@ -106,11 +113,12 @@ class ReplayCurriculum(Curriculum):
                 f"capacity={capacity} must be a multiple of the {self.task.batch_size} levels of "
                 "an update, where all of them are played on"
             )
-        self._rule, self._new_levels, self._capacity = rule, new_levels, capacity
-        self._warm = fill * capacity
-        self._probability, self._synchronous = replay_probability, synchronous
-        self._train_on_new, self._edits, self._parents = train_on_new, edits, parents
-        self._renew, self._co_learnability = renew, co_learnability
+        self._rule, self._new_levels = rule, new_levels
+        self._warm = real("fill", fill, above=0) * capacity
+        self._probability = part("replay_probability", replay_probability, above_zero=True)
+        self._synchronous, self._train_on_new = synchronous, train_on_new
+        self._edits, self._parents, self._renew = edits, parents, renew
+        self._co_learnability = real("co_learnability", co_learnability)
         self._template = new_levels.sample(1, torch.Generator()).cpu()[0]
         self.begin()
 
@@ -364,28 +372,3 @@ def _lineage(buffer: TensorDictBase) -> Tensor:
             break
         slots.append(parent[0])
     return torch.tensor(slots[::-1])
-
-
-def _check(
-    capacity: int,
-    fill: float,
-    probability: float,
-    train_on_new: bool,
-    synchronous: bool,
-    edits: int,
-    parents: str,
-) -> None:
-    if capacity < 1 or edits < 0:
-        raise ValueError(
-            f"capacity must be at least 1 and edits at least 0, got {capacity}, {edits}"
-        )
-    for name, value in (("fill", fill), ("replay_probability", probability)):
-        if not 0 < value <= 1:
-            raise ValueError(f"{name} must be above 0 and at most 1, got {value}")
-    if train_on_new and synchronous:
-        raise ValueError(
-            "train_on_new=true, synchronous=true: new levels are either trained on or only scored, "
-            "beside every update"
-        )
-    if parents not in ("batch", "easy"):
-        raise ValueError(f"parents={parents!r}: must be batch or easy")

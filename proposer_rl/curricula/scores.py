@@ -33,6 +33,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.learning import PPO
 from proposer_rl.learning.advantages import gae
 from proposer_rl.meta.gradient_norms import squared_gradients
@@ -127,15 +128,13 @@ class Scorer:
 
     def __init__(self, task: Task, name: str, source: Source, rollouts: int = 1) -> None:
         self.task = task
-        self.rollouts = rollouts
-        self.from_episodes = source == "episodes"
+        self.rollouts = whole("rollouts", rollouts, 1)
+        self.from_episodes = one_of("source", source, ("episodes", "exact")) == "episodes"
         self._name = name
         there_are = {
             "episodes": [*STEPWISE, "learnability", "regret"],
             "exact": ["learnability", "regret", "gradient_norm"],
         }
-        if source not in there_are:
-            raise ValueError(f"source={source!r}: must be one of {sorted(there_are)}")
         if name not in there_are[source]:
             raise ValueError(f"score={name!r}: from source={source} there are {there_are[source]}")
         if not self.from_episodes:

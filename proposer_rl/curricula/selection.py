@@ -14,6 +14,7 @@ from proposer_rl.curricula.batches import (
     plain_levels,
     restored_levels,
 )
+from proposer_rl.curricula.checks import part, whole
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
@@ -45,18 +46,15 @@ class SelectionCurriculum(Curriculum):
         self, scorer: Scorer, *, candidates: int, keep: int, every: int, new: float
     ) -> None:
         size = scorer.task.batch_size
-        if min(candidates, every) < 1 or candidates % size:
+        if whole("candidates", candidates, 1) % size:
             raise ValueError(
-                f"candidates={candidates} must be a multiple of the {size} levels of an update, "
-                f"and every={every} at least 1"
+                f"candidates={candidates} must be a multiple of the {size} levels of an update"
             )
-        if not 1 <= keep <= candidates:
-            raise ValueError(f"keep={keep} must be from 1 to candidates={candidates}")
-        if not 0 <= new <= 1:
-            raise ValueError(f"new={new} must be from 0 to 1")
+        if whole("keep", keep, 1) > candidates:
+            raise ValueError(f"keep={keep} must be at most candidates={candidates}")
+        self._every, self._new = whole("every", every, 1), round(part("new", new) * size)
+        self._candidates, self._keep = candidates, keep
         self.scorer, self.task = scorer, scorer.task
-        self._candidates, self._keep, self._every = candidates, keep, every
-        self._new = round(new * size)
         self._template = self.task.space.sample(1, torch.Generator()).cpu()[0]
         self.begin()
 

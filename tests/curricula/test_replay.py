@@ -284,18 +284,28 @@ def test_some_bins_are_those_of_the_values() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"capacity": 0}, "capacity must be at least 1"),
-        ({"fill": 0.0}, "fill must be above 0 and at most 1, got 0.0"),
-        ({"replay_probability": 1.5}, "replay_probability must be above 0"),
-        ({"edits": -1}, "edits at least 0"),
+        ({"capacity": 0}, "capacity must be a whole number from 1 to 1,000,000, got 0"),
+        ({"capacity": "lots"}, "capacity must be a whole number"),
+        ({"fill": 0.0}, "fill must be a finite number above 0, got 0.0"),
+        ({"replay_probability": 1.5}, "replay_probability must be above 0 to 1, got 1.5"),
+        ({"edits": -1}, "edits must be a whole number from 0"),
         ({"train_on_new": True}, "train_on_new=true, synchronous=true"),
-        ({"parents": "hard"}, "parents='hard': must be batch or easy"),
+        ({"parents": "hard"}, "parents must be batch or easy, got 'hard'"),
         ({"renew": True, "capacity": 15}, "capacity=15 must be a multiple of the 4 levels"),
     ],
 )
 def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replay(**options)
+
+
+@pytest.mark.parametrize(
+    "rule", [{"temperature": 0.0}, {"staleness": 1.5}, {"best": 0}, {"prioritization": "luck"}]
+)
+def test_rules_that_make_no_sense_are_refused(rule: dict[str, Any]) -> None:
+    (name,) = rule
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        ReplayRule(**rule)
 
 
 def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:

@@ -178,7 +178,7 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
 def test_what_cannot_be_scored_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match=r"score='luck': from source=exact there are \['learn"):
         Scorer(TASK, "luck", "exact")
-    with pytest.raises(ValueError, match="source='oracle': must be one of"):
+    with pytest.raises(ValueError, match="source must be episodes or exact, got 'oracle'"):
         Scorer(TASK, "regret", "oracle")  # type: ignore[arg-type]
     blind: Any = SimpleNamespace()
     with pytest.raises(TypeError, match="SimpleNamespace does not know the largest return"):

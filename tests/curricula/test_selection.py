@@ -90,9 +90,9 @@ def test_the_mixture_is_exact(new: float, fresh: int) -> None:
     ("options", "message"),
     [
         ({"candidates": 10}, "candidates=10 must be a multiple of the 4 levels"),
-        ({"every": 0}, "every=0 at least 1"),
-        ({"keep": 17}, "keep=17 must be from 1 to candidates=16"),
-        ({"new": -0.1}, "new=-0.1 must be from 0 to 1"),
+        ({"every": 0}, "every must be a whole number from 1"),
+        ({"keep": 17}, "keep=17 must be at most candidates=16"),
+        ({"new": -0.1}, "new must be from 0 to 1, got -0.1"),
     ],
 )
 def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
