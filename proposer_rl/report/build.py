@@ -94,7 +94,7 @@ def _check_output(output: Path) -> None:
 def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> page.Section:
     """What the page shows of a study; its files are added to the others."""
     found = findings(study)
-    claims, methods = finding_table(found), outcomes.group_table(study)
+    claims, methods = finding_table(study, found), outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
     for table in (methods, *tables, claims):
         files[f"{TABLES}/{prefix}{table.name}.csv"] = table.to_csv().encode()

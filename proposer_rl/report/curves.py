@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from proposer_rl.report.outcomes import updates_needed, waiting_outcome
+from proposer_rl.report.comparisons import updates_needed, waiting_outcome
 from proposer_rl.report.records import Column, is_rate, level_text, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import PANEL, Drawing, Panel, axes_of, look, style
 
@@ -34,10 +34,10 @@ def learning_curves(study: Study) -> Drawing:
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
-        "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t). Thin: not all "
-        "runs of the method are that long. Bars: mean number of updates, cut at the "
-        "horizon, with a bootstrap interval; dots are runs, triangles censored runs, which never "
-        "got there.",
+        "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t), from "
+        f"{FEWEST} seeds on. Thin: not all runs of the method are that long. Bars: mean number of "
+        "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
+        "runs, which never got there.",
         [*panels, bars],
         3,
         [group.label for group in study.groups],
@@ -195,15 +195,15 @@ def _axis(name: str) -> str:
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = axes_of(figure)
-    horizon = study.restricted_to(study.threshold)
+    horizon = study.horizon
     groups = study.compared[::-1]
     for place, group in enumerate(groups):
         waiting = group.waiting(study.headline, study.threshold)
-        interval = updates_needed(study, group, study.threshold)
+        interval = updates_needed(study, group)
         colour = look(group.label).colour
-        axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
-        if not np.isnan(interval.low):
-            axes.plot([interval.low, interval.high], [place, place], color=colour, linewidth=2.5)
+        if interval is not None:
+            axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
+            axes.plot(interval[1:], [place, place], color=colour, linewidth=2.5)
         offsets = place + np.linspace(-0.2, 0.2, len(waiting)) * (len(waiting) > 1)
         for run, y in zip(waiting, offsets, strict=True):
             marker = "o" if run.reached else ">"
@@ -221,4 +221,4 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel(waiting_outcome(study, study.threshold).name)
+    axes.set_xlabel(waiting_outcome(study).name)

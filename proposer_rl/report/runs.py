@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from proposer_rl.report.records import (
     number,
     printable,
 )
-from proposer_rl.report.statistics import Waiting
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
@@ -44,6 +43,18 @@ class UnreadableRun(ValueError):
     """A folder looks like a run's but cannot be read; the message is one line."""
 
     exit_code = 2
+
+
+class Waiting(NamedTuple):
+    """Updates until a threshold, of one run.
+
+    Attributes:
+        updates: when it was reached or, for a censored run, how long the run was.
+        reached: whether it was; False for a censored run.
+    """
+
+    updates: float
+    reached: bool
 
 
 @dataclass(frozen=True)
@@ -136,6 +147,17 @@ class Run:
         if len(reached):
             return Waiting(float(self.metrics["updates"][reached[0]]), True)
         return Waiting(float(self.updates), False)
+
+    def waited(self, measurement: str, threshold: float, horizon: float) -> float:
+        """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.
+
+        Also where it was reached: short runs that did would else count, and those that did not
+        would not.
+        """
+        waiting = self.waiting(measurement, threshold)
+        if self.updates < horizon:
+            return math.nan
+        return min(waiting.updates, horizon) if waiting.reached else horizon
 
     def at(self, measurement: str, updates: float) -> float:
         """A measurement after exactly that many updates; NaN where there was none."""

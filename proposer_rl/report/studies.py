@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.report.runs import Run, UnreadableRun, read_run
-from proposer_rl.report.statistics import Waiting, common_horizon
+from proposer_rl.report.runs import Run, UnreadableRun, Waiting, read_run
 
 LONGEST_LABEL = 40  # characters of the settings in a label
 
@@ -100,11 +99,6 @@ class Study:
         """Groups of which some run is as long as the horizon."""
         longest = {group.label: max(run.updates for run in group.runs) for group in self.groups}
         return [group for group in self.groups if longest[group.label] >= self.horizon]
-
-    def restricted_to(self, threshold: float) -> float:
-        """The horizon of restricted means to a threshold of the headline measurement."""
-        waiting = [group.waiting(self.headline, threshold) for group in self.compared]
-        return min(common_horizon(waiting), self.horizon)
 
     def group(self, label: str) -> Group | None:
         """The group of that label, if there is one."""

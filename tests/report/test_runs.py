@@ -14,8 +14,7 @@ import pytest
 
 from proposer_rl.report import runs
 from proposer_rl.report.proposals import axis_means
-from proposer_rl.report.runs import UnreadableRun, find_runs, read_run, share_map
-from proposer_rl.report.statistics import Waiting
+from proposer_rl.report.runs import UnreadableRun, Waiting, find_runs, read_run, share_map
 from tests.report.folders import TASK, cycle, write_run
 
 
@@ -30,6 +29,9 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert run.total_frames.tolist() == [0, 7000, 14000]
     assert run.waiting("id_success", 0.5) == Waiting(10, True)
     assert run.waiting("id_success", 0.95) == Waiting(20, False)
+    waited = [run.waited("id_success", level, 20) for level in (0.5, 0.95)]
+    assert waited == [10, 20] and run.waited("id_success", 0.9, 15) == 15
+    assert np.isnan(run.waited("id_success", 0.5, 30))
     assert run.at("id_success", 10) == 0.5 and np.isnan(run.at("id_success", 11))
     # Trapezoids of width 10: (0 + 0.5) / 2 and (0.5 + 0.9) / 2.
     assert run.mean_until("id_success", 20) == pytest.approx((0.25 + 0.7) / 2)
