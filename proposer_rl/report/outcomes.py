@@ -15,10 +15,17 @@ from proposer_rl.report.comparisons import (
     updates_needed,
     waiting_outcome,
 )
-from proposer_rl.report.records import LONGEST_TEXT, level_text, words
+from proposer_rl.report.records import LONGEST_TEXT, is_rate, level_text, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import FEWEST, Interval, interquartile_mean, mean_interval
-from proposer_rl.report.studies import Study
+from proposer_rl.report.statistics import (
+    FEWEST,
+    Interval,
+    interquartile_mean,
+    jackknife,
+    mean_interval,
+    probability_of_improvement,
+)
+from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
 
 MILLION = 1e6
@@ -58,7 +65,7 @@ def group_table(study: Study) -> Table:
     waiting, worst = waiting_outcome(study).name, f"{headline}_worst10"
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        runs, final = group.runs, _known(group.runs, headline, horizon)
+        runs = group.runs
         reached = sum(run.reached for run in group.waiting(headline, threshold))
         row: dict[str, Cell] = {
             "method": group.label,
@@ -69,7 +76,7 @@ def group_table(study: Study) -> Table:
         }
         for name in study.measurements:
             row[f"{words(name)} after {horizon} updates"] = _mean(_known(runs, name, horizon))
-        row[f"IQM of {words(headline)}"] = interquartile_mean(final) if final else None
+        row |= _over_levels(study, group)
         if any(worst in run.metrics for run in study.runs):
             row[f"{words(headline)}, worst 10 %"] = _mean(_known(runs, worst, horizon))
         cost: dict[str, Callable[[Run], float]] = {
@@ -83,10 +90,32 @@ def group_table(study: Study) -> Table:
     note = (
         f"Updates: mean of min(updates, {horizon}) over the runs of full length; measured every "
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
-        "spent. Evaluations: of levels, asked for by the curriculum. Brackets: 95 % interval, "
-        f"from {FEWEST} seeds on, where they differ."
+        "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
+        "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
+        "success; both where the runs tell of single levels. P(better): that a run of the method "
+        f"has the higher {primary(study).name}. Brackets: 95 % interval, from {FEWEST} seeds on, "
+        "where they differ."
     )
     return Table("methods", "Methods", note, rows)
+
+
+def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
+    """What is told of single levels, and of the baseline; empty cells where it is not known."""
+    name, outcome, baseline = study.headline, primary(study), study.baseline
+    scores = study.scores(group, name)
+    row: dict[str, Cell] = {}
+    if any(study.scores(each, name) is not None for each in study.groups):
+        iqm = None if scores is None else jackknife(interquartile_mean, scores)
+        row[f"IQM of {words(name)}"] = iqm
+        if is_rate(name):
+            gap = None if scores is None else mean_interval(1 - scores.mean(1))
+            row[f"optimality gap of {words(name)}"] = gap
+    values = [outcome.values(each) for each in (group, baseline)]
+    compared = group is not baseline and all(values)
+    row[f"P(better than {baseline.label})"] = (
+        probability_of_improvement(*values) if compared else None
+    )
+    return row
 
 
 def run_table(study: Study) -> Table:

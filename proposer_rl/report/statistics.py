@@ -6,6 +6,7 @@ apart, is measured in ``tests/report/test_coverage.py``.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -166,15 +167,16 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
-    """Seeds with which a difference as large as the one seen would be found, about.
+    """More seeds, with which a difference as large as the one seen would be found, about.
 
-    A standard error falls with the root of the number of seeds; with the normal distribution's
-    quantiles, for a two-sided test with a power of 80 % (Cohen, Statistical Power Analysis, 1988).
+    With a power of 80 %: the two quantiles of Student's distribution, of the test and of the power,
+    add up to the difference in standard errors, which fall with the root of the number of seeds
+    (Cohen, Statistical Power Analysis, 1988).
 
     Args:
         difference: as it was seen.
         seeds: with so many.
-        level: of the test.
+        level: of the two-sided test.
 
     Returns:
         None where nothing can be said: too few seeds, or no difference at all.
@@ -182,5 +184,12 @@ def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
     effect = abs(difference.value) / difference.error
     if not effect > 0:
         return None
+
+    def enough(count: int) -> bool:
+        freedom = difference.freedom * count / seeds
+        quantiles = special.stdtrit(freedom, [1 - level / 2, POWER])
+        return bool(quantiles.sum() <= effect * math.sqrt(count / seeds))
+
     quantiles = special.ndtri([1 - level / 2, POWER])
-    return math.ceil(seeds * (float(quantiles.sum()) / effect) ** 2)
+    least = math.floor(seeds * (float(quantiles.sum()) / effect) ** 2)  # of a normal distribution
+    return next(count for count in itertools.count(max(least, seeds + 1)) if enough(count))
