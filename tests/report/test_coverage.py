@@ -95,7 +95,7 @@ def test_intervals_over_levels_and_seeds_cover(seeds: int) -> None:
         return 1 / (1 + np.exp(-(ability + hardness + rng.normal(0, 1, (count, seeds, 64)))))
 
     truth = interquartile_mean(scores(2000))
-    found = [jackknife(interquartile_mean, rows) for rows in scores(500)]
+    found = [jackknife(interquartile_mean, rows) for rows in scores(1200)]
     held = np.mean([one.low <= truth <= one.high for one in found])
     assert held >= ENOUGH
     drawn = []
