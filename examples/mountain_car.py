@@ -121,6 +121,7 @@ class MountainCarTask:
             "about": {"Measured on": f"{self._levels} cars of a weak engine, and of all kinds"},
             "key": "Blue: start. Orange: top. Purple: where the car was.",
             "measured": {"levels": self._levels, "steps": self._solver.ppo.horizon},
+            "exact": True,
             "samples": {name: self.record(c[:6], None) for name, c in self._measured_on.items()},
         }
 

@@ -101,6 +101,7 @@ class Task(Protocol):
         - ``about``: texts by their labels; ``key`` and ``text_key``: what is to be seen in a
           record's picture and in its text;
         - ``measured``: all that must be equal for two runs' measurements to be comparable;
+        - ``exact``: whether the measurements draw nothing at random;
         - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
         """
 

@@ -43,6 +43,7 @@ def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> Non
     log = make_log(LoggerSettings(type="tensorboard"), folder, "run")
     assert log is not None
     log("cycles", cycles[0], 20)
+    log("cycles", {"levels": {"best": [LEVEL], "none": []}}, 20)
     log("curriculum", {"levels": [LEVEL, {"picture": "none"}, *[LEVEL] * 4]}, 20)
     (events_folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
     events = EventAccumulator(str(events_folder)).Reload()
@@ -53,5 +54,7 @@ def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> Non
     assert shown.shape == (2 * 20 + 8, 4 * 40 + 3 * 8, 3)  # five pictures, four in a row
     assert np.array_equal(shown[:20, 48:88], PIXELS) and np.array_equal(shown[28:, :40], PIXELS)
     assert (shown[20:28] == 255).all() and (shown[28:, 48:] == 255).all()
+    (event,) = events.Images("cycles/best")
+    assert (event.height, event.width) == (20, 40)
     (event,) = events.Images("cycles/histogram")
     assert event.step == 20 and event.width > 200

@@ -148,6 +148,7 @@ def test_what_a_reader_is_told(task: Task) -> None:
     facts = json.loads(json.dumps(task.facts))
     assert facts.keys() - {"text_key"} == {
         "title", "levels", "distributions", "space", "about", "key", "measured", "samples",
+        "exact",
     }  # fmt: skip
     for name in facts["distributions"]:
         assert f"{name}_success" in task.measurements

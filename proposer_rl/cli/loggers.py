@@ -72,10 +72,12 @@ def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
 
 def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     """What of a row is seen better than read, as uint8 [H, W, 3]."""
-    found = [picture(record.get("picture")) for record in row.get("levels", ())]
-    tiles = [tile for tile in found if tile is not None]
-    if tiles:
-        yield "levels", _sheet(tiles)
+    levels = row.get("levels", ())
+    for name, records in levels.items() if isinstance(levels, Mapping) else [("levels", levels)]:
+        found = [picture(record.get("picture")) for record in records]
+        tiles = [tile for tile in found if tile is not None]
+        if tiles:
+            yield name, _sheet(tiles)
     if "histogram" in row:
         image = last_map(path)
         if image is not None:

@@ -16,6 +16,7 @@ examples:
   bin/report outputs                       every run below outputs/, to report/
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
+  bin/report sweeps/quick --baseline target   everything measured against that method
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -30,7 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     page = write_report(
-        options.folder, options.output, options.threshold, progress=not options.quiet
+        options.folder,
+        options.output,
+        options.threshold,
+        options.baseline,
+        progress=not options.quiet,
     )
     print(f"Report: {page}")
 
@@ -52,6 +57,12 @@ def _parser() -> argparse.ArgumentParser:
         "--threshold",
         type=_finite,
         help="of sample efficiency, such as 0.8 of a success (default: the runs' own)",
+    )
+    parser.add_argument(
+        "--baseline",
+        metavar="METHOD",
+        help="what the others are measured against, as the report calls it (default: "
+        "domain_randomization, else the first)",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

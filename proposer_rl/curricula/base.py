@@ -44,7 +44,8 @@ class Improvement:
     """What a curriculum did before a cycle.
 
     Attributes:
-        metrics: of the cycle, ready for JSON; empty if there is nothing to tell.
+        metrics: of the cycle, ready for JSON; empty if there is nothing to tell. ``levels`` in it
+            are records of the task (:meth:`~proposer_rl.task.Task.record`) by their captions.
         frames: environment steps that it cost each Solver, beyond its own.
         evaluations: levels on which policies were evaluated for it, for each Solver.
         advance: None if the Solver is as it was.

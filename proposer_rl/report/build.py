@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import curves, levels, outcomes, page, proposals
+from proposer_rl.report import curves, levels, outcomes, page, proposals, single_levels
 from proposer_rl.report.findings import finding_table, findings
 from proposer_rl.report.records import is_rate
 from proposer_rl.report.runs import find_runs
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, save
-from proposer_rl.report.tables import escape_markdown, to_csv
+from proposer_rl.report.tables import Cell, escape_markdown, to_csv
 from proposer_rl.runs.folder import write_atomically
 
 PAGE = "report.html"
@@ -26,23 +26,39 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.learning_curves,
     curves.cost_curves,
     curves.worst_levels,
+    single_levels.worst_curves,
+    single_levels.level_by_level,
     curves.difficulty,
     proposals.gains,
     proposals.heat_maps,
     levels.along_training,
     levels.side_by_side,
+    levels.told_by_curricula,
     proposals.diagnostics,
 )
 
 
+# Numbers behind the figures, as CSV alone.
+TIDY: Mapping[str, Callable[[Study], tuple[list[str], list[list[Cell]]]]] = {
+    "metrics": outcomes.tidy_metrics,
+    "cycles": outcomes.tidy_cycles,
+    "worst_share": single_levels.worst_table,
+    "levels": single_levels.level_table,
+}
+
+
 class OutputError(ValueError):
-    """The output folder cannot be taken; the message is one line."""
+    """What was asked for cannot be written; the message is one line."""
 
     exit_code = 2
 
 
 def write_report(
-    folders: Sequence[Path], output: Path, threshold: float | None = None, progress: bool = True
+    folders: Sequence[Path],
+    output: Path,
+    threshold: float | None = None,
+    baseline: str | None = None,
+    progress: bool = True,
 ) -> Path:
     """Write a report.
 
@@ -50,6 +66,8 @@ def write_report(
         folders: of runs, or with runs in them.
         output: folder to write to; a report in it is replaced, other files stay.
         threshold: of the headline measurement, in place of the runs' own.
+        baseline: label of the method that the others are measured against; None for
+            ``domain_randomization`` or, where that is missing, the first.
         progress: whether to draw a progress bar.
 
     Returns:
@@ -57,10 +75,14 @@ def write_report(
 
     Raises:
         UnreadableRun: if a folder has no run, or none can be read.
-        OutputError: if the output folder holds something that is no report.
+        OutputError: if the output folder holds something that is no report, or there is no such
+            threshold or baseline.
     """
     _check_output(output)
-    studies, notes = read_studies(find_runs(folders), threshold)
+    studies, notes = read_studies(find_runs(folders), threshold, baseline)
+    labels = sorted({group.label for study in studies for group in study.groups})
+    if baseline not in (None, *labels):
+        raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
     for study in studies:
         if threshold is not None and is_rate(study.headline) and not 0 < threshold <= 1:
             raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
@@ -73,7 +95,7 @@ def write_report(
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
             sections.append(_section(study, prefix, files, bar))
     title = "Curricula: what the runs show"
-    command = page.report_command(folders, threshold)
+    command = page.report_command(folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
     files["report.md"] = _markdown(title, command, sections).encode()
     _write(output, files)
@@ -94,12 +116,12 @@ def _check_output(output: Path) -> None:
 def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> page.Section:
     """What the page shows of a study; its files are added to the others."""
     found = findings(study)
-    claims, methods = finding_table(found), outcomes.group_table(study)
+    claims, methods = finding_table(study, found), outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
     for table in (methods, *tables, claims):
         files[f"{TABLES}/{prefix}{table.name}.csv"] = table.to_csv().encode()
         files[f"{TABLES}/{prefix}{table.name}.md"] = table.to_markdown().encode()
-    for name, tidy in (("metrics", outcomes.tidy_metrics), ("cycles", outcomes.tidy_cycles)):
+    for name, tidy in TIDY.items():
         header, rows = tidy(study)
         if rows:
             files[f"{TABLES}/{prefix}{name}.csv"] = to_csv(header, rows).encode()

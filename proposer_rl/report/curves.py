@@ -10,12 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from proposer_rl.report.outcomes import updates_needed, waiting_outcome
+from proposer_rl.report.comparisons import updates_needed, waiting_outcome
 from proposer_rl.report.records import Column, is_rate, level_text, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import PANEL, Drawing, Panel, axes_of, look, style
+from proposer_rl.report.style import PANEL, Drawing, Look, Panel, axes_of, style
 
 GRID_POINTS = 200
 MOST_PANELS = 12
@@ -34,13 +34,13 @@ def learning_curves(study: Study) -> Drawing:
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
-        "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t). Thin: not all "
-        "runs of the method are that long. Bars: mean number of updates, cut at the "
-        "horizon, with a bootstrap interval; dots are runs, triangles censored runs, which never "
-        "got there.",
+        "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t), from "
+        f"{FEWEST} seeds on. Thin: not all runs of the method are that long. Bars: mean number of "
+        "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
+        "runs, which never got there.",
         [*panels, bars],
         3,
-        [group.label for group in study.groups],
+        study.legend,
     )
 
 
@@ -58,30 +58,35 @@ def worst_levels(study: Study) -> Drawing | None:
         f"Mean over the 10 % of the {study.example.task.levels} where the Solver is worst at that "
         "moment: a policy that gives up on hard ones shows here first.",
         panels,
-        labels=[group.label for group in study.groups],
+        legend=study.legend,
     )
 
 
 def cost_curves(study: Study) -> Drawing:
-    """The headline against what was paid for it, the curriculum's part counted."""
+    """The headline against updates, and against what was paid for it with the curriculum's part."""
+    name = words(study.headline)
     costs: dict[str, Callable[[Run], Column]] = {
-        "environment frames, millions": lambda run: run.total_frames / 1e6,
-        "wall-clock minutes": lambda run: (run.own_seconds - run.own_seconds[0]) / 60,
+        "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
+        "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
     }
     return Drawing(
         "cost",
-        f"The same {words(study.headline)} against its whole cost",
+        f"The same {name} against updates and against its whole cost",
         "Frames: the Solver's own plus those that the curriculum spent, on copies or on scoring. "
-        "Minutes: of the whole process, evaluation included; where seeds were trained together, "
-        "an even share. Minutes can be compared only between runs on equal machines.",
+        "Seconds: of the whole process, evaluation included; where seeds were trained together, "
+        "an even share. Seconds can be compared only between runs on equal machines.",
         [
-            Panel(
-                f"{words(study.headline)} against {axis} (the curriculum's counted), by method.",
-                partial(_draw_against_cost, study=study, axis=f"{axis} (all)", x=cost),
-            )
-            for axis, cost in costs.items()
+            _curve_panel(study, study.headline),
+            *(
+                Panel(
+                    f"{name} against {axis}, the curriculum's counted, by method.",
+                    partial(_draw_against_cost, study=study, axis=axis, x=cost),
+                )
+                for axis, cost in costs.items()
+            ),
         ],
-        labels=[group.label for group in study.groups],
+        3,
+        study.legend,
     )
 
 
@@ -97,29 +102,29 @@ def difficulty(study: Study) -> Drawing | None:
         "says so standard deviations (sd). Lines and bands as above.",
         [_curve_panel(study, name, "training") for name in names[:MOST_PANELS]],
         3,
-        [group.label for group in study.groups],
+        study.legend,
     )
 
 
-def draw_curve(axes: Axes, x: Column, rows: Column, label: str) -> Column:
+def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
     """Mean and interval of runs over x.
 
     Args:
         axes: where to draw.
         x: float [n].
         rows: float [runs, n], NaN where a run has no value.
-        label: of the method.
+        look: of the method.
 
     Returns:
         The mean, float [n].
     """
     mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
     whole = ~np.isnan(rows).any(0)
-    axes.plot(x, mean, alpha=0.5, linewidth=0.8, **style(label))
-    axes.plot(x, np.where(whole, mean, np.nan), **style(label), marker="." if len(x) == 1 else "")
+    axes.plot(x, mean, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
+    axes.plot(x, np.where(whole, mean, np.nan), **style(look, len(x)))
     if len(rows) > 1 and whole.any():
         _, low, high = np.array([mean_interval(values) for values in rows.T[whole]]).T
-        axes.fill_between(x[whole], low, high, color=look(label).colour, alpha=0.15, linewidth=0)
+        axes.fill_between(x[whole], low, high, color=look.colour, alpha=0.15, linewidth=0)
     return mean
 
 
@@ -166,7 +171,7 @@ def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: 
             rows = np.full((len(columns), len(x)), np.nan)
             for row, own in zip(rows, columns, strict=True):
                 row[np.searchsorted(x, own["updates"])] = own[name]
-            means.append(draw_curve(axes, x, rows, group.label))
+            means.append(draw_curve(axes, x, rows, group.look))
     trained = table == "training"
     text = name.replace("_", " ") if trained else _axis(name)
     finish(axes, "Solver updates", text, means, rate=is_rate(name), zero=trained)
@@ -184,7 +189,7 @@ def _draw_against_cost(
             np.interp(grid, x(run), run.metrics[name], left=np.nan, right=np.nan)
             for run in group.runs
         ]
-        means.append(draw_curve(axes, grid, np.array(rows), group.label))
+        means.append(draw_curve(axes, grid, np.array(rows), group.look))
     finish(axes, axis, _axis(name), means, rate=is_rate(name))
 
 
@@ -195,15 +200,15 @@ def _axis(name: str) -> str:
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = axes_of(figure)
-    horizon = study.restricted_to(study.threshold)
+    horizon = study.horizon
     groups = study.compared[::-1]
     for place, group in enumerate(groups):
         waiting = group.waiting(study.headline, study.threshold)
-        interval = updates_needed(study, group, study.threshold)
-        colour = look(group.label).colour
-        axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
-        if not np.isnan(interval.low):
-            axes.plot([interval.low, interval.high], [place, place], color=colour, linewidth=2.5)
+        interval = updates_needed(study, group)
+        colour = group.look.colour
+        if interval is not None:
+            axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
+            axes.plot(interval[1:], [place, place], color=colour, linewidth=2.5)
         offsets = place + np.linspace(-0.2, 0.2, len(waiting)) * (len(waiting) > 1)
         for run, y in zip(waiting, offsets, strict=True):
             marker = "o" if run.reached else ">"
@@ -221,4 +226,4 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel(waiting_outcome(study, study.threshold).name)
+    axes.set_xlabel(waiting_outcome(study).name)

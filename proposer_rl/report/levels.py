@@ -75,6 +75,31 @@ def side_by_side(study: Study) -> Drawing | None:
     )
 
 
+def told_by_curricula(study: Study) -> Drawing | None:
+    """Levels that curricula tell of: the last time, of each method's first seed."""
+    panels = [
+        Panel(
+            f"{study.example.task.levels.capitalize()} that the curriculum of {group.label} tells "
+            f"of: {caption}.",
+            partial(_draw_row, levels=levels, title=f"{group.label}: {caption}"),
+            (SIDE * SAMPLES, SIDE + 0.35),
+        )
+        for group in study.groups
+        for caption, levels in group.runs[0].sheets.items()
+        if any(level.picture for level in levels[:SAMPLES])
+    ]
+    if not panels:
+        return None
+    return Drawing(
+        "told",
+        f"{study.example.task.levels.capitalize()} that the curricula tell of",
+        "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
+        f"{study.example.task.key}",
+        panels,
+        1,
+    )
+
+
 def draw_run(folder: Path, title: str) -> Path:
     """One picture of a run: what was measured on every distribution, and levels trained on.
 

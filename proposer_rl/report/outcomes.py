@@ -1,143 +1,35 @@
-"""What came out: one row per run, per group, and per pair of groups."""
+"""What came out, in tables: a row per group, per pair of groups, per run and per measurement."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from proposer_rl.report import records
-from proposer_rl.report.records import LONGEST_TEXT, level_text, words
+from proposer_rl.report.comparisons import (
+    comparisons,
+    primary,
+    updates_needed,
+    waiting_outcome,
+)
+from proposer_rl.report.records import LONGEST_TEXT, is_rate, level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
+    FEWEST,
     Interval,
-    Values,
     interquartile_mean,
-    mean_difference,
+    jackknife,
     mean_interval,
     probability_of_improvement,
-    pseudo_values,
-    restricted_difference,
-    restricted_interval,
-    seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
 
 MILLION = 1e6
 MOST_COLUMNS, DEEPEST = 200, 8
-
-
-class Comparison(NamedTuple):
-    """Two groups by one outcome.
-
-    Attributes:
-        one, other: their labels.
-        outcome: what is compared.
-        difference: of ``one`` minus ``other``.
-        better: the label of the better group, None where the interval includes zero.
-        improvement: probability that a run of ``one`` is better than a run of ``other``.
-        seeds: per group, with which a difference as large as the one seen would be found.
-    """
-
-    one: str
-    other: str
-    outcome: str
-    difference: Interval
-    better: str | None
-    improvement: Interval
-    seeds: int | None
-
-
-class Outcome(NamedTuple):
-    """A number for each run of a group, and how two groups differ by it.
-
-    Attributes:
-        name: with its unit.
-        values: one per run that can be counted.
-        difference: of two groups.
-        sign: 1 where more is better, -1 where less is.
-    """
-
-    name: str
-    values: Callable[[Group], Values]
-    difference: Callable[[Group, Group], Interval]
-    sign: int
-
-
-def outcomes(study: Study) -> list[Outcome]:
-    """What groups of a study are compared by; the sample efficiency comes first."""
-    headline, horizon = study.headline, study.horizon
-
-    def plain(name: str, value: Callable[[Run], float]) -> Outcome:
-        def values(group: Group) -> list[float]:
-            return [one for run in group.runs if not math.isnan(one := value(run))]
-
-        return Outcome(name, values, lambda a, b: mean_difference(values(a), values(b)), 1)
-
-    mean = f"{words(headline)}, mean over {horizon} updates"
-    return [
-        waiting_outcome(study, study.threshold),
-        plain(mean, lambda run: run.mean_until(headline, horizon)),
-        *(
-            plain(
-                f"{words(name)} after {horizon} updates",
-                partial(Run.at, measurement=name, updates=horizon),
-            )
-            for name in study.measurements
-        ),
-    ]
-
-
-def waiting_outcome(study: Study, threshold: float) -> Outcome:
-    """Restricted updates to a threshold of the headline measurement."""
-    name, limit = study.headline, study.restricted_to(threshold)
-
-    def difference(one: Group, other: Group) -> Interval:
-        waiting = [group.waiting(name, threshold) for group in (one, other)]
-        return restricted_difference(waiting[0], waiting[1], limit)
-
-    return Outcome(
-        f"updates to {level_text(name, threshold)} {words(name)} (at most {limit:.0f})",
-        lambda group: pseudo_values(group.waiting(name, threshold), limit),
-        difference,
-        -1,
-    )
-
-
-def updates_needed(study: Study, group: Group, threshold: float) -> Interval:
-    """Restricted mean of a group's updates to a threshold of the headline measurement."""
-    return restricted_interval(
-        group.waiting(study.headline, threshold), study.restricted_to(threshold)
-    )
-
-
-def compare(outcome: Outcome, one: Group, other: Group) -> Comparison:
-    """Compare two groups."""
-    difference = outcome.difference(one, other)
-    better = None
-    if difference.decided:
-        better = one.label if difference.estimate * outcome.sign > 0 else other.label
-    a, b = (outcome.sign * np.asarray(outcome.values(group)) for group in (one, other))
-    return Comparison(
-        one.label,
-        other.label,
-        outcome.name,
-        difference,
-        better,
-        probability_of_improvement(a, b),
-        None if better else seeds_needed(a, b),
-    )
-
-
-def comparisons(study: Study) -> list[Comparison]:
-    """Every pair of groups by every outcome."""
-    pairs = list(combinations(study.compared, 2))
-    return [compare(outcome, *pair) for outcome in outcomes(study) for pair in pairs]
 
 
 def comparison_table(study: Study) -> Table:
@@ -148,17 +40,21 @@ def comparison_table(study: Study) -> Table:
             "first": row.one,
             "second": row.other,
             "difference": row.difference,
-            "better": row.better or "undecided",
+            "verdict": row.decision.verdict if row.decision else None,
+            "p (Holm)": row.decision.p if row.decision else None,
             "P(first better)": row.improvement,
-            "seeds needed": row.seeds,
+            "seeds needed": row.decision.seeds if row.decision else None,
         }
         for row in comparisons(study)
     ]
     note = (
-        "Difference: first minus second, with a 95 % interval: percentile bootstrap over the runs "
-        "for updates, Welch's for the others. P(first better): over all pairs of runs, ties count "
-        "half. Seeds needed: per method, for a power of 80 % at 5 % if the true difference is the "
-        "one seen. No correction for the number of comparisons."
+        f"Only the primary outcome, {primary(study).name}, has verdicts; their p-values are "
+        "corrected together for the number of pairs (Holm). Difference: first minus second, with "
+        "a 95 % interval, not corrected: Student's over pairs of runs where both have the same "
+        "seeds, else Welch's. P(first better): over all pairs of runs, ties count half; with "
+        "Clopper's and Pearson's interval. Seeds needed: per method, about, for a power of 80 % if "
+        "the true difference is the one seen. With fewer than "
+        f"{FEWEST} seeds no interval and no verdict."
     )
     return Table("comparisons", "Pairwise comparisons", note, rows)
 
@@ -166,21 +62,21 @@ def comparison_table(study: Study) -> Table:
 def group_table(study: Study) -> Table:
     """One row per group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
-    waiting, worst = waiting_outcome(study, threshold).name, f"{headline}_worst10"
+    waiting, worst = waiting_outcome(study).name, f"{headline}_worst10"
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        runs, final = group.runs, _known(group.runs, headline, horizon)
+        runs = group.runs
         reached = sum(run.reached for run in group.waiting(headline, threshold))
-        needed = updates_needed(study, group, threshold) if group in study.compared else None
         row: dict[str, Cell] = {
             "method": group.label,
             "seeds": len(runs),
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
-            waiting: needed,
+            waiting: updates_needed(study, group),
+            primary(study).name: _mean(primary(study).values(group)),
         }
         for name in study.measurements:
             row[f"{words(name)} after {horizon} updates"] = _mean(_known(runs, name, horizon))
-        row[f"IQM of {words(headline)}"] = interquartile_mean(final) if final else None
+        row |= _over_levels(study, group)
         if any(worst in run.metrics for run in study.runs):
             row[f"{words(headline)}, worst 10 %"] = _mean(_known(runs, worst, horizon))
         cost: dict[str, Callable[[Run], float]] = {
@@ -192,12 +88,34 @@ def group_table(study: Study) -> Table:
         row |= {name: float(np.mean([paid(run) for run in runs])) for name, paid in cost.items()}
         rows.append(row)
     note = (
-        f"Updates: mean of min(updates, {study.restricted_to(threshold):.0f}) by Kaplan-Meier, so "
-        "that censored runs count; measured every few updates, so never exact. Frames: the "
-        "Solver's own, and with all that the curriculum spent. Evaluations: of levels, asked for "
-        "by the curriculum. Brackets: 95 % interval."
+        f"Updates: mean of min(updates, {horizon}) over the runs of full length; measured every "
+        "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
+        "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
+        "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
+        "success; both where the runs tell of single levels. P(better): that a run of the method "
+        f"has the higher {primary(study).name}. Brackets: 95 % interval, from {FEWEST} seeds on, "
+        "where they differ."
     )
     return Table("methods", "Methods", note, rows)
+
+
+def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
+    """What is told of single levels, and of the baseline; empty cells where it is not known."""
+    name, outcome, baseline = study.headline, primary(study), study.baseline
+    scores = study.scores(group, name)
+    row: dict[str, Cell] = {}
+    if any(study.scores(each, name) is not None for each in study.groups):
+        iqm = None if scores is None else jackknife(interquartile_mean, scores)
+        row[f"IQM of {words(name)}"] = iqm
+        if is_rate(name):
+            gap = None if scores is None else mean_interval(1 - scores.mean(1))
+            row[f"optimality gap of {words(name)}"] = gap
+    values = [outcome.values(each) for each in (group, baseline)]
+    compared = group is not baseline and all(values)
+    row[f"P(better than {baseline.label})"] = (
+        probability_of_improvement(*values) if compared else None
+    )
+    return row
 
 
 def run_table(study: Study) -> Table:

@@ -17,12 +17,13 @@ from proposer_rl.report.proposals import ANIMATION
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, look, save_panel
+from proposer_rl.report.style import Drawing, save_panel
 
 PIXELS = 78  # of an inch of a figure
 LONGEST_WORD = 2000  # of a command
 WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
+MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
 
 
 Section = dict[str, Any]  # all that the page shows of a study, as the template names it
@@ -47,12 +48,15 @@ def figure(drawing: Drawing) -> Section:
             size = (height * ANIMATION[0] / ANIMATION[1], height)
             text = f"{panel.description} As an animation over the cycles."
             images.append(_image(panel.animation[1], "image/gif", text, size))
-    legend = [(label, *look(label)) for label in drawing.labels]
+    legend = [
+        {"label": label, "colour": look.colour, "dash": DASHES[look.dash], "mark": MARKS[look.mark]}
+        for label, look in drawing.legend.items()
+    ]
     return {
         "title": drawing.title,
         "caption": drawing.caption,
         "images": images,
-        "legend": [{"label": n, "colour": c, "dash": DASHES[dash]} for n, c, dash in legend],
+        "legend": legend,
     }
 
 
@@ -116,9 +120,10 @@ def _image(content: bytes, kind: str, description: str, size: tuple[float, float
     }
 
 
-def report_command(folders: Sequence[Path], threshold: float | None) -> str:
+def report_command(folders: Sequence[Path], threshold: float | None, baseline: str | None) -> str:
     """What writes this report again, without the places of this machine."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
+    asked += [] if baseline is None else [f"--baseline={baseline}"]
     return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked]))
 
 

@@ -22,7 +22,7 @@ from proposer_rl.report.curves import draw_curve, finish
 from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
 from proposer_rl.report.runs import Run, read_run, share_map
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, look
+from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of
 
 Value = Callable[[Record], float]  # of a cycle; NaN where it has none
 
@@ -124,7 +124,7 @@ def diagnostics(study: Study) -> Drawing | None:
             for text, value in values.items()
         ],
         3,
-        [group.label for group in groups],
+        {group.label: group.look for group in groups},
     )
 
 
@@ -163,7 +163,7 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
 
 def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> None:
     axes = axes_of(figure)
-    colour = look(group.label).colour
+    colour = group.look.colour
     points = np.array([(updates, gain) for updates, c in _lists(group, name) for gain in c])
     # As pixels also in SVG, where thousands of dots would make the page heavy.
     axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
@@ -246,7 +246,7 @@ def _draw_over_cycles(figure: FigureBase, groups: Sequence[Group], value: Value,
     for group in groups:
         x, rows = _per_cycle(group, value)
         seen = ~np.isnan(rows).all(0)
-        means.append(draw_curve(axes, x[seen], rows[:, seen], group.label))
+        means.append(draw_curve(axes, x[seen], rows[:, seen], group.look))
     finish(axes, "Solver updates", axis, means)
 
 

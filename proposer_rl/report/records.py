@@ -45,6 +45,22 @@ class LevelRecord(BaseModel):
     text: Annotated[list[Text], Field(max_length=64)] = []
 
 
+Result = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
+Results = Annotated[list[Result], Field(min_length=1)]
+# What a cycle tells in pictures, by their captions.
+Sheets = Annotated[dict[Name, list[LevelRecord]], Field(max_length=16)]
+
+
+class LevelResults(BaseModel):
+    """What a seed reached on every level of a distribution."""
+
+    updates: int
+    seed: int
+    distribution: Name
+    success: Results | None = None
+    returns: Annotated[Results | None, Field(alias="return")] = None
+
+
 class SampleRecord(BaseModel):
     """Levels that a seed trained on."""
 
@@ -66,6 +82,7 @@ class TaskFacts(BaseModel):
         samples: levels of each distribution.
         key: what is to be seen in pictures.
         text_key: what is to be seen in levels drawn in characters.
+        exact: whether nothing is drawn at random to measure it; None where that is not said.
     """
 
     title: Name
@@ -80,6 +97,7 @@ class TaskFacts(BaseModel):
     samples: dict[Name, list[LevelRecord]] = {}
     key: Text = ""
     text_key: Text = ""
+    exact: bool | None = None
 
 
 def checked(kind: type[T], value: Any, where: str) -> T:

@@ -7,25 +7,27 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from proposer_rl.report.records import (
     LARGEST,
     Column,
+    LevelRecord,
+    LevelResults,
     Name,
     Record,
     SampleRecord,
+    Sheets,
     TaskFacts,
     checked,
     is_rate,
     number,
     printable,
 )
-from proposer_rl.report.statistics import Waiting
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
@@ -46,6 +48,18 @@ class UnreadableRun(ValueError):
     exit_code = 2
 
 
+class Waiting(NamedTuple):
+    """Updates until a threshold, of one run.
+
+    Attributes:
+        updates: when it was reached or, for a censored run, how long the run was.
+        reached: whether it was; False for a censored run.
+    """
+
+    updates: float
+    reached: bool
+
+
 @dataclass(frozen=True)
 class Run:
     """One seed of one run's folder.
@@ -61,6 +75,8 @@ class Run:
         metrics, training: columns of the tables, equally long within a table.
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
+        levels: what was reached on every level at the end, [levels], by the measurement's column.
+        sheets: pictures of levels by their captions, as the curriculum told of them last.
     """
 
     folder: Path
@@ -74,6 +90,8 @@ class Run:
     training: Mapping[str, Column]
     cycles: Sequence[Record]
     samples: Sequence[SampleRecord]
+    levels: Mapping[str, Column] = field(default_factory=dict)
+    sheets: Mapping[str, Sequence[LevelRecord]] = field(default_factory=dict)
 
     @property
     def method(self) -> str:
@@ -136,6 +154,17 @@ class Run:
         if len(reached):
             return Waiting(float(self.metrics["updates"][reached[0]]), True)
         return Waiting(float(self.updates), False)
+
+    def waited(self, measurement: str, threshold: float, horizon: float) -> float:
+        """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.
+
+        Also where it was reached: short runs that did would else count, and those that did not
+        would not.
+        """
+        waiting = self.waiting(measurement, threshold)
+        if self.updates < horizon:
+            return math.nan
+        return min(waiting.updates, horizon) if waiting.reached else horizon
 
     def at(self, measurement: str, updates: float) -> float:
         """A measurement after exactly that many updates; NaN where there was none."""
@@ -233,8 +262,11 @@ def _read_run(folder: Path) -> list[Run]:
     cycles = _optional(folder, "cycles.jsonl", read_jsonl)
     if any(math.isnan(number(row["updates"])) for row in cycles):
         raise ValueError("cycles.jsonl: updates is no number")
+    sheets = [checked(Sheets, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
     recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
     samples = checked(list[SampleRecord], recorded, "curriculum.jsonl")
+    reached = _optional(folder, "levels.jsonl", read_jsonl)
+    levels = checked(list[LevelResults], reached, "levels.jsonl")
     runs = []
     for seed in seeds:
         metrics = _columns(rows, seed)
@@ -252,6 +284,8 @@ def _read_run(folder: Path) -> list[Run]:
                 training=_columns(training, seed),
                 cycles=cycles,
                 samples=[sample for sample in samples if sample.seed == seed],
+                levels=_levels(levels, seed, int(metrics["updates"][-1])),
+                sheets=_last_sheets(cycles, sheets, seed),
             )
         )
     return runs
@@ -302,14 +336,35 @@ def _measurements(task: TaskFacts, metrics: Mapping[str, Column]) -> list[str]:
     return [name for name in found if name is not None]
 
 
+def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, Column]:
+    """What a seed reached on every level after that many updates."""
+    found = {}
+    for row in rows:
+        if (row.seed, row.updates) == (seed, updates):
+            for kind, values in (("success", row.success), ("return", row.returns)):
+                if values is not None:
+                    name = f"{row.distribution}_{kind}"
+                    found[name] = _rounded(name, np.array(values, float))
+    return found
+
+
+def _last_sheets(cycles: Sequence[Record], sheets: Sequence[Any], seed: int) -> Any:
+    """The pictures of the last cycle that has any, of a seed where it says whose they are."""
+    own = [s for row, s in zip(cycles, sheets, strict=True) if s and row.get("seed", seed) == seed]
+    return own[-1] if own else {}
+
+
+def _rounded(name: str, values: Column) -> Column:
+    """A share as it is: a sum of probabilities is rounded, to 1.0000001 too."""
+    inside = values.clip(0, 1)
+    return np.where(is_rate(name) & (np.abs(values - inside) < ROUNDING), inside, values)
+
+
 def _columns(rows: Sequence[Mapping[str, float]], seed: int) -> dict[str, Column]:
     own = [row for row in rows if row["seed"] == seed]
     columns = {}
     for name in own[0] if own else ():
-        values = np.array([row[name] for row in own], dtype=float)
-        if is_rate(name):  # a sum of probabilities is rounded, to 1.0000001 too
-            inside = values.clip(0, 1)
-            values = np.where(np.abs(values - inside) < ROUNDING, inside, values)
+        values = _rounded(name, np.array([row[name] for row in own], dtype=float))
         checked(Name, name, "the name of a column")
         columns[name] = np.where(np.abs(values) < LARGEST, values, np.nan)
     columns.pop("seed", None)

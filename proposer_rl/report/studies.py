@@ -6,13 +6,17 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.report.runs import Run, UnreadableRun, read_run
-from proposer_rl.report.statistics import Waiting, common_horizon
+import numpy as np
 
+from proposer_rl.report.records import Column
+from proposer_rl.report.runs import Run, UnreadableRun, Waiting, read_run
+from proposer_rl.report.style import Look, looks
+
+USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label
 
 # A folder's seed, alone or at the end of its name as in those of sweeps.
@@ -27,11 +31,13 @@ class Group:
         label: what it is called in this report.
         runs: in the order of their seeds.
         setting: in which it differs from groups of the same method; empty if there are none.
+        look: in figures.
     """
 
     label: str
     runs: tuple[Run, ...]
     setting: str = ""
+    look: Look = field(default_factory=lambda: Look("black"))
 
     @property
     def seeds(self) -> list[int]:
@@ -61,11 +67,13 @@ class Study:
         title: the scale and the task.
         groups: what is compared, by label.
         threshold: of the headline measurement.
+        chosen: the label of the baseline that was asked for.
     """
 
     title: str
     groups: tuple[Group, ...]
     threshold: float
+    chosen: str | None = None
 
     @property
     def runs(self) -> list[Run]:
@@ -101,22 +109,45 @@ class Study:
         longest = {group.label: max(run.updates for run in group.runs) for group in self.groups}
         return [group for group in self.groups if longest[group.label] >= self.horizon]
 
-    def restricted_to(self, threshold: float) -> float:
-        """The horizon of restricted means to a threshold of the headline measurement."""
-        waiting = [group.waiting(self.headline, threshold) for group in self.compared]
-        return min(common_horizon(waiting), self.horizon)
+    @property
+    def legend(self) -> dict[str, Look]:
+        """The groups' looks by their labels."""
+        return {group.label: group.look for group in self.groups}
+
+    @property
+    def baseline(self) -> Group:
+        """What the others are measured against: the chosen one, the usual one, or the first."""
+        found = [self.group(label) for label in (self.chosen, USUAL_BASELINE) if label]
+        return next((group for group in found if group), (self.compared or self.groups)[0])
+
+    def scores(self, group: Group, name: str) -> Column | None:
+        """What a group's runs of full length reach on each level, [runs, levels].
+
+        Returns:
+            None where no run tells.
+        """
+        full = [run.levels[name] for run in self.runs if self._tells(run, name)]
+        own = [run.levels[name] for run in group.runs if self._tells(run, name)]
+        alike = [row for row in own if len(row) == len(full[0])]
+        return np.array(alike) if alike else None
+
+    def _tells(self, run: Run, name: str) -> bool:
+        return name in run.levels and run.updates == self.horizon
 
     def group(self, label: str) -> Group | None:
         """The group of that label, if there is one."""
         return next((group for group in self.groups if group.label == label), None)
 
 
-def read_studies(folders: Iterable[Path], threshold: float | None) -> tuple[list[Study], list[str]]:
+def read_studies(
+    folders: Iterable[Path], threshold: float | None, baseline: str | None = None
+) -> tuple[list[Study], list[str]]:
     """Read runs and sort them into studies.
 
     Args:
         folders: of runs.
         threshold: in place of the runs' own.
+        baseline: label of what the others are measured against, where it is there.
 
     Returns:
         The studies, the largest first, and a line for each folder that was left out.
@@ -144,8 +175,15 @@ def read_studies(folders: Iterable[Path], threshold: float | None) -> tuple[list
             _title(members[0]),
             _groups(members),
             _threshold(members[0]) if threshold is None else threshold,
+            baseline,
         )
         for members in sorted_runs.values()
+    ]
+    labels = sorted({group.label for study in studies for group in study.groups})
+    every = looks(labels)
+    studies = [
+        replace(study, groups=tuple(replace(g, look=every[g.label]) for g in study.groups))
+        for study in studies
     ]
     return sorted(studies, key=lambda study: -len(study.runs)), notes + doubles
 

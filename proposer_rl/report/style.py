@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from matplotlib import rc_context
@@ -22,9 +23,12 @@ METHODS = {
     "domain_randomization": GREEN,
     "hand_made": ORANGE,
 }
-# For every other method or variant, by its name: Paul Tol's muted scheme, without near doubles.
+# For every other method or variant: Paul Tol's muted scheme without near doubles, with marks.
 FURTHER = ("#332288", "#882255", "#44AA99", "#AA4499", "#999933", "#88CCEE", "#CC6677")
+MARKS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ("-", "--", "-.", ":")
+TURN = 3  # marks further for the next method of a colour
+MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
 
 SETTINGS: Any = {
@@ -48,10 +52,11 @@ SETTINGS: Any = {
 
 
 class Look(NamedTuple):
-    """Colour and line of a method."""
+    """Colour, line and mark of a method; the mark is empty where the colour is enough."""
 
     colour: str
-    dash: str
+    dash: str = "-"
+    mark: str = ""
 
 
 class Panel(NamedTuple):
@@ -79,7 +84,7 @@ class Drawing(NamedTuple):
         caption: below it.
         panels: its parts, at least one.
         columns: how many of them stand side by side in the file of all.
-        labels: of the methods in its legend; empty where none is needed.
+        legend: looks of the methods by their labels; empty where none is needed.
     """
 
     name: str
@@ -87,22 +92,37 @@ class Drawing(NamedTuple):
     caption: str
     panels: Sequence[Panel]
     columns: int = 2
-    labels: Sequence[str] = ()
+    legend: Mapping[str, Look] = {}
 
 
-def look(label: str) -> Look:
-    """The look of a method or variant, a function of its label alone."""
-    if label in METHODS:
-        return Look(METHODS[label], "-")
-    number = zlib.crc32(label.encode())
-    colour = FURTHER[number % len(FURTHER)]
-    return Look(colour, DASHES[number // len(FURTHER) % len(DASHES)])
+def looks(labels: Iterable[str]) -> dict[str, Look]:
+    """Looks of methods and variants, each its own: by the label, and if that is taken the next."""
+    found, used = {}, Counter[int]()
+    for label in sorted(set(labels)):
+        if label in METHODS:
+            found[label] = Look(METHODS[label])
+            continue
+        first = zlib.crc32(label.encode())
+        order = [(first + i) % len(FURTHER) for i in range(len(FURTHER))]
+        place = min(order, key=used.__getitem__)
+        again = used[place]
+        mark = MARKS[(place + TURN * again) % len(MARKS)]
+        found[label] = Look(FURTHER[place], DASHES[again % len(DASHES)], mark)
+        used[place] += 1
+    return found
 
 
-def style(label: str) -> dict[str, Any]:
-    """Arguments of a line of that method."""
-    colour, dash = look(label)
-    return {"color": colour, "linestyle": dash}
+def style(look: Look, points: int = 2) -> dict[str, Any]:
+    """Arguments of a line of that look with so many points."""
+    alone = "." if points == 1 else ""
+    every = max(1, -(-points // MARKED))
+    return {
+        "color": look.colour,
+        "linestyle": look.dash,
+        "marker": look.mark or alone,
+        "markersize": 4,
+        "markevery": every,
+    }
 
 
 def axes_of(figure: FigureBase) -> Axes:
@@ -120,15 +140,17 @@ def save(drawing: Drawing) -> dict[str, bytes]:
     columns = min(drawing.columns, len(drawing.panels))
     rows = -(-len(drawing.panels) // columns)
     width, height = drawing.panels[0].size
-    legend = 0.3 * -(-len(drawing.labels) // max(2 * columns, 1))
+    legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
     with rc_context(SETTINGS):
         figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
         parts = figure.subfigures(rows, columns, squeeze=False).flat
         for panel, part in zip(drawing.panels, parts, strict=False):
             panel.draw(part)
-        if drawing.labels:
-            handles = [Line2D([], [], label=label, **style(label)) for label in drawing.labels]
-            figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
+        if drawing.legend:
+            handles = [Line2D([], [], label=n, **style(one)) for n, one in drawing.legend.items()]
+            figure.legend(
+                handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
+            )
         return {suffix: _render(figure, suffix) for suffix in ("svg", "png")}
 
 

@@ -76,10 +76,14 @@ def write_run(
     cycles: Sequence[dict[str, Any]] = (),
     copies: int = 0,
     task: dict[str, Any] = TASK,
+    levels: Sequence[float] = (),
     facts: dict[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """A run whose measurement on every distribution is ``curve``, one value per evaluation."""
+    """A run whose measurement on every distribution is ``curve``, one value per evaluation.
+
+    ``levels`` is what is reached on every single level at the end, on every distribution.
+    """
     run = RunFolder(folder)
     settings = config(method, seeds[0], **changes)
     run.write_json("config.json", settings)
@@ -107,6 +111,10 @@ def write_run(
     for cycle in cycles:
         run.append("cycles.jsonl", cycle)
     updates = EVERY * (len(curve) - 1)
+    for seed in seeds:
+        for name in task["distributions"] if len(levels) else ():
+            row = {"seed": seed, "updates": updates, "distribution": name, kind: list(levels)}
+            run.append("levels.jsonl", row)
     identity = {
         "versions": {"python": "3.11"},
         "device": "cpu",

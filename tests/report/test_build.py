@@ -53,9 +53,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     runs = tmp_path_factory.mktemp("runs")
     for seed in range(2):
         cycles = [cycle(i, [0.1, -0.1], [[1, 2, 3], [4, 5, 6 + i]], every=10) for i in range(3)]
-        write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600)
-        write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0)
-    write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up")
+        cycles[1]["levels"] = {"highest scores": [LEVEL] * 3, HOSTILE: [LEVEL]}
+        told = {"levels": [0.1, 0.5, 0.25 * seed]}
+        write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600, **told)
+        write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0, **told)
+    write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up", **told)
     write_run(runs / "large", "target", task={**TASK, "title": "5×5 mazes", "measured": 5})
     return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
 
@@ -97,13 +99,15 @@ def test_the_page_says_what_was_run_and_what_is_unfinished(report: Path) -> None
 def test_there_are_figures_and_tables_for_other_tools(report: Path) -> None:
     figures = {path.name for path in (report.parent / "figures").iterdir()}
     names = ("learning_curves", "cost", "worst_levels", "difficulty", "gains", "proposals")
-    for name in (*names, "levels", "samples", "diagnostics"):
+    more = ("worst_share", "level_by_level", "told")
+    for name in (*names, *more, "levels", "samples", "diagnostics"):
         for suffix in ("svg", "png"):
             assert f"tiny_scale_2_4_mazes_{name}.{suffix}" in figures
     animation = report.parent / "figures" / "tiny_scale_2_4_mazes_proposals_perf_gain.gif"
     with Image.open(animation) as image:
         assert sum(1 for _ in ImageSequence.Iterator(image)) == 3
-    for name in ("methods", "comparisons", "runs", "findings", "metrics", "cycles"):
+    tables = ("methods", "comparisons", "runs", "findings", "metrics", "cycles")
+    for name in (*tables, "worst_share", "levels"):
         file = report.parent / "tables" / f"tiny_scale_2_4_mazes_{name}.csv"
         rows = list(csv.DictReader(file.open(encoding="utf-8")))
         assert rows and None not in rows[0]
@@ -155,6 +159,22 @@ def test_wrong_folders_get_one_line(tmp_path: Path, capsys) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_the_baseline_can_be_chosen_among_the_methods(tmp_path: Path, capsys) -> None:
+    for method in ("target", "plr"):
+        for seed in range(5):
+            write_run(tmp_path / "runs" / f"{method}{seed}", method, [seed], [0, 0.1 * seed + 0.3])
+    folder, output = str(tmp_path / "runs"), tmp_path / "report"
+    line = refused(capsys, folder, "-o", str(output), "--baseline", "nobody")
+    assert line == "error: --baseline=nobody: must be one of plr, target"
+    for arguments, baseline in (([], "plr"), (["--baseline=target"], "target")):
+        main([folder, "-q", "-o", str(output), *arguments])
+        rows = list(csv.DictReader((output / "tables" / "methods.csv").open(encoding="utf-8")))
+        found = {row["method"]: row[f"P(better than {baseline})"] for row in rows}
+        other = {"plr": "target", "target": "plr"}[baseline]
+        assert found == {baseline: "", other: "0.5"}
+    assert "--baseline=target" in (output / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_wrong_threshold_is_refused(runs: Path, capsys) -> None:
     with pytest.raises(SystemExit) as end:
         main([str(runs), "--threshold", "nan"])
@@ -183,6 +203,7 @@ ANYTHING = [
         "rate": 0.25,
         "buffer": [3, 4],
         "ok": True,
+        "levels": {"[/b]$\\bad{": [{"picture": "none"}, LEVEL], "lineage": []},
     },
     {"updates": 20, "rate": None, "staleness": 1e300, "histogram": "no", "return_gain": ["a"]},
     {"updates": 40, "rate": float("nan"), "buffer": {}, "total": 10**400, "$\\bad{": 1, "\x07": 2},

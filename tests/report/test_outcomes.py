@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from proposer_rl.report.comparisons import comparisons
 from proposer_rl.report.findings import findings
 from proposer_rl.report.outcomes import (
-    compare,
-    comparisons,
+    comparison_table,
     group_table,
-    outcomes,
     run_table,
     tidy_cycles,
     tidy_metrics,
@@ -25,6 +24,7 @@ from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.tables import Table, to_csv, write
 from tests.report.folders import cycle, write_run
 
+SEEDS = 6
 SLOW = [0.0, 0.0, 0.05, 0.3, 0.5, 0.6]
 FAST = [0.0, 0.4, 0.7, 0.85, 0.9, 0.9]
 
@@ -33,11 +33,11 @@ def curve_of(base: list[float], seed: int) -> list[float]:
     return [value * (1 - 0.01 * seed) for value in base]
 
 
-def study_of(folder: Path, **curves: list[float]) -> Study:
-    """Three seeds of each method; those called by a Proposer's name have cycles."""
+def study_of(folder: Path, seeds: int = SEEDS, **curves: list[float]) -> Study:
+    """Seeds of each method; those called by a Proposer's name have cycles."""
     for method, base in curves.items():
         proposes = method in ("perf_gain", "task_difficulty")
-        for seed in range(3):
+        for seed in range(seeds):
             cycles = []
             for i in range(8):
                 harder = [[8 - i, 1, 1], [1, 1, 1 + i + seed]]
@@ -53,47 +53,84 @@ def study_of(folder: Path, **curves: list[float]) -> Study:
     return read_studies(sorted(folder.iterdir()), None)[0][0]
 
 
-def test_a_faster_method_is_found_better_by_every_outcome(tmp_path: Path) -> None:
-    study = study_of(tmp_path, target=SLOW, hand_made=FAST)
-    for row in comparisons(study):
-        assert row.better == "hand_made"
-        assert (row.one, row.other) == ("hand_made", "target")
-        assert row.improvement.estimate == 1 and row.seeds is None
-    first = comparisons(study)[0]
-    # 80 % after 30 updates in all three seeds; never within 50.
-    assert first.difference == (-20, -20, -20)
-
-
-def test_equal_methods_are_undecided_and_more_seeds_are_asked_for(tmp_path: Path) -> None:
-    study = study_of(tmp_path, target=SLOW, hand_made=[value * 1.001 for value in SLOW])
-    rows = comparisons(study)
-    assert all(row.better is None for row in rows)
-    assert rows[0].difference == (0, 0, 0) and rows[0].seeds is None
-    assert all(row.seeds > 100 for row in rows[1:])
-
-
-def test_success_is_compared_at_the_horizon(tmp_path: Path) -> None:
-    study = study_of(tmp_path, target=SLOW, hand_made=FAST)
-    one, other = study.group("hand_made"), study.group("target")
-    row = compare(outcomes(study)[2], one, other)
+def test_a_better_method_is_found_by_the_primary_outcome_alone(tmp_path: Path) -> None:
+    first, *others = comparisons(study_of(tmp_path, target=SLOW, hand_made=FAST))
+    assert (first.one, first.other) == ("hand_made", "target")
+    assert first.outcome == "ID success, mean over 50 updates"
+    assert first.decision is not None and first.decision.winner == "hand_made"
+    assert first.decision.seeds is None and first.improvement.estimate == 1
+    areas = [(np.sum(base) - (base[0] + base[-1]) / 2) / 5 for base in (FAST, SLOW)]
+    scale = np.mean([1 - 0.01 * seed for seed in range(SEEDS)])
+    assert first.difference.estimate == pytest.approx((areas[0] - areas[1]) * scale)
+    assert len(others) == 3 and all(row.decision is None for row in others)
+    # 80 % after 30 updates in every seed, and never within 50: there is no spread.
+    assert others[0].difference.estimate == -20 and math.isnan(others[0].difference.low)
+    assert others[1].outcome == "ID success after 50 updates"
     expected = np.mean(curve_last(FAST)) - np.mean(curve_last(SLOW))
-    assert row.difference.estimate == pytest.approx(expected)
+    assert others[1].difference.estimate == pytest.approx(expected)
 
 
 def curve_last(base: list[float]) -> list[float]:
-    return [curve_of(base, seed)[-1] for seed in range(3)]
+    return [curve_of(base, seed)[-1] for seed in range(SEEDS)]
+
+
+def test_equal_methods_are_undecided_and_more_seeds_are_asked_for(tmp_path: Path) -> None:
+    for seed in range(SEEDS):
+        write_run(tmp_path / f"a{seed}", "hand_made", [seed], curve_of(SLOW, SEEDS - seed))
+    first, *_ = comparisons(study_of(tmp_path, target=SLOW))
+    assert first.decision is not None and first.decision.winner is None
+    assert first.decision.verdict == "undecided" and first.decision.p > 0.05
+    assert first.decision.seeds > SEEDS
+
+
+def test_methods_that_learnt_nothing_do_not_beat_each_other(tmp_path: Path) -> None:
+    low = {"target": [value / 20 for value in SLOW], "hand_made": [value / 20 for value in FAST]}
+    first, *_ = comparisons(study_of(tmp_path, **low))
+    assert first.decision is not None and first.decision.p < 0.05
+    assert first.decision.verdict == "nothing learnt" and first.decision.winner is None
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 4])
+def test_with_few_seeds_there_is_no_interval_and_no_verdict(seeds: int, tmp_path: Path) -> None:
+    study = study_of(tmp_path, seeds, perf_gain=FAST, task_difficulty=FAST, target=SLOW)
+    for row in comparisons(study):
+        assert math.isnan(row.difference.low) and math.isnan(row.improvement.low)
+        assert row.decision is None or row.decision.verdict == "too few seeds"
+    assert set(verdicts(study).values()) == {"too few seeds"}
+    assert "[" not in "".join(map("".join, comparison_table(study).texts()))
+
+
+def test_runs_with_the_same_seeds_are_compared_in_pairs(tmp_path: Path) -> None:
+    """What varies from seed to seed alike is no doubt about the difference."""
+    for method, plus in (("a", 0.0), ("b", 0.02)):
+        for seed in range(SEEDS):
+            end = 0.3 + 0.1 * seed + plus * (1 + seed % 2)
+            write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end])
+    paired, *_ = comparisons(read_studies(sorted(tmp_path.iterdir()), None)[0][0])
+    assert paired.decision is not None and paired.decision.winner == "b"
+    write_run(tmp_path / "b9", "b", [9], [0.0, 0.6])
+    alone, *_ = comparisons(read_studies(sorted(tmp_path.iterdir()), None)[0][0])
+    assert alone.decision is not None and alone.decision.p > 0.5
+
+
+def test_a_short_run_does_not_count_whether_it_got_there_or_not(tmp_path: Path) -> None:
+    write_run(tmp_path / "short_fast", "hand_made", [98], [0.0, 0.9], finished=False)
+    write_run(tmp_path / "short_slow", "hand_made", [99], [0.0, 0.0], finished=False)
+    study = study_of(tmp_path, hand_made=FAST, target=SLOW)
+    (row,) = (row for row in group_table(study).rows if row["method"] == "hand_made")
+    assert row["seeds"] == SEEDS + 2
+    assert row["updates to 80% ID success (at most 50)"].estimate == 30
 
 
 def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     study = study_of(tmp_path, perf_gain=FAST, target=SLOW)
     table = group_table(study)
     rows = {row["method"]: row for row in table.rows}
-    assert rows["perf_gain"]["reached 80%"] == "3 of 3"
-    assert rows["target"]["reached 80%"] == "0 of 3"
+    assert rows["perf_gain"]["reached 80%"] == "6 of 6"
+    assert rows["target"]["reached 80%"] == "0 of 6"
     (updates,) = (name for name in table.columns if name.startswith("updates to"))
     assert rows["perf_gain"][updates].estimate == 30
-    assert rows["target"][updates] == (50, 50, 50)
-    assert rows["target"]["IQM of ID success"] == pytest.approx(np.mean(curve_last(SLOW)))
+    assert write(rows["target"][updates]) == "50.0"  # nobody got there: no interval
     worst = rows["target"]["ID success, worst 10 %"]
     assert worst.estimate == pytest.approx(np.mean(curve_last(SLOW)) / 2)
     assert rows["perf_gain"]["evaluations"] == 150
@@ -104,53 +141,72 @@ def test_the_tidy_metrics_are_those_of_the_runs(tmp_path: Path) -> None:
     study = study_of(tmp_path, perf_gain=FAST, target=SLOW)
     header, rows = tidy_metrics(study)
     read = list(csv.DictReader(io.StringIO(to_csv(header, rows))))
-    assert len(read) == 2 * 3 * 6
+    assert len(read) == 2 * SEEDS * 6
     own = [row for row in read if row["method"] == "target" and row["seed"] == "1"]
     assert [float(row["id_success"]) for row in own] == pytest.approx(curve_of(SLOW, 1))
     header, rows = tidy_cycles(study)
     read = list(csv.DictReader(io.StringIO(to_csv(header, rows))))
-    assert len(read) == 3 * 8 and read[0]["return_gain"] == "0.3 0.1"
+    assert len(read) == SEEDS * 8 and read[0]["return_gain"] == "0.3 0.1"
     assert read[0]["histogram"] == "8 1 1 1 1 1"
 
 
 def test_censored_runs_are_said_to_be(tmp_path: Path) -> None:
     text = run_table(study_of(tmp_path, target=SLOW)).to_markdown()
-    assert text.count("censored at 50") == 3
+    assert text.count("censored at 50") == SEEDS
 
 
 def verdicts(study: Study) -> dict[str, str]:
     return {finding.claim: finding.verdict for finding in findings(study)}
 
 
+STALL = "The baseline that trains on the target alone stalls at first."
+SOON = "Both Proposers learn almost at once."
+FASTER = "Performance gain learns faster than the baseline."
+ALIKE = "Out of distribution the methods end up alike."
+SLIGHTLY = "Performance gain beats task difficulty slightly, not significantly."
+HARDER = "Proposals start easy and grow harder."
+GAINS = "The maximum gain of the copies stays positive while the mean falls below zero."
+
+
 def test_findings_that_hold_are_supported(tmp_path: Path) -> None:
     late = [0.0, 0.0, 0.0, 0.0, 0.3, 0.6]
     soon = [0.2, 0.5, 0.7, 0.85, 0.9, 0.9]
     found = verdicts(study_of(tmp_path, perf_gain=soon, task_difficulty=soon, target=late))
-    assert found["The baseline that trains on the target alone stalls at first."] == "supported"
-    assert found["Both Proposers learn almost at once."] == "supported"
-    assert (
-        found["Performance gain needs clearly fewer updates to 80% than the baseline."]
-        == "supported"
-    )
-    assert found["Out of distribution the methods end up alike."] == "contradicted"
-    assert found["Proposals start easy and grow harder."] == "supported"
-    claim = "The maximum gain of the copies stays positive while the mean falls below zero."
-    assert found[claim] == "supported"
-    assert found["perf_gain beats target."] == "supported"
+    for claim in (STALL, SOON, FASTER, HARDER, GAINS, "perf_gain beats target."):
+        assert found[claim] == "supported", claim
+    assert found[ALIKE] == "contradicted"
 
 
 def test_findings_that_fail_are_contradicted(tmp_path: Path) -> None:
-    found = verdicts(study_of(tmp_path, perf_gain=SLOW, task_difficulty=FAST, target=FAST))
-    assert found["The baseline that trains on the target alone stalls at first."] != "supported"
-    assert found["Both Proposers learn almost at once."] == "contradicted"
-    assert (
-        found["Performance gain needs clearly fewer updates to 80% than the baseline."]
-        == "contradicted"
-    )
-    claim = "Performance gain beats task difficulty slightly, not significantly."
-    assert found[claim] == "contradicted"
-    assert found["perf_gain beats target."] == "contradicted"
-    assert found["task_difficulty beats target."] == "undecided"
+    found = verdicts(study_of(tmp_path, perf_gain=SLOW, task_difficulty=SLOW, target=FAST))
+    for claim in (STALL, SOON, FASTER, "perf_gain beats target."):
+        assert found[claim] == "contradicted", claim
+    found = verdicts(study_of(tmp_path / "other", perf_gain=SLOW, task_difficulty=FAST))
+    assert found[SLIGHTLY] == "contradicted"
+
+
+def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Path) -> None:
+    names = ("perf_gain", "task_difficulty", "target")
+    for folder, factor, expected in (("a", 1.0, "supported"), ("b", 0.05, "undecided")):
+        for number, name in enumerate(names):
+            for seed in range(SEEDS):  # each method with small chances of its own
+                end = factor * (0.9 + 0.01 * ((seed + number) * (number + 1) % 5))
+                write_run(tmp_path / folder / f"{name}{seed}", name, [seed], [0.0, end / 2, end])
+        (study,), _ = read_studies(sorted((tmp_path / folder).iterdir()), None)
+        found = verdicts(study)
+        assert found[ALIKE] == expected and found[SLIGHTLY] == expected, folder
+
+
+def test_badge_and_text_tell_the_same(tmp_path: Path) -> None:
+    """A difference that is significant decides, and the text says so; else neither does."""
+    for seed in range(SEEDS):
+        write_run(tmp_path / f"t{seed}", "target", [seed], curve_of(SLOW, SEEDS - seed))
+    curves = {"perf_gain": FAST, "task_difficulty": SLOW}
+    for finding in findings(study_of(tmp_path, **curves)):
+        if "beats" in finding.claim or finding.claim == FASTER:
+            p = float(finding.evidence.split("p = ")[1].split(" ")[0])
+            assert (finding.verdict == "undecided") == (p > 0.05)
+            assert ("the difference is significant" in finding.evidence) <= (p <= 0.05)
 
 
 def test_findings_without_their_methods_have_no_data(tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ import pytest
 
 from proposer_rl.report import runs
 from proposer_rl.report.proposals import axis_means
-from proposer_rl.report.runs import UnreadableRun, find_runs, read_run, share_map
-from proposer_rl.report.statistics import Waiting
-from tests.report.folders import TASK, cycle, write_run
+from proposer_rl.report.runs import UnreadableRun, Waiting, find_runs, read_run, share_map
+from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 
 def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -30,6 +29,9 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert run.total_frames.tolist() == [0, 7000, 14000]
     assert run.waiting("id_success", 0.5) == Waiting(10, True)
     assert run.waiting("id_success", 0.95) == Waiting(20, False)
+    waited = [run.waited("id_success", level, 20) for level in (0.5, 0.95)]
+    assert waited == [10, 20] and run.waited("id_success", 0.9, 15) == 15
+    assert np.isnan(run.waited("id_success", 0.5, 30))
     assert run.at("id_success", 10) == 0.5 and np.isnan(run.at("id_success", 11))
     # Trapezoids of width 10: (0 + 0.5) / 2 and (0.5 + 0.9) / 2.
     assert run.mean_until("id_success", 20) == pytest.approx((0.25 + 0.7) / 2)
@@ -99,6 +101,14 @@ def in_levels(key: str, value: object):
     return change
 
 
+def in_row(key: str, value: object):
+    return lambda text: json.dumps({**json.loads(text.splitlines()[0]), key: value}) + "\n"
+
+
+def in_cycle(value: object):
+    return in_row("levels", value)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -129,6 +139,17 @@ def in_levels(key: str, value: object):
         ("curriculum.jsonl", in_levels("text", ["\x1b[2J"]), "must be printable"),
         ("cycles.jsonl", lambda text: text.replace('"updates": 0', '"updates": "x"'), "no number"),
         ("cycles.jsonl", lambda text: text.replace('"updates"', '"x"'), "'updates' is missing"),
+        ("cycles.jsonl", in_cycle(["x"]), "levels: Input should be a valid dict"),
+        ("cycles.jsonl", in_cycle({"best": [1]}), "levels: best.0: Input should be"),
+        ("cycles.jsonl", in_cycle({"best": [{"picture": 1}]}), "best.0.picture: Input should be"),
+        ("cycles.jsonl", in_cycle({"a\nb": []}), "must be printable"),
+        ("cycles.jsonl", in_cycle({str(i): [] for i in range(17)}), "at most 16 items"),
+        ("levels.jsonl", in_row("success", []), "0.success: List should have at least 1 item"),
+        ("levels.jsonl", in_row("success", ["x"]), "0.success.0: Input should be a valid number"),
+        ("levels.jsonl", in_row("success", [float("nan")]), "0.success.0: Input should be"),
+        ("levels.jsonl", in_row("return", [1e200]), "0.return.0: Input should be less"),
+        ("levels.jsonl", in_row("distribution", "\x07"), "0.distribution: Value error"),
+        ("levels.jsonl", in_row("seed", "0"), "0.seed: Input should be a valid integer"),
         ("run.json", lambda text: "{}", "'task' is missing"),
         ("run.json", set_key("task", value=[]), "task: Input should be"),
         ("run.json", set_key("task", "title", value="\x07"), "task: title: Value error"),
@@ -148,12 +169,45 @@ def in_levels(key: str, value: object):
 def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
     name: str, change, message: str, tmp_path: Path
 ) -> None:
-    folder = write_run(tmp_path / "run", cycles=[cycle(0, [0.1, 0.1], [[1], [1]])])
+    cycles = [cycle(0, [0.1, 0.1], [[1], [1]])]
+    folder = write_run(tmp_path / "run", cycles=cycles, levels=[0.5])
     broken(folder, name, change)
     with pytest.raises(UnreadableRun) as refused:
         read_run(folder)
     assert message in str(refused.value) and "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{folder}: ")
+
+
+def test_what_is_told_of_single_levels_is_each_seeds_own(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", seeds=[3, 4], levels=[0.25, 1.0000001])
+    with open(folder / "levels.jsonl", "a") as file:
+        for updates, results in ((10, [0.9, 0.9]), (20, [0.5, 0.5])):
+            row = {"seed": 4, "updates": updates, "distribution": "id", "success": results}
+            file.write(json.dumps({**row, "anything": [None]}) + "\n")
+    one, other = read_run(folder)
+    assert {name: row.tolist() for name, row in one.levels.items()} == {
+        "id_success": [0.25, 1],
+        "ood_success": [0.25, 1],
+    }
+    assert other.levels["id_success"].tolist() == [0.5, 0.5]  # the last row at the end
+    assert not read_run(write_run(tmp_path / "older"))[0].levels
+
+
+def test_a_curriculum_tells_of_levels_in_the_last_cycle_that_has_any(tmp_path: Path) -> None:
+    told = [{"best": [LEVEL]}, {"best": [LEVEL] * 2, "lineage": []}, {"of another": [LEVEL]}, None]
+    cycles = [{"updates": i, "score": i} for i in range(4)]
+    rows = [
+        {**row, "levels": levels} if levels else row
+        for row, levels in zip(cycles, told, strict=True)
+    ]
+    rows[2]["seed"] = 9
+    (run,) = read_run(write_run(tmp_path / "run", cycles=rows))
+    assert [(name, len(levels)) for name, levels in run.sheets.items()] == [
+        ("best", 2),
+        ("lineage", 0),
+    ]
+    assert run.sheets["best"][0].picture == LEVEL["picture"]
+    assert not any("levels" in row for row in run.cycles)
 
 
 def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:

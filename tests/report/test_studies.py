@@ -144,7 +144,6 @@ def test_runs_are_compared_at_the_length_of_most(tmp_path: Path) -> None:
     (study,), _ = read(tmp_path)
     assert study.horizon == 20
     assert [group.label for group in study.compared] == ["target"]
-    assert study.restricted_to(0.8) == 20
 
 
 def test_an_unreadable_folder_is_noted_and_the_others_are_read(tmp_path: Path) -> None:

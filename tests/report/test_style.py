@@ -6,9 +6,22 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from proposer_rl.cli.config import methods
-from proposer_rl.report.style import FURTHER, METHODS, Drawing, Panel, axes_of, look, save, style
+from proposer_rl.report.style import (
+    DASHES,
+    FURTHER,
+    METHODS,
+    Drawing,
+    Look,
+    Panel,
+    axes_of,
+    looks,
+    save,
+    style,
+)
 
 # Machado, Oliveira & Fernandes (IEEE TVCG 15, 2009), full severity, on linear RGB.
 SEEN_WITHOUT = {
@@ -39,22 +52,29 @@ def test_methods_can_be_told_apart(vision: str | None) -> None:
 
 
 def test_every_method_has_a_look_of_its_own() -> None:
-    looks = [look(name) for name in methods()]
-    assert len(set(looks)) == len(looks)
+    found = looks([*methods(), *(f"further_{i}" for i in range(16))])
+    assert len(set(found.values())) == len(found)
 
 
-def test_an_unknown_method_gets_a_stable_further_look() -> None:
-    assert look("plr") == look("plr") and look("plr").colour in FURTHER
-    assert look("perf_gain").colour not in FURTHER
-    many = {look(f"method_{i}") for i in range(300)}
-    assert len(many) == len(FURTHER) * 4
+def test_an_unknown_method_gets_a_further_look_whatever_else_is_there() -> None:
+    assert looks(["plr"])["plr"] == looks(["plr", "perf_gain", "target"])["plr"]
+    assert looks(["plr"])["plr"].colour in FURTHER
+    assert looks(["perf_gain"])["perf_gain"] == Look(METHODS["perf_gain"])
+
+
+@given(st.sets(st.text(max_size=4), max_size=len(FURTHER) * len(DASHES)))
+def test_looks_are_apart_by_colour_as_long_as_there_are_colours(labels: set[str]) -> None:
+    found = list(looks(labels).values())
+    assert len(set(found)) == len(labels)
+    assert len({(look.colour, look.mark) for look in found}) == len(labels)
+    assert len({look.colour for look in found}) == min(len(labels), len(FURTHER))
 
 
 def test_a_figure_is_the_same_file_every_time() -> None:
     def draw(figure) -> None:
-        axes_of(figure).plot([0, 1], [1, 0], **style("plr"))
+        axes_of(figure).plot([0, 1], [1, 0], **style(Look("#332288", "--", "s")))
 
-    drawing = Drawing("d", "D", "", [Panel("P", draw)], labels=["plr"])
+    drawing = Drawing("d", "D", "", [Panel("P", draw)], legend={"plr": Look("#332288", "--", "s")})
     one, two = save(drawing), save(drawing)
     assert one == two and set(one) == {"svg", "png"}
     assert b"<dc:date>" not in one["svg"]

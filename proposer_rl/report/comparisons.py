@@ -1,0 +1,215 @@
+"""What methods are compared by, and the one decision on which of two is better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from proposer_rl.report.records import is_rate, level_text, words
+from proposer_rl.report.runs import Run
+from proposer_rl.report.statistics import (
+    ERROR,
+    FEWEST,
+    Estimate,
+    Interval,
+    difference_of,
+    holm,
+    mean_interval,
+    mean_of,
+    probability_of_improvement,
+    seeds_needed,
+)
+from proposer_rl.report.studies import Group, Study
+
+ALIKE = 0.1  # of a rate: differences below it are small, and who gained less learnt nothing
+
+TOO_FEW, UNDECIDED, NOT_LEARNT = "too few seeds", "undecided", "nothing learnt"
+
+
+class Outcome(NamedTuple):
+    """A number for each run of a group.
+
+    Attributes:
+        name: with its unit.
+        value: of a run; NaN where it has none.
+        sign: 1 where more is better, -1 where less is.
+    """
+
+    name: str
+    value: Callable[[Run], float]
+    sign: int = 1
+
+    def known(self, group: Group) -> list[Run]:
+        """The runs of a group that have a value."""
+        return [run for run in group.runs if not math.isnan(self.value(run))]
+
+    def values(self, group: Group) -> list[float]:
+        """The known values of a group's runs."""
+        return [self.value(run) for run in self.known(group)]
+
+
+class Decision(NamedTuple):
+    """Which of two methods is better, by the primary outcome.
+
+    Attributes:
+        winner: its label; None where neither is said to be better.
+        verdict: in a few words.
+        p: corrected for the number of comparisons; NaN where nothing could be tested.
+        reason: what it rests on, in words.
+        seeds: about how many would decide it; None where it is decided or nothing can be said.
+    """
+
+    winner: str | None
+    verdict: str
+    p: float
+    reason: str
+    seeds: int | None = None
+
+
+class Comparison(NamedTuple):
+    """Two groups by one outcome.
+
+    Attributes:
+        one, other: their labels.
+        outcome: what is compared.
+        difference: of ``one`` minus ``other``.
+        improvement: probability that a run of ``one`` is better than a run of ``other``.
+        decision: None for all outcomes but the primary one.
+    """
+
+    one: str
+    other: str
+    outcome: str
+    difference: Interval
+    improvement: Interval
+    decision: Decision | None = None
+
+
+def primary(study: Study) -> Outcome:
+    """The outcome that decides whether a method beats another.
+
+    The mean of the headline along training: every run has it, whether it gets to the threshold or
+    not; it sees the way and the end; and as a mean over many measurements it varies little.
+    """
+    name, horizon = study.headline, study.horizon
+    value = partial(Run.mean_until, measurement=name, updates=horizon)
+    return Outcome(f"{words(name)}, mean over {horizon} updates", value)
+
+
+def waiting_outcome(study: Study) -> Outcome:
+    """Updates to the threshold of the headline, cut at the horizon."""
+    name, threshold, horizon = study.headline, study.threshold, study.horizon
+    return Outcome(
+        f"updates to {level_text(name, threshold)} {words(name)} (at most {horizon})",
+        partial(Run.waited, measurement=name, threshold=threshold, horizon=horizon),
+        -1,
+    )
+
+
+def outcomes(study: Study) -> list[Outcome]:
+    """The primary outcome, then the secondary ones, on which nothing is decided."""
+    ends = [
+        Outcome(
+            f"{words(name)} after {study.horizon} updates",
+            partial(Run.at, measurement=name, updates=study.horizon),
+        )
+        for name in study.measurements
+    ]
+    return [primary(study), waiting_outcome(study), *ends]
+
+
+def updates_needed(study: Study, group: Group) -> Interval | None:
+    """A group's mean of updates to the threshold, cut at the horizon; None without a whole run."""
+    values = waiting_outcome(study).values(group)
+    if not values:
+        return None
+    found = mean_interval(values)
+    low, high = np.clip(found[1:], 0, study.horizon)
+    return Interval(found.estimate, float(low), float(high))
+
+
+def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
+    """How two groups differ by an outcome.
+
+    Runs of the same seed begin with the same weights and draw the same numbers: where both groups
+    have the same seeds, each once, they are compared in pairs.
+    """
+    seeds = [[run.seed for run in outcome.known(group)] for group in (one, other)]
+    paired = seeds[0] == seeds[1] and len(set(seeds[0])) == len(seeds[0])
+    return difference_of(outcome.values(one), outcome.values(other), paired)
+
+
+def learnt(group: Group, name: str, updates: float) -> bool:
+    """Whether a measurement is shown to have grown by then, a rate by more than :data:`ALIKE`."""
+    gains = np.array([run.at(name, updates) - run.metrics[name][0] for run in group.runs])
+    known = gains[~np.isnan(gains)]
+    if len(known) < FEWEST:
+        return False
+    found = mean_of(known)
+    low = found.value if math.isnan(found.error) else found.interval(1 - 2 * ERROR).low
+    return low > (ALIKE if is_rate(name) else 0)
+
+
+def decisions(study: Study) -> dict[tuple[str, str], Decision]:
+    """Of every pair of groups which is better by the primary outcome, by their labels.
+
+    The tests of all pairs are corrected together, by Holm's method.
+    """
+    pairs = list(combinations(study.compared, 2))
+    outcome = primary(study)
+    found = [difference(outcome, *pair) for pair in pairs]
+    corrected = holm([one.p for one in found])
+    count = sum(not math.isnan(p) for p in corrected)
+    return {
+        (one.label, other.label): _decide(study, (one, other), estimate, p, count)
+        for (one, other), estimate, p in zip(pairs, found, corrected, strict=True)
+    }
+
+
+def _decide(
+    study: Study, pair: tuple[Group, Group], estimate: Estimate, p: float, count: int
+) -> Decision:
+    runs = [len(primary(study).known(group)) for group in pair]
+    if min(runs) < FEWEST:
+        text = f"{runs[0]} and {runs[1]} seeds, and it takes {FEWEST} of each"
+        return Decision(None, TOO_FEW, p, text)
+    if math.isnan(p):
+        return Decision(None, UNDECIDED, p, "no spread between the runs")
+    text = f"p = {p:.2g} after correction for {count} comparisons"
+    if p > ERROR:
+        needed = seeds_needed(estimate, min(runs), ERROR / count)
+        more = f", about {needed:,} seeds each would decide it" if needed else ""
+        return Decision(None, UNDECIDED, p, text + more, needed)
+    winner = pair[0] if estimate.value > 0 else pair[1]
+    if not learnt(winner, study.headline, study.horizon):
+        return Decision(None, NOT_LEARNT, p, f"{text}, but {winner.label} hardly learnt")
+    return Decision(winner.label, f"{winner.label} is better", p, text)
+
+
+def comparisons(study: Study) -> list[Comparison]:
+    """Every pair of groups by every outcome that both have."""
+    decided = decisions(study)
+    found = []
+    for number, outcome in enumerate(outcomes(study)):
+        for one, other in combinations(study.compared, 2):
+            if outcome.known(one) and outcome.known(other):
+                decision = decided[one.label, other.label] if number == 0 else None
+                found.append(_compare(outcome, one, other, decision))
+    return found
+
+
+def _compare(outcome: Outcome, one: Group, other: Group, decision: Decision | None) -> Comparison:
+    a, b = (outcome.sign * np.asarray(outcome.values(group)) for group in (one, other))
+    return Comparison(
+        one.label,
+        other.label,
+        outcome.name,
+        difference(outcome, one, other).interval(),
+        probability_of_improvement(a, b),
+        decision,
+    )

@@ -1,0 +1,122 @@
+"""Single levels: their worst share by its definition, and what goes to the tables."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from proposer_rl.report.outcomes import group_table
+from proposer_rl.report.single_levels import (
+    level_by_level,
+    level_table,
+    worst_curves,
+    worst_means,
+    worst_table,
+)
+from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.studies import Study, read_studies
+from tests.report.folders import TASK, write_run
+
+scores = st.lists(st.floats(0, 1, width=16), min_size=1, max_size=9)
+
+
+@given(scores, st.integers(1, 40))
+def test_the_worst_mean_is_that_of_the_lowest_part(values: list[float], parts: int) -> None:
+    """Every level cut into 40 equal parts, of which the lowest are taken."""
+    each = [Fraction(value) for value in sorted(values) for _ in range(40)]
+    lowest = each[: parts * len(values)]
+    found = worst_means(np.array([values]), np.array([parts / 40]))
+    assert found.shape == (1, 1)
+    assert found[0, 0] == pytest.approx(float(sum(lowest) / len(lowest)), abs=1e-9)
+
+
+@given(scores)
+def test_it_grows_from_the_worst_level_to_the_mean(values: list[float]) -> None:
+    shares = np.geomspace(0.01, 1, 30)
+    (found,) = worst_means(np.array([values]), shares)
+    assert found[0] == pytest.approx(min(values)) and found[-1] == pytest.approx(np.mean(values))
+    assert (np.diff(found) > -1e-12).all()
+
+
+LEVELS = {"target": [0.2, 0.4, 0.6], "domain_randomization": [0.1, 0.9, 0.6]}
+
+
+def study_of(folder: Path, exact: bool | None = True, **options: Any) -> Study:
+    task = TASK if exact is None else {**TASK, "exact": exact}
+    for method, levels in LEVELS.items():
+        for seed in range(5):
+            told = {"levels": [value + 0.01 * seed for value in levels], "task": task}
+            write_run(folder / f"{method}{seed}", method, [seed], **told, **options)
+    write_run(folder / "older", "hand_made", task=task)
+    return read_studies(sorted(folder.iterdir()), None)[0][0]
+
+
+def test_tables_have_every_share_and_every_level(tmp_path: Path) -> None:
+    study = study_of(tmp_path)
+    header, rows = worst_table(study)
+    found = [dict(zip(header, row, strict=True)) for row in rows]
+    assert {row["method"] for row in found} == set(LEVELS)  # the older folder is left out
+    (whole,) = (
+        row
+        for row in found
+        if (row["measurement"], row["method"]) == ("ood_success", "target") and row["share"] == 1
+    )
+    known = mean_interval([0.4 + 0.01 * seed for seed in range(5)])
+    assert (whole["mean"], whole["mean, low"], whole["mean, high"]) == pytest.approx(known)
+    assert min(row["share"] for row in found) == pytest.approx(0.01)
+    header, rows = level_table(study)
+    assert header[2:] == ["domain_randomization", "hand_made", "target"]
+    assert len(rows) == 2 * 3 and rows[1][:2] == ["id_success", 1]
+    assert rows[1][2:] == pytest.approx([0.92, np.nan, 0.42], nan_ok=True)
+
+
+def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
+    rows = {row["method"]: row for row in group_table(study_of(tmp_path)).rows}
+    gap = rows["target"]["optimality gap of ID success"]
+    assert gap.estimate == pytest.approx(1 - 0.42) and gap.high > gap.low
+    pooled = sorted(value + 0.01 * seed for value in LEVELS["target"] for seed in range(5))
+    assert rows["target"]["IQM of ID success"].estimate == pytest.approx(np.mean(pooled[3:-3]))
+    assert rows["hand_made"]["IQM of ID success"] is None
+    assert rows["target"]["P(better than domain_randomization)"].estimate == 0.5
+    assert rows["domain_randomization"]["P(better than domain_randomization)"] is None
+
+
+@pytest.mark.parametrize(
+    ("exact", "text"),
+    [(True, "no second evaluation"), (False, "selection bias makes"), (None, "do not say")],
+)
+def test_the_page_says_whether_selection_bias_is_in_it(
+    exact: bool | None, text: str, tmp_path: Path
+) -> None:
+    drawing = worst_curves(study_of(tmp_path, exact))
+    assert drawing is not None and text in drawing.caption and len(drawing.panels) == 2
+
+
+def test_methods_are_drawn_against_the_baseline(tmp_path: Path) -> None:
+    drawing = level_by_level(study_of(tmp_path))
+    assert drawing is not None and len(drawing.panels) == 1
+    assert "of target against that of domain_randomization" in drawing.panels[0].description
+
+
+def test_levels_of_runs_that_are_not_at_the_horizon_do_not_count(tmp_path: Path) -> None:
+    write_run(tmp_path / "short", "plr", [0], [0, 0.5], levels=[1.0, 1.0, 1.0], finished=False,
+              task={**TASK, "exact": True})  # fmt: skip
+    write_run(tmp_path / "odd", "target", [9], levels=[1.0], task={**TASK, "exact": True})
+    study = study_of(tmp_path)
+    plr, target = study.group("plr"), study.group("target")
+    assert plr is not None and study.scores(plr, "id_success") is None
+    assert target is not None and study.scores(target, "id_success").shape == (5, 3)
+
+
+def test_without_single_levels_there_is_no_figure(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "target")
+    study = read_studies([tmp_path / "a"], None)[0][0]
+    assert worst_curves(study) is None and level_by_level(study) is None
+    assert worst_table(study)[1] == [] and level_table(study)[1] == []
+    assert not any("IQM" in name for name in group_table(study).columns)
