@@ -183,6 +183,21 @@ class HandMadeSettings:
 
 
 @settings
+class PoolSettings:
+    """How many levels curricula keep, and choose among.
+
+    Attributes:
+        capacity: levels of a buffer.
+        candidates: levels that are scored to keep some of them.
+        keep: of the candidates.
+    """
+
+    capacity: Annotated[int, Ge(1)]
+    candidates: Annotated[int, Ge(1)]
+    keep: Annotated[int, Ge(1)]
+
+
+@settings
 class LoggerSettings:
     """Where rows of metrics go besides the run's folder.
 

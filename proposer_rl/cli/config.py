@@ -20,6 +20,7 @@ from proposer_rl.settings import (
     ComputeSettings,
     HandMadeSettings,
     LoggerSettings,
+    PoolSettings,
     ProposerSettings,
     Schedule,
     SolverSettings,
@@ -69,6 +70,7 @@ class RunConfig(BaseModel):
     seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     precision: Literal["auto", "fp32", "bf16"]
     hand_made: HandMadeSettings
+    pool: PoolSettings
     solver: SolverSettings
     proposer: ProposerSettings
     schedule: Schedule
