@@ -115,3 +115,41 @@ def test_no_key_of_the_proposer_is_forgotten() -> None:
         names = {f"proposer.{key}" for key in proposer}
         names |= {f"proposer.{key}.{inner}" for key, value in nested.items() for inner in value}
         assert names - {"proposer.action.kind"} <= tried
+
+
+# What the sources' own files say: q, T, staleness, score, whether new levels are trained on, edits.
+SOURCES = {
+    ("robust_plr", "dcd"): (0.5, 0.1, 0.3, "max_mc", False, 0),
+    ("accel", "dcd_accel"): (0.8, 0.3, 0.3, "positive_value_loss", False, 5),
+    ("robust_plr", "minimax"): (0.5, 0.3, 0.3, "max_mc", False, 0),
+    ("accel", "minimax_accel"): (0.5, 0.3, 0.5, "max_mc", False, 20),
+    ("robust_plr", "jaxued"): (0.8, 0.3, 0.3, "max_mc", False, 0),
+    ("accel", "jaxued_accel"): (0.8, 0.3, 0.3, "max_mc", False, 5),
+    ("plr", "sfl"): (0.5, 1.0, 0.3, "max_mc", True, 0),
+    ("accel", "sfl_accel"): (0.5, 1.0, 0.3, "max_mc", True, 20),
+}
+
+
+@pytest.mark.parametrize(("method", "source"), SOURCES)
+def test_a_source_has_its_own_numbers(method: str, source: str) -> None:
+    chosen = composed(f"+method={method}", f"+as={source}").curriculum
+    keys = ("replay_probability", "temperature", "staleness", "score", "train_on_new", "edits")
+    assert tuple(chosen[key] for key in keys) == SOURCES[method, source]
+    assert chosen["capacity"] == 4000
+    parts(composed(f"+method={method}", "+scale=smoke", f"+as={source}"), StopSignals())
+
+
+def test_every_source_is_tried() -> None:
+    there = {file.stem for file in (CONFIG_FOLDER / "as").glob("*.yaml")}
+    assert there == {source for _, source in SOURCES}
+
+
+@pytest.mark.parametrize("method", ["regret", "sfl", "ncc"])
+def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
+    costs = {}
+    for options in ((), ("+score=sampled",)):
+        config = composed(f"+method={method}", "+scale=smoke", *options)
+        learner, curriculum = parts(config, StopSignals())[1:]
+        proposal = curriculum.propose(learner, 0, [Streams(0, "update", 0)])
+        costs[options] = (proposal.frames > 0, proposal.evaluations > 0)
+    assert costs == {(): (False, True), ("+score=sampled",): (True, False)}
