@@ -18,7 +18,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
 
-NOTHING = 1e-9  # a share that is rounding of the solver's
+NOTHING = 1e-6  # a share that is rounding of the solver's
 
 
 class TargetTask(Task, LocatedTarget, Protocol):

@@ -97,6 +97,21 @@ def test_from_bins_that_are_lost_the_nearest_ones_are_taken() -> None:
     np.testing.assert_allclose(p, [0, 1, 0, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("part", range(4))
+def test_it_is_solved_whatever_the_shares(part: int) -> None:
+    """Rounded numbers on the paper's grid: equations that contradict each other by 1e-16."""
+    generator = np.random.default_rng(part)
+    places = np.array(list(product(np.linspace(-1, 1, 6), np.linspace(-1, 1, 8))))
+    costs = ((places[:, None] - places) ** 2).sum(-1)
+    for number in range(40):
+        target, now = generator.dirichlet(np.full(48, 0.1)), generator.dirichlet(np.full(48, 0.5))
+        allowed = generator.random(48) < generator.choice([0.02, 0.1, 0.5, 1])
+        allowed[number] = True
+        p, left = step_towards(target, now, costs, allowed, generator.choice([0.001, 0.3, 1]))
+        assert p.sum() == pytest.approx(1) and (p[~allowed] == 0).all() and (p >= 0).all()
+        assert left >= costs[allowed].min(0) @ target - 1e-6
+
+
 def curriculum(task: Any, **options: Any) -> TransportCurriculum:
     return TransportCurriculum(task, **{"every": 1, "probes": 2, **options})
 
