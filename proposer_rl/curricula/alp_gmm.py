@@ -17,7 +17,7 @@ from proposer_rl.task import Task
 
 LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
 CHUNK = 2**16  # earlier episodes that are compared at once
-SOURCES = ("episodes", "performance")
+SOURCES = ("episodes", "exact")
 
 
 class MixtureCurriculum(Curriculum):
@@ -42,7 +42,7 @@ class MixtureCurriculum(Curriculum):
     Args:
         task: whose space has the bins.
         source: of the return: ``"episodes"`` for the first one of each level in the Solver's
-            training; ``"performance"`` for what the task tells of the level, which costs an
+            training; ``"exact"`` for what the task tells of the level, which costs an
             evaluation of each and is exact where that is.
         warmup: episodes before the first mixture.
         refit: episodes between two mixtures, and that one is fitted to.

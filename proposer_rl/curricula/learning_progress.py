@@ -16,7 +16,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
 Q = 0.1  # the success that is stretched to one half
-SOURCES = ("probes", "episodes")
+SOURCES = ("exact", "episodes")
 
 
 class LearningProgressCurriculum(BinCurriculum):
@@ -35,7 +35,7 @@ class LearningProgressCurriculum(BinCurriculum):
     Args:
         task: whose space has the bins.
         every: updates between two looks at the Solvers.
-        source: of p: ``"probes"`` for fixed levels of every bin, which is exact where the task's
+        source: of p: ``"exact"`` for fixed levels of every bin, which is exact where the task's
             performance is and costs evaluations; ``"episodes"`` for the first episodes of the
             Solver's own training on the bin since the last look, which cost nothing. Of a bin
             without one, the averages stay.
@@ -56,7 +56,7 @@ class LearningProgressCurriculum(BinCurriculum):
         task: Task,
         *,
         every: int = 1,
-        source: str = "probes",
+        source: str = "exact",
         probes: int = 16,
         measure: str = "success",
         fast: float = 0.9,
@@ -80,7 +80,7 @@ class LearningProgressCurriculum(BinCurriculum):
         """Move the averages by the performance on the probes, or in the episodes since."""
         shape = (len(streams), self.task.space.size)
         seen, evaluations = torch.full(shape, torch.nan), 0
-        if self._source == "probes":
+        if self._source == "exact":
             seen, evaluations = self._probes.performance(learner, streams)
         elif self._episodes:
             seen = self._episodes[0] / self._episodes[1]
@@ -108,7 +108,7 @@ class LearningProgressCurriculum(BinCurriculum):
 
     def observe(self, learner: PPO, levels: Any, update: Update) -> None:
         """Remember the episodes, where they are what progress is read from."""
-        if self._source == "probes":
+        if self._source == "exact":
             return
         first = {"success": first_episode_success, "return": first_episode_return}
         reached = first[self._probes.measure](update.rollout).float().cpu()  # [K, P]

@@ -133,7 +133,7 @@ def test_a_warm_up_is_even_and_its_draws_are_rounded() -> None:
     assert ((points - tasks).abs() <= 0.25).all() and len(tasks.unique()) == 5
 
 
-@pytest.mark.parametrize("source", ["episodes", "performance"])
+@pytest.mark.parametrize("source", ["episodes", "exact"])
 def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
     """Bins 0 and 1 are learnt from update 10 to 29; the others never change."""
     task = Scripted(torch.zeros(1, 8), batch_size=32)
@@ -247,7 +247,7 @@ def test_draws_beyond_the_box_are_clipped_and_told() -> None:
 
 def test_performance_is_that_before_the_update_and_counted() -> None:
     task = Scripted(torch.rand(2, 8), batch_size=16)
-    curriculum = small(task, source="performance")
+    curriculum = small(task, source="exact")
     streams = [Streams(0), Streams(1)]
     proposal = curriculum.propose(task, 0, streams)
     assert proposal[1:] == (0, 16)
@@ -268,7 +268,7 @@ def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"source": "both"}, "source must be episodes or performance, got 'both'"),
+        ({"source": "both"}, "source must be episodes or exact, got 'both'"),
         ({"components": 1}, "components must be a whole number from 2 to 1,000,000, got 1"),
         ({"refit": 2.5}, "refit must be a whole number from 2 to 1,000,000, got 2.5"),
         ({"warmup": None}, "warmup must be a whole number from 2 to 1,000,000, got None"),

@@ -71,7 +71,7 @@ def test_shares_are_a_distribution_with_a_floor(progress: list[float], explorati
     assert (shares >= exploration / len(progress) - 1e-6).all()
 
 
-@pytest.mark.parametrize("source", ["probes", "episodes"])
+@pytest.mark.parametrize("source", ["exact", "episodes"])
 def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
     """The last two bins: one is learnt from update 10 to 29; the other never changes."""
     task = Scripted(torch.zeros(1, N), batch_size=40)
@@ -185,7 +185,7 @@ def test_a_task_without_success_is_told_what_to_give() -> None:
         ({"every": 1.5}, "every must be a whole number from 1 to 1,000,000, got 1.5"),
         ({"probes": 10**30}, "probes must be a whole number from 1 to 1,000,000, got 1000"),
         ({"probes": True}, "probes must be a whole number from 1 to 1,000,000, got True"),
-        ({"source": "dreams"}, "source must be probes or episodes, got 'dreams'"),
+        ({"source": "dreams"}, "source must be exact or episodes, got 'dreams'"),
         ({"measure": None}, "measure must be success or return, got None"),
         ({"fast": 1.0}, "fast must be from 0 to below 1, got 1.0"),
         ({"slow": -0.1}, "slow must be from 0 to below 1, got -0.1"),

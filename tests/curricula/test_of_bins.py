@@ -29,7 +29,7 @@ MAKERS: dict[str, Make] = {
     "episodes": lambda: LearningProgressCurriculum(TASK, source="episodes", every=2),
     "mixtures": lambda: MixtureCurriculum(TASK, warmup=8, refit=6, components=3),
     "exact mixtures": lambda: MixtureCurriculum(
-        TASK, source="performance", warmup=8, refit=6, components=3
+        TASK, source="exact", warmup=8, refit=6, components=3
     ),
     "transport": lambda: TransportCurriculum(TASK, delta=0.2, every=2, probes=2),
 }
