@@ -172,15 +172,18 @@ def test_findings_that_hold_are_supported(tmp_path: Path) -> None:
     late = [0.0, 0.0, 0.0, 0.0, 0.3, 0.6]
     soon = [0.2, 0.5, 0.7, 0.85, 0.9, 0.9]
     found = verdicts(study_of(tmp_path, perf_gain=soon, task_difficulty=soon, target=late))
-    for claim in (STALL, SOON, FASTER, HARDER, GAINS, "perf_gain beats target."):
+    for claim in (STALL, SOON, FASTER, HARDER, GAINS):
         assert found[claim] == "supported", claim
     assert found[ALIKE] == "contradicted"
+    # The first method is the baseline, where there is no domain_randomization.
+    assert found["target beats perf_gain."] == "contradicted"
 
 
 def test_findings_that_fail_are_contradicted(tmp_path: Path) -> None:
     found = verdicts(study_of(tmp_path, perf_gain=SLOW, task_difficulty=SLOW, target=FAST))
-    for claim in (STALL, SOON, FASTER, "perf_gain beats target."):
+    for claim in (STALL, SOON, FASTER):
         assert found[claim] == "contradicted", claim
+    assert found["target beats perf_gain."] == "supported"
     found = verdicts(study_of(tmp_path / "other", perf_gain=SLOW, task_difficulty=FAST))
     assert found[SLIGHTLY] == "contradicted"
 
