@@ -327,18 +327,20 @@ def test_a_frozen_one_sees_the_next_solver_through_levels_of_its_life() -> None:
     lives = [[Streams(0, *scope)] for scope in ((), ("lifetime", 1))]
     first, second = learners(1), TASK.learner([Streams(1, "solver")])
     old, fresh = (proposer(**HELD).frozen() for _ in range(2))
-    old.improve(first, 4, lives[0])
-    for updates in (4, 5, 6):  # the last begins an action that is to hold for the seventh, too
+    old.improve(first, 5, lives[0])
+    for updates in (5, 6, 7):  # the last begins an action that is to hold for one more
         old.propose(first, updates, update(updates))
     old.begin()
     seen = []
     for curriculum in (old, fresh):
         curriculum.improve(second, 0, lives[1])
         levels = [curriculum.propose(second, n, update(n)).levels for n in range(3)]
-        seen.append((levels, curriculum.view.validation, curriculum.view.probes))
-    (levels, *looked), (other_levels, *other_looked) = seen
-    assert all((one == other).all() for one, other in zip(looked, other_looked, strict=True))
-    assert all((one == other).all() for one, other in zip(levels, other_levels, strict=True))
+        for purpose in ("validation", "probes"):
+            looked_at = getattr(curriculum.view, purpose)
+            generator = lives[1][0].generator(purpose)
+            assert (looked_at == TASK.target.sample(len(looked_at), generator)).all()
+        seen.append(levels)
+    assert all((one == other).all() for one, other in zip(*seen, strict=True))
 
 
 def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:
