@@ -16,7 +16,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from benchmarks.results import Options
 from proposer_rl.cli.build import Made, build, make_task, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
+from proposer_rl.cli.config import RunConfig, read_config
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.learning import PPO
 from proposer_rl.mazes import Level
 from proposer_rl.mazes.task import MazeTask

@@ -93,7 +93,7 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
 
 
 def test_the_module_runs_as_a_program() -> None:
-    command = [sys.executable, "-m", "proposer_rl.cli.train", "+method=target", *SMOKE]
+    command = [sys.executable, "-m", "proposer_rl.cli.start", "+method=target", *SMOKE]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "outputs/target/" in result.stdout

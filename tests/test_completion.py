@@ -23,7 +23,7 @@ echo "${COMPREPLY[@]}"
 def test_bash_completes_the_name_of_a_method(tmp_path: Path) -> None:
     command = tmp_path / "bin" / "train"  # starts Python as the repository's does
     command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m proposer_rl.cli.train "$@"\n')
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m proposer_rl.cli.start "$@"\n')
     command.chmod(0o755)
     process = subprocess.run(
         ["bash", "-c", PRESS_TAB],

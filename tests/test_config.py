@@ -21,6 +21,7 @@ from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
 from proposer_rl.cli.errors import UNFORESEEN, exit_code
 from proposer_rl.cli.same_run import check_same_run
+from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder
@@ -146,7 +147,10 @@ WRONG = [
     ),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
-    ("sede=1", "Could not override 'sede'"),
+    ("sede=1", "sede: there is no such key; there are: ablation, checkpoint, compute, curriculum"),
+    ("solver.ppo.gama=1", "solver.ppo.gama: there is no such key; there are: adam_eps, clip_"),
+    ("solver.x.y=1", "solver.x: there is no such key; there are: batch_size, ppo"),
+    ("curriculum.tempo=3", "curriculum.tempo: there is no such key; there are: _target_"),
     ("+sede=1", "sede: there is no such key; there are: ablation, checkpoint, compute"),
     ("+solver.x=1", "solver.x: there is no such key; there are: batch_size, ppo"),
     (
@@ -195,7 +199,17 @@ WRONG = [
         "task.distributions.ood: cannot make levels with",
     ),
     # what a method is made of
-    ("curriculum._target_=os.nothing", "curriculum: Error locating target 'os.nothing'"),
+    ("curriculum._target_=os.nothing", "'os.nothing': No module named 'os.nothing'"),
+    (
+        "curriculum._target_=my_parts.make",
+        "curriculum: Error locating target 'my_parts.make': No module named 'my_parts'; if it is "
+        "your own, name its folder, as in PYTHONPATH=. bin/train ...",
+    ),
+    (
+        "task._target_=my_parts.make",
+        "task._target_=my_parts.make: Error locating target 'my_parts.make': No module named "
+        "'my_parts'; if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
+    ),
     ("curriculum._target_=os.system", "curriculum: Target 'os.system' is blocklisted"),
     ("curriculum._target_=builtins.len", "curriculum: must make a Curriculum, but makes int"),
     ("+curriculum.x=1", "curriculum: target() got an unexpected"),
@@ -207,6 +221,14 @@ WRONG_COMMANDS = [
         f"method/magic: unknown; choose one of: {METHODS}",
     ),
     (["+method=3"], "Config group override must be a string or a list. Got int"),
+    (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
+    (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: paper, quick, smoke"),
+    (["+method=target", "task=none"], "task/none: unknown; choose one of: maze"),
+    (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: action_repeat"),
+    (["+method=plr", "+as=none"], "as/none: unknown; choose one of: dcd, dcd_accel, jaxued"),
+    (["+method=plr", "+score=none"], "score/none: unknown; choose one of: sampled"),
+    (["+sweep=none"], "sweep/none: unknown; choose one of: ablations, curricula, paper, quick"),
+    (["curriculum.tempo=3"], "curriculum.tempo: there is no such key; there are: none"),
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: paper, quick"),
     (["+method=hand_made", "hand_made.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (["+method=hand_made", "hand_made.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
@@ -214,8 +236,15 @@ WRONG_COMMANDS = [
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),
     (
         ["+method=perf_gain", "+ablation=meta_episode_length_10", "+scale=quick"],
-        "+scale: must come before +ablation",
+        "+scale: must come before +ablation, or it would undo it",
     ),
+    (
+        ["+ablation=reward_return", "+method=perf_gain"],
+        "+method: must come before +ablation, or it would undo it",
+    ),
+    (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
+    (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
+    (["+score=sampled", "+method=sfl"], "+method: must come before +score, or it would undo it"),
     (
         ["+method=perf_gain", *SMOKE, "proposer.advance=best", "schedule.cycle_length=5"],
         "schedule.cycle_length=5 must equal proposer.meta_episode_length=3",
@@ -261,8 +290,55 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ")
     assert message in line
-    written = {path.name for path in Path("run").glob("*")}
-    assert written <= {".hydra", "train.log"}
+    assert list(Path().iterdir()) == []
+
+
+REFUSED = [
+    ["sede=1"],
+    ["+method=target", "seed=-1"],
+    ["+method=target", "task.network.channels=[13]"],
+    ["-m", "+method=target,magic"],
+    ["-m", "+method=target", "sede=1,2"],
+    ["+sweep=quick", "sede=1"],
+]
+
+
+@pytest.mark.parametrize("arguments", REFUSED)
+def test_a_refused_command_leaves_no_folder_and_nothing_of_others_is_lost(
+    arguments: list[str], train, capsys
+) -> None:
+    for kept in ([], ["outputs/target/other", "multirun/other", "sweeps/other"]):
+        for folder in kept:
+            Path(folder).mkdir(parents=True)
+        before = sorted(Path().rglob("*"))
+        assert train(*arguments, *SMOKE) == 2
+        assert sorted(Path().rglob("*")) == before
+
+
+def test_a_folder_that_was_there_stays(train) -> None:
+    Path("mine").mkdir()
+    assert train("+method=target", "seed=-1", "hydra.run.dir=mine") == 2
+    assert Path("mine").is_dir()
+    assert train("+method=target", "seed=-1", "hydra.run.dir=mine/a/b") == 2
+    assert not Path("mine/a").exists()
+
+
+@pytest.mark.parametrize(
+    ("late", "early", "key"),
+    [
+        ("+method=plr", "+as=dcd", "curriculum.temperature"),
+        ("+method=sfl", "+score=sampled", "curriculum.source"),
+        ("+method=perf_gain", "+ablation=reward_return", "curriculum.reward"),
+    ],
+)
+def test_an_order_that_is_refused_would_undo_something(late: str, early: str, key: str) -> None:
+    found = []
+    for overrides in ([late, early], [early, late], [late]):
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+            found.append(OmegaConf.select(compose("train", overrides), key))
+    right, undone, without = found
+    assert right != without and undone == without
 
 
 def test_a_value_may_refer_to_another(train) -> None:
@@ -276,7 +352,7 @@ def test_a_value_may_refer_to_another(train) -> None:
 def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
     assert train("+method=perf_gain", "compute.collector=ray", "hydra.run.dir=run") == 2
-    line = "error: compute.collector=ray: needs Ray: pip install 'proposer_rl[ray]'"
+    line = f"error: compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
     assert capsys.readouterr().err.strip() == line
 
 

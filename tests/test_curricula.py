@@ -140,6 +140,16 @@ def test_a_schedule_passes_everything_on_and_changes_at_the_exact_update() -> No
     assert calls == [(name, "close") for name in "abc"]
 
 
+def test_a_schedule_starts_anew_with_the_next_solver() -> None:
+    calls: list = []
+    curriculum = schedule(calls)
+    proposed = []
+    for _ in range(2):
+        curriculum.begin()
+        proposed.append([curriculum.propose(None, updates, []).levels for updates in range(4)])
+    assert proposed == [list("aabc")] * 2
+
+
 @pytest.mark.parametrize("until", [[], [2], [3, 2], [2, 2], [0, 4]])
 def test_a_schedule_refuses_ends_that_do_not_fit(until: list[int]) -> None:
     with pytest.raises(ValueError, match="3 stages need 2 ascending positive"):
@@ -310,6 +320,27 @@ def test_a_fresh_solvers_cycle_is_not_the_last_ones() -> None:
     curriculum.begin()
     state = curriculum.state_dict()
     assert state["began"] == 0 and state["action"] is None
+
+
+def test_a_frozen_one_sees_the_next_solver_through_levels_of_its_life() -> None:
+    """As one that has seen no other Solver."""
+    lives = [[Streams(0, *scope)] for scope in ((), ("lifetime", 1))]
+    first, second = learners(1), TASK.learner([Streams(1, "solver")])
+    old, fresh = (proposer(**HELD).frozen() for _ in range(2))
+    old.improve(first, 5, lives[0])
+    for updates in (5, 6, 7):  # the last begins an action that is to hold for one more
+        old.propose(first, updates, update(updates))
+    old.begin()
+    seen = []
+    for curriculum in (old, fresh):
+        curriculum.improve(second, 0, lives[1])
+        levels = [curriculum.propose(second, n, update(n)).levels for n in range(3)]
+        for purpose in ("validation", "probes"):
+            looked_at = getattr(curriculum.view, purpose)
+            generator = lives[1][0].generator(purpose)
+            assert (looked_at == TASK.target.sample(len(looked_at), generator)).all()
+        seen.append(levels)
+    assert all((one == other).all() for one, other in zip(*seen, strict=True))
 
 
 def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from signal import SIG_DFL, SIGTERM, signal
 
+import numpy as np
 import pytest
 import torch
 
@@ -253,6 +254,24 @@ def test_a_checkpoint_of_another_population_is_refused(tmp_path: Path) -> None:
     experiment(tmp_path, 0, 1).run()
     with pytest.raises(CheckpointError, match="does not fit this run"):
         experiment(tmp_path, 0).run()
+
+
+def test_a_threshold_is_reached_by_being_met(tmp_path: Path) -> None:
+    rows = _rows(experiment(tmp_path / "before", 7))
+    best = max(rows, key=lambda row: row["id_success"])  # the first of equals
+    for name, threshold, reached in (
+        ("met", best["id_success"], best["updates"]),
+        ("above", np.nextafter(best["id_success"], 2), None),
+    ):
+        run = experiment(tmp_path / name, 7, threshold=float(threshold))
+        assert _rows(run) == rows
+        assert run.summary()["updates_to_threshold"] == [reached]
+
+
+def _rows(run: Experiment) -> list[dict[str, float]]:
+    """Of a whole run, without the seconds."""
+    run.run()
+    return [{**row, "seconds": 0} for row in read_csv(run.folder.path / "metrics.csv")]
 
 
 def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tests.same_run import assert_same_run
 
 ROOT = Path(__file__).parents[1]
 TRAIN = [
-    *("-m", "proposer_rl.cli.train", "--config-dir", str(ROOT / "examples" / "conf")),
+    *("-m", "proposer_rl.cli.start", "--config-dir", str(ROOT / "examples" / "conf")),
     *("task=mountain_car", "+method=perf_gain", "compute.progress=false", "schedule.updates=6"),
     *("proposer.meta_episode_length=2", "proposer.action_repeat=1", "proposer.rollouts=2"),
     *("task.levels=8", "solver.ppo.horizon=10", "schedule.checkpoint_every=2"),

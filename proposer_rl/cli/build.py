@@ -13,12 +13,13 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from tqdm import tqdm
 
-from proposer_rl.cli.config import ConfigError, RunConfig, TaskMaker, task_maker
+from proposer_rl.cli.config import ConfigError, RunConfig, TaskMaker, task_maker, why_not_made
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.outcome import run_name
 from proposer_rl.curricula import Curriculum
 from proposer_rl.experiment import Experiment, check_headline
+from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
@@ -167,7 +168,7 @@ def _curriculum(config: RunConfig, task: Task, signals: StopSignals) -> Curricul
         factory = instantiate(config.curriculum, _partial_=True)
         curriculum = factory(chosen)
     except (TypeError, ValueError, HydraException) as error:
-        raise ConfigError(f"curriculum: {one_line(error)}") from error
+        raise ConfigError(f"curriculum: {why_not_made(error)}") from error
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
@@ -207,7 +208,9 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     if compute.collector == "single":
         return None
     if compute.collector == "ray" and find_spec("ray") is None:
-        raise ConfigError("compute.collector=ray: needs Ray: pip install 'proposer_rl[ray]'")
+        raise ConfigError(
+            f"compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
+        )
     on_gpus = task.device.type == "cuda"
     available = torch.cuda.device_count() if on_gpus else available_cores()
     count = compute.workers or min(copies, available)

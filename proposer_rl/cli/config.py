@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 from hydra.errors import HydraException
-from hydra.utils import get_object
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.places import CONFIG_FOLDER, names
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import (
     ComputeSettings,
@@ -24,13 +26,6 @@ from proposer_rl.settings import (
     ProposerSettings,
     Schedule,
     SolverSettings,
-)
-
-PACKAGE = Path(__file__).resolve().parents[1]
-# In a wheel the configuration lies in the package, in a checkout beside it.
-CONFIG_FOLDER = next(
-    (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
-    PACKAGE / "conf",
 )
 
 # ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
@@ -93,8 +88,8 @@ def read_config(config: DictConfig) -> RunConfig:
         ConfigError: naming the first wrong key, its value and what is allowed.
     """
     if config.method is None or config.curriculum is None:
-        names = ", ".join(methods())
-        raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {names}")
+        known = ", ".join(methods())
+        raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
     values = _resolved(config)
     for key, value in _leaves(values):
         if isinstance(value, int | float) and abs(value) > LARGEST:
@@ -121,12 +116,12 @@ def task_maker(settings: Mapping[str, Any]) -> TaskMaker:
     if not isinstance(target, str):
         raise ConfigError("task._target_: missing: the class or function that makes the task")
     try:
-        make = get_object(target)
+        make = instantiate({"_target_": target, "_partial_": True}).func
         parameters = inspect.signature(make).parameters
         typed = make.__init__ if inspect.isclass(make) else make
         hints = get_type_hints(typed, include_extras=True)  # bounds, too
     except (HydraException, ImportError, AttributeError, TypeError, ValueError, NameError) as error:
-        raise ConfigError(f"task._target_={target}: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"task._target_={target}: {why_not_made(error)}") from error
     missing = [name for name in GIVEN_TO_TASKS if name not in parameters]
     if missing:
         raise ConfigError(
@@ -182,22 +177,41 @@ def stored_config(file: Path) -> Any:
 
 
 def check_order(overrides: Sequence[str]) -> None:
-    """Refuse an order in which a scale would undo an ablation: later groups win.
+    """Refuse an order in which one group would undo another: later ones win.
 
     Args:
         overrides: as given on the command line.
 
     Raises:
-        ConfigError: if ``+scale=`` comes after ``+ablation=``.
+        ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them.
     """
-    groups = [override.partition("=")[0] for override in overrides]
-    if "+ablation" in groups and "+scale" in groups[groups.index("+ablation") :]:
-        raise ConfigError("+scale: must come before +ablation, or it would undo the ablation")
+    changed_by = None
+    for override in overrides:
+        group = override.partition("=")[0]
+        if group in ("+ablation", "+as", "+score"):
+            changed_by = changed_by or group
+        elif group in ("+method", "+scale") and changed_by is not None:
+            raise ConfigError(f"{group}: must come before {changed_by}, or it would undo it")
 
 
 def methods() -> list[str]:
     """Names of the methods in the configuration folder."""
-    return sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
+    return names(CONFIG_FOLDER, "method")
+
+
+def why_not_made(error: BaseException) -> str:
+    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
+    line = one_line(error).partition(", set env var HYDRA_FULL_ERROR")[0]
+    innermost = error
+    while innermost.__cause__ is not None:
+        innermost = innermost.__cause__
+    if innermost is error or not isinstance(innermost, ImportError):
+        return line
+    line = f"{line}: {one_line(innermost)}"
+    # With a dot in its name, what holds the module was found.
+    if not isinstance(innermost, ModuleNotFoundError) or "." in str(innermost.name):
+        return line
+    return f"{line}; if it is your own, name its folder, as in PYTHONPATH=. bin/train ..."
 
 
 def _resolved(config: DictConfig) -> Any:

@@ -13,6 +13,7 @@ from torchrl.record.loggers import get_logger
 
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.experiment import Log
+from proposer_rl.extras import install_command
 from proposer_rl.report.proposals import last_map
 from proposer_rl.report.records import numbers, picture
 from proposer_rl.settings import LoggerSettings
@@ -28,8 +29,8 @@ def require_logger(settings: LoggerSettings) -> None:
     """
     if settings.type != "csv" and find_spec(settings.type) is None:
         raise ConfigError(
-            f"logger={settings.type}: its package is missing; install it with "
-            f"pip install 'proposer_rl[{settings.type}]'"
+            f"logger={settings.type}: its package is missing; install it with: "
+            f"{install_command(settings.type)}"
         )
 
 

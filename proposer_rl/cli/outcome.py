@@ -15,7 +15,8 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from tqdm import tqdm
 
-from proposer_rl.cli.config import PACKAGE, RunConfig
+from proposer_rl.cli.config import RunConfig
+from proposer_rl.cli.places import PACKAGE
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.terminal import screen

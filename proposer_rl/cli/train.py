@@ -1,4 +1,4 @@
-"""``bin/train`` and ``proposer-train``: run one experiment, or with ``-m`` several."""
+"""Run one experiment, or with ``-m`` several: ``bin/train``, but for its help."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, ConfigError, RunConfig, check_order, read_config
+from proposer_rl.cli.config import ConfigError, RunConfig, check_order, read_config
 from proposer_rl.cli.errors import SIGNALLED, UNFORESEEN, command, exit_code, one_line, refuse
+from proposer_rl.cli.hydra_errors import explained
 from proposer_rl.cli.outcome import announce, identity, overrides, run_name
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.cli.sweep import forget_failure, record_failure
+from proposer_rl.cli.traces import remove_traces
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
@@ -45,14 +48,13 @@ def _compose_and_run() -> None:
     _refuse_pickles(sys.argv)
     try:
         _main()
-    except MissingConfigException as error:
-        known = f"; choose one of: {', '.join(error.options)}" if error.options else ""
-        raise ConfigError(f"{error.missing_cfg_file}: unknown{known}") from error
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(one_line(error)) from error
+        remove_traces()
+        raise ConfigError(explained(error)) from error
     except ValueError as error:
         if HydraConfig.initialized():
             raise
+        remove_traces()
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
 
 
@@ -74,6 +76,7 @@ def _main(hydra_config: DictConfig) -> float:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error), exit_code(error))
         if exit_code(error) != UNFORESEEN:
+            remove_traces()
             refuse(error)
         raise
 
@@ -166,8 +169,3 @@ def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
 def _how_to_go_on(folder: RunFolder) -> str:
     again = shlex.join([*overrides(), f"hydra.run.dir={folder.path}"])
     return f"To go on: bin/train {again}"
-
-
-if __name__ == "__main__":
-    sys.argv[0] = "train"  # the name in the shell, bin/train: Hydra installs completion for it
-    main()

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from proposer_rl.extras import install_command
+
 
 class TaskMixture(NamedTuple):
     """Gaussians over points and progress; the last of the D + 1 coordinates is progress.
@@ -30,7 +32,7 @@ def require_scikit_learn() -> None:
     """
     if find_spec("sklearn") is None:
         raise ValueError(
-            "alp_gmm: scikit-learn is missing; install it with pip install 'proposer_rl[alp-gmm]'"
+            f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"
         )
 
 

@@ -167,17 +167,16 @@ class RolloutEvaluator:
         uniform = torch.rand(noise, generator=generator, device=levels.walls.device)
         state = env.reset()
         playing = torch.ones(batch, dtype=torch.bool, device=levels.walls.device)
-        returns, successes = torch.zeros_like(playing, dtype=torch.float32), ~playing
-        for number in uniform:
+        returns = torch.zeros_like(playing, dtype=torch.float32)
+        for number in uniform:  # one for each step up to the limit: nothing is truncated before
             cell = cell_index(state["agent"], levels.walls.shape[-1])[..., None, None]
             here = cumulative.gather(-2, cell.expand(*batch, 1, len(MOVES))).squeeze(-2)
             threshold = number.expand(batch).unsqueeze(-1) * here[..., -1:]
             action = (here <= threshold).sum(-1).clamp_(max=len(MOVES) - 1)
             state = env.step(state.set("action", action))["next"]
             returns += state["reward"].squeeze(-1) * playing
-            successes |= state["terminated"].squeeze(-1) & playing
-            playing &= ~state["done"].squeeze(-1)
-        return _result(levels, returns.mean(0), successes.float().mean(0))
+            playing &= ~state["terminated"].squeeze(-1)
+        return _result(levels, returns.mean(0), (~playing).float().mean(0))
 
 
 @torch.no_grad()

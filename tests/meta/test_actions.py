@@ -79,6 +79,19 @@ def test_a_copys_levels_depend_on_its_action_and_stream_alone(actions: Actions) 
     assert torch.equal(both[..., 0].long(), choices)
 
 
+def test_levels_are_drawn_apart_from_their_bins() -> None:
+    """Of two even bins, what is drawn in one does not tell which one it is."""
+    space, streams = Numbered(2), [Streams(seed) for seed in range(400)]
+    action = torch.zeros(len(streams), 1)
+    drawn, choices = Mixture(space).levels(action, 1, streams)
+    named, _ = ProblemChoices(space).levels(choices, 1, streams)
+    assert torch.equal(drawn, named)  # however much chance the choices took
+    for choice in range(2):
+        own = drawn[..., 1][choices == choice]
+        assert len(own) > 150
+        assert own.mean() == pytest.approx(0.5, abs=0.08)
+
+
 @pytest.mark.parametrize(
     "directions",
     [torch.zeros(3), torch.full((1, 2), torch.inf), torch.zeros(0, 2), torch.zeros(1, 3)],

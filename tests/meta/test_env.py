@@ -69,18 +69,21 @@ def test_specs(options: dict) -> None:
     check_env_specs(meta_env(**options), break_when_any_done="both")
 
 
-def test_an_episode_is_a_plain_loop_over_one_solver() -> None:
+@pytest.mark.parametrize("episode", [0, 1])
+def test_an_episode_is_a_plain_loop_over_one_solver(episode: int) -> None:
+    """Also the second: it starts with the Solver that was forked, not with those of the first."""
     env, start, streams, actions = meta_env(), learners(1).snapshot(), Streams(9), some_actions()
     env.fork(start[0], streams)
-    steps = play(env, actions)
+    steps = [play(env, actions) for _ in range(episode + 1)][episode]
     validation = TASK.target.sample(E, streams.generator("validation"))
     for k in range(K):
         solver = learners(1)
         returns = [evaluate(solver.agent, validation)["return"].mean()]
         for step in range(L):
-            levels = SPACE.generate(actions[step, k], streams.generator(0, step, k, "levels"))
+            place = (episode, step, k)
+            levels = SPACE.generate(actions[step, k], streams.generator(*place, "levels"))
             solver.env.set_levels(levels[None])
-            solver.update([streams.generator(0, step, k, "actions")])
+            solver.update([streams.generator(*place, "actions")])
             returns.append(evaluate(solver.agent, validation)["return"].mean())
         gains = torch.stack(returns).diff()
         torch.testing.assert_close(steps["next", "reward"][k, :, 0], gains, rtol=1e-3, atol=1e-5)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import struct
 from pathlib import Path
 
@@ -226,6 +227,34 @@ def test_write_json_replaces(folder: RunFolder) -> None:
     folder.write_json("summary.json", {"b": None})
     assert json.loads((folder.path / "summary.json").read_text()) == {"b": None}
     assert [path.name for path in folder.path.iterdir()] == ["summary.json"]
+
+
+def test_a_file_gets_its_name_once_it_is_on_the_disk_and_so_does_the_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, done = tmp_path / "x", []
+    write_atomically(path, b"old")
+    fsync, replace = os.fsync, os.replace
+
+    def note_fsync(descriptor: int) -> None:
+        synced = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        done.append(("fsync", synced, synced.read_bytes() if synced.is_file() else None))
+        fsync(descriptor)
+
+    def note_replace(source: Path, target: Path) -> None:
+        done.append(("replace", source, target))
+        replace(source, target)
+
+    monkeypatch.setattr(run_folder.os, "fsync", note_fsync)
+    monkeypatch.setattr(run_folder.os, "replace", note_replace)
+    write_atomically(path, b"new")
+    temporary = done[0][1]
+    assert temporary.parent == tmp_path and temporary != path
+    assert done == [
+        ("fsync", temporary, b"new"),  # all of it, not what a buffer has let go
+        ("replace", temporary, path),
+        ("fsync", tmp_path, None),
+    ]
 
 
 def test_an_error_leaves_the_old_file_alone(

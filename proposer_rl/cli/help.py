@@ -1,0 +1,75 @@
+"""``bin/train --help``: what there is to choose from, with the first line of each file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from proposer_rl.cli.places import CONFIG_FOLDER, names
+
+# In the order in which they are given on the command line, and what each decides.
+GROUPS = {
+    "task=": "what is to be learnt",
+    "+method=": "what the Solver trains on",
+    "+scale=": "how much is computed",
+    "+as=": "the numbers of another library, for methods that keep levels",
+    "+score=": "where the scores of levels come from",
+    "+ablation=": "what is changed of a method",
+    "+sweep=": "many runs",
+}
+USAGE = """\
+Train a Solver on a curriculum.
+
+  bin/train +method=NAME [+scale=NAME] [+ablation=NAME] [KEY=VALUE ...]
+"""
+EXAMPLES = """\
+Examples:
+  bin/train +method=perf_gain +scale=quick
+  bin/train -m +method=perf_gain,target +scale=quick seed=0,1,2
+  bin/train +method=perf_gain +scale=quick --cfg job   # every setting; nothing is run
+
+-m runs every combination; --hydra-help lists the other options, all of them Hydra's."""
+PACKAGE_LINE = "# @package"
+
+
+def asks_for_help(arguments: Sequence[str]) -> bool:
+    """Whether the command is to say what it does, instead of doing it."""
+    return "--help" in arguments or "-h" in arguments
+
+
+def help_text(arguments: Sequence[str]) -> str:
+    """Usage, what each group has, and examples.
+
+    Args:
+        arguments: of the command; a folder given with ``--config-dir`` is looked into, too.
+    """
+    folders = [CONFIG_FOLDER, *_own_folders(arguments)]
+    parts = [USAGE]
+    for option, meaning in GROUPS.items():
+        parts.append(f"{option} {meaning}")
+        parts += [f"  {name:24} {line}" for name, line in _choices(option.strip("+="), folders)]
+        parts.append("")
+    return "\n".join([*parts, EXAMPLES])
+
+
+def _choices(group: str, folders: Sequence[Path]) -> list[tuple[str, str]]:
+    """Names and first lines; of two files with one name the first folder's counts, as in Hydra."""
+    found: dict[str, str] = {}
+    for folder in folders:
+        for name in names(folder, group):
+            found.setdefault(name, _first_comment(folder / group / f"{name}.yaml"))
+    return sorted(found.items())
+
+
+def _first_comment(file: Path) -> str:
+    lines = file.read_text(encoding="utf-8").splitlines()
+    said = (line for line in lines if line.startswith("#") and not line.startswith(PACKAGE_LINE))
+    return next(said, "").lstrip("# ")
+
+
+def _own_folders(arguments: Sequence[str]) -> Iterator[Path]:
+    option = "--config-dir"
+    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
+        name, equals, value = argument.partition("=")
+        if name == option or argument == "-cd":
+            yield Path(value if equals else following)

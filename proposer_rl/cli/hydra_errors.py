@@ -1,0 +1,52 @@
+"""What Hydra says of a command that it cannot compose, in one line that says what there is."""
+
+from __future__ import annotations
+
+import re
+
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.extras import install_command
+
+LAUNCHERS = [f"hydra/launcher/{name}" for name in ("joblib", "submitit_local", "submitit_slurm")]
+# Groups of which nothing is chosen until a command does.
+ADDED = ("method", "scale", "ablation", "as", "score", "sweep")
+_NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
+
+
+def explained(error: Exception) -> str:
+    """The message of an error from composing a configuration.
+
+    Args:
+        error: of Hydra or of OmegaConf.
+    """
+    if isinstance(error, MissingConfigException):
+        return _no_such_file(error)
+    cause = error.__cause__
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        return _no_such_key(cause)
+    not_chosen = _NOT_CHOSEN.match(str(error))
+    if not_chosen and not_chosen[1] in ADDED:
+        group, known = not_chosen[1], ", ".join(names(CONFIG_FOLDER, not_chosen[1]))
+        return f"{group}: choose one with +{group}=NAME, NAME one of: {known}"
+    return one_line(error)
+
+
+def _no_such_file(error: MissingConfigException) -> str:
+    file = error.missing_cfg_file
+    if file in LAUNCHERS:
+        return f"{file}: its package is missing; install it with: {install_command('launchers')}"
+    known = f"; choose one of: {', '.join(error.options)}" if error.options else ""
+    return f"{file}: unknown{known}"
+
+
+def _no_such_key(error: OmegaConfBaseException) -> str:
+    holder = error.parent_node
+    if not isinstance(holder, DictConfig):
+        return one_line(error)
+    known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
+    return f"{error.full_key}: there is no such key; there are: {', '.join(known) or 'none'}"

@@ -1,0 +1,25 @@
+"""Packages that only some runs need, and how they are installed."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def install_command(extra: str) -> str:
+    """The line that installs an extra into the environment that this process runs in.
+
+    Of a checkout, with the versions that its commands pin. Elsewhere the package is installed
+    already, so that no index is asked for it.
+
+    Args:
+        extra: one of ``project.optional-dependencies`` in ``pyproject.toml``.
+    """
+    what = [f"proposer_rl[{extra}]"]
+    constraints = ROOT / "constraints.txt"
+    if constraints.is_file():
+        what = ["-c", str(constraints), "-e", f"{ROOT}[{extra}]"]
+    return shlex.join([sys.executable, "-m", "pip", "install", *what])

@@ -1,0 +1,81 @@
+"""The frames that runs say they cost, against the steps that their environments make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from signal import SIGTERM
+
+import pytest
+
+from proposer_rl.cli.build import build, parts
+from proposer_rl.experiment import Experiment
+from proposer_rl.mazes import MazeEnv
+from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.runs.signals import Interrupted, StopSignals
+from tests.tiny import composed
+
+# Where frames are spent: in proposing, in observing, in improving.
+SPENT = {
+    "propose": ["+method=robust_plr", "curriculum.capacity=16"],
+    "propose, sampled": [
+        "+method=sfl",
+        "+score=sampled",
+        "curriculum.candidates=16",
+        "curriculum.keep=8",
+    ],
+    "observe": ["+method=paired"],
+    "improve": ["+method=perf_gain"],
+    "nowhere": ["+method=target"],
+}
+
+
+class At(StopSignals):
+    """A signal that comes at the n-th safe point."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__()
+        self.left = points
+
+    @property
+    def pending(self) -> bool:
+        return self.left == 1
+
+    def deliver(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Interrupted(SIGTERM)
+
+
+def experiment(folder: Path, arguments: list[str], signals: StopSignals) -> Experiment:
+    scale = ["+scale=smoke", "compute.progress=false"]
+    config = composed(arguments[0], *scale, *arguments[1:])
+    return build(config, parts(config, signals), RunFolder(folder), signals)
+
+
+@pytest.mark.parametrize("arguments", SPENT.values(), ids=SPENT.keys())
+def test_the_frames_are_the_steps_that_were_made_also_after_a_resume(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    step = MazeEnv._step
+
+    def counted(self: MazeEnv, *given: object) -> object:
+        made.append(self.batch_size.numel())
+        return step(self, *given)
+
+    monkeypatch.setattr(MazeEnv, "_step", counted)
+    summary = experiment(tmp_path / "whole", arguments, StopSignals()).run()
+    assert summary["frames"] == 6 * 4 * 10
+    assert summary["frames"] + summary["curriculum_frames"] == sum(made)
+    assert (summary["curriculum_frames"] > 0) == (arguments != SPENT["nowhere"])
+    with pytest.raises(Interrupted):
+        experiment(tmp_path / "again", arguments, At(5)).run()
+    assert len(read_csv(tmp_path / "again" / "metrics.csv")) < 4
+    experiment(tmp_path / "again", arguments, StopSignals()).run()
+    whole, again = (
+        [{**row, "seconds": 0} for row in read_csv(tmp_path / name / "metrics.csv")]
+        for name in ("whole", "again")
+    )
+    assert whole == again
+    for cost in ("curriculum_frames", "evaluations"):
+        assert whole[-1][cost] == summary[cost]

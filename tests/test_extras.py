@@ -1,0 +1,63 @@
+"""The line that a command prints where a package is missing, and what pip makes of it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.errors import MissingConfigException
+
+from proposer_rl import extras
+from proposer_rl.cli.hydra_errors import LAUNCHERS, explained
+from proposer_rl.extras import install_command
+from tests.test_packaging import PROJECT, ROOT
+
+EXTRAS = PROJECT["optional-dependencies"]
+CALL = re.compile(r"install_command\(([^)]*)\)")
+OFFLINE = ["--dry-run", "--no-index", "--no-deps", "--no-build-isolation"]
+
+
+def test_only_extras_that_there_are_are_asked_for() -> None:
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "proposer_rl").rglob("*.py")]
+    asked = {name for source in sources for name in CALL.findall(source)}
+    named = {name.strip("\"'") for name in asked if name[0] in "\"'"}
+    assert named == {"alp-gmm", "launchers", "ray"}
+    # The others are the definition and the logger's, whose extra has its name.
+    assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type"}
+    assert named | {"tensorboard", "wandb"} <= EXTRAS.keys()
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_of_a_checkout_the_line_installs_it_with_the_extra(extra: str) -> None:
+    command = shlex.split(install_command(extra))
+    assert command[:4] == [sys.executable, "-m", "pip", "install"]
+    assert command[4:] == ["-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}[{extra}]"]
+
+
+def test_pip_takes_the_line() -> None:
+    command = [*shlex.split(install_command("tensorboard")), *OFFLINE]
+    command.remove("-e")  # what it needs to build would be downloaded
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.rstrip().endswith(f"Would install proposer_rl-{PROJECT['version']}")
+
+
+def test_of_an_installed_package_the_line_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "ROOT", tmp_path)
+    command = shlex.split(install_command("alp-gmm"))
+    assert command == [sys.executable, "-m", "pip", "install", "proposer_rl[alp-gmm]"]
+
+
+def test_a_launcher_that_is_missing_is_told_from_one_that_there_is_not() -> None:
+    for file in LAUNCHERS:
+        error = MissingConfigException("Could not find it", file, ["basic"])
+        line = f"{file}: its package is missing; install it with: {install_command('launchers')}"
+        assert explained(error) == line
+    error = MissingConfigException("Could not find it", "hydra/launcher/jobs", ["basic"])
+    assert explained(error) == "hydra/launcher/jobs: unknown; choose one of: basic"

@@ -1,0 +1,72 @@
+"""``bin/train --help``: complete, at once, and about what there is."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from proposer_rl.cli.help import GROUPS, help_text
+from proposer_rl.cli.places import CONFIG_FOLDER
+from tests.tiny import composed
+
+FILES = [
+    file for group in GROUPS for file in sorted((CONFIG_FOLDER / group.strip("+=")).glob("*.yaml"))
+]
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_every_choice_has_its_line(file: Path) -> None:
+    section = help_text([]).partition(f"{file.parent.name}= ")[2].partition("\n\n")[0]
+    (line,) = re.findall(rf"^  {file.stem} +(.*)$", section, re.MULTILINE)
+    assert f"# {line}\n" in file.read_text(encoding="utf-8")
+    assert len(line) > 10 and line.endswith(".")
+
+
+def test_every_group_that_a_command_adds_is_listed() -> None:
+    given = {folder.name for folder in CONFIG_FOLDER.iterdir() if folder.is_dir()}
+    always = {"logger", "compute", "proposer"}  # docs/configuration.md has these
+    assert given - always == {group.strip("+=") for group in GROUPS}
+    assert {"target", "perf_gain", "plr"} <= {file.stem for file in FILES}
+
+
+def test_the_examples_are_valid() -> None:
+    examples = re.findall(r"^  bin/train (\+.*|-m .*)$", help_text([]).split("Examples:")[1], re.M)
+    assert len(examples) == 3
+    for example in examples:
+        overrides = [word for word in shlex.split(example, comments=True) if "=" in word]
+        assert composed(*(word.partition(",")[0] for word in overrides)).method == "perf_gain"
+
+
+def test_files_of_ones_own_are_listed(tmp_path: Path) -> None:
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").write_text("# @package _global_\n# My own.\nmethod: mine\n")
+    (tmp_path / "method" / "target.yaml").write_text("# Not the one that Hydra takes.\n")
+    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"]):
+        said = help_text([*option, "--help"])
+        assert "My own." in said and "Not the one" not in said
+    assert "My own." not in help_text(["--help"])
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["+method=target", "-h"]])
+def test_help_imports_nothing_that_takes_time(arguments: list[str], tmp_path: Path) -> None:
+    code = (
+        "import sys; from proposer_rl.cli.start import main; main(); "
+        "assert not {'torch', 'hydra', 'pydantic'} & sys.modules.keys()"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(CONFIG_FOLDER.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == help_text([]) + "\n"
+    assert list(tmp_path.iterdir()) == []
