@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from proposer_rl.cli.help import asks_for_help, help_text
@@ -10,7 +11,10 @@ from proposer_rl.cli.help import asks_for_help, help_text
 def main() -> None:
     """Entry point of the command."""
     if asks_for_help(sys.argv[1:]):
-        print(help_text(sys.argv[1:]))
+        try:
+            print(help_text(sys.argv[1:]), flush=True)
+        except BrokenPipeError:  # who reads has seen enough, as with `| head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return
     # It takes seconds to import PyTorch.
     from proposer_rl.cli.train import main as train
