@@ -310,7 +310,7 @@ class ReplayCurriculum(Curriculum):
             "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
         }
         if self._edits:
-            shown["lineage of the most edited, as far as it is kept"] = _lineage(buffer)
+            shown["the longest line of edits in the buffer"] = _lineage(buffer)
         return {
             caption: self.task.record(buffer["level"][which], None)
             for caption, which in shown.items()
@@ -364,11 +364,17 @@ def _easiness(scorer: Scorer, learner: PPO, update: Update) -> Tensor:
 
 
 def _lineage(buffer: TensorDictBase) -> Tensor:
-    """Slots from the oldest ancestor that is there to the most edited level of a buffer [n]."""
-    slots = [int(buffer["generation"].argmax())]
-    while len(slots) < SHOWN:
-        parent = (buffer["key"] == buffer["parent"][slots[-1]]).nonzero().flatten().tolist()
-        if not parent or parent[0] in slots:
-            break
-        slots.append(parent[0])
-    return torch.tensor(slots[::-1])
+    """Slots of a buffer [n] that hold the longest line of levels, each edited from the one before.
+
+    At most the last :data:`SHOWN` of it.
+    """
+    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
+    parents = [place.get(key) for key in buffer["parent"].tolist()]
+    longest: list[int] = []
+    for slot in range(len(parents)):
+        line, parent = [slot], parents[slot]
+        while parent is not None and parent not in line and len(line) < SHOWN:
+            line.append(parent)
+            parent = parents[parent]
+        longest = max(longest, line, key=len)
+    return torch.tensor(longest[::-1])

@@ -17,6 +17,7 @@ from proposer_rl.curricula.buffer import (
     level_keys,
     score_weights,
 )
+from proposer_rl.curricula.replay import _lineage
 from proposer_rl.mazes import planes
 from proposer_rl.streams import Streams
 from tests.curricula.living import (
@@ -194,6 +195,14 @@ def test_children_differ_from_their_parents_by_their_edits() -> None:
             assert 0 < walls + moved <= 3
             assert int(child["generation"]) == int(parent["generation"][0]) + 1
     assert found > 4
+
+
+def test_the_lineage_is_the_longest_line_of_edits() -> None:
+    buffer = empty_buffer(TASK.space.sample(1, torch.Generator())[0], 1, 6)[0]
+    buffer["key"] = torch.tensor([1, 2, 3, 4, 5, 6])
+    buffer["parent"] = torch.tensor([3, 0, 2, 1, 99, 5])  # 2 > 3 > 1 > 4, and 5 > 6
+    buffer["generation"] = torch.tensor([2, 0, 1, 3, 7, 8])
+    assert _lineage(buffer).tolist() == [1, 2, 0, 3]
 
 
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
