@@ -144,7 +144,7 @@ def test_every_source_is_tried() -> None:
     assert there == {source for _, source in SOURCES}
 
 
-@pytest.mark.parametrize("method", ["regret", "sfl", "ncc"])
+@pytest.mark.parametrize("method", ["regret", "sfl", "ncc", "pace"])
 def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
     costs = {}
     for options in ((), ("+score=sampled",)):

@@ -15,7 +15,7 @@ l1_value_loss          mean of abs(A_t)
 max_mc                 mean of R - V(s_t)
 learnability           p (1 - p) of the share p       p (1 - p)
 regret                 R - mean return                J* - J
-gradient_norm                                         squared norm of the gradient of J
+gradient_norm          the same of a policy gradient  squared norm of the gradient of J
 =====================  =============================  ====================================
 
 Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
@@ -36,7 +36,7 @@ from torch import Tensor
 from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.learning import PPO
 from proposer_rl.learning.advantages import gae
-from proposer_rl.meta.gradient_norms import squared_gradients
+from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask, ExactTask, Levels, OptimalTask, Task
 
@@ -132,13 +132,15 @@ class Scorer:
         self.from_episodes = one_of("source", source, ("episodes", "exact")) == "episodes"
         self._name = name
         there_are = {
-            "episodes": [*STEPWISE, "learnability", "regret"],
+            "episodes": [*STEPWISE, "learnability", "regret", "gradient_norm"],
             "exact": ["learnability", "regret", "gradient_norm"],
         }
         if name not in there_are[source]:
             raise ValueError(f"score={name!r}: from source={source} there are {there_are[source]}")
         if not self.from_episodes:
             self._exact = _exact_score(task, name)
+        elif name == "gradient_norm":
+            self._policy_gradients = squared_policy_gradients(task)
 
     def of_rollouts(self, learner: PPO, rollouts: Sequence[TensorDictBase], best: Tensor) -> Scored:
         """Score levels [K, P] by rollouts on them, [K, P, T] each.
@@ -153,7 +155,13 @@ class Scorer:
         count = torch.stack([f.ended for f in found]).sum(0)
         some = count.clamp(1)
         best = torch.stack([best.to(count.device).double(), *(f.best for f in found)]).amax(0)
-        if self._name in STEPWISE:
+        if self._name == "gradient_norm":
+            lengths = [
+                self._policy_gradients(learner, rollout, _advantages(learner, rollout))
+                for rollout in rollouts
+            ]
+            score = torch.stack(lengths).mean(0)
+        elif self._name in STEPWISE:
             each = [
                 (self._stepwise(learner, rollout, best) * f.weight).sum(-1)
                 for rollout, f in zip(rollouts, found, strict=True)
@@ -218,10 +226,15 @@ class Scorer:
         return Scored(score, torch.full(score.shape, -torch.inf)), score.shape[1]
 
     def _stepwise(self, learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
-        settings, value = learner.settings, learner.agent.value_key
-        played = gae(settings.gamma, settings.lmbda, value)(rollout.copy())
-        advantage, values = (played[key].squeeze(-1).double() for key in ("advantage", value))
-        return STEPWISE[self._name](advantage, values, best)
+        values = rollout[learner.agent.value_key].squeeze(-1).double()
+        return STEPWISE[self._name](_advantages(learner, rollout).double(), values, best)
+
+
+def _advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
+    """GAE with the learner's numbers, not standardised: float [K, P, T]."""
+    settings = learner.settings
+    estimate = gae(settings.gamma, settings.lmbda, learner.agent.value_key)
+    return estimate(rollout.copy())["advantage"].squeeze(-1)
 
 
 def _exact_score(task: Task, name: str) -> Callable[[PPO, Levels, torch.Generator], Tensor]:

@@ -17,29 +17,92 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import PPO
-from proposer_rl.meta.first_order import squared_length
+from proposer_rl.meta.first_order import squared_length, surrogate
+from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
-from proposer_rl.task import ExactTask, Levels
+from proposer_rl.task import ExactTask, Levels, Task
+
+Worth = Callable[[ActorCritic, int, Tensor], Tensor]
+"""Of m agents in a population, a Solver and the places of m of its levels, int64 [m]: float [m]."""
 
 
 def squared_gradients(task: ExactTask, chunk: int = 16) -> Callable[[PPO, Levels], Tensor]:
-    """Makes the function that scores levels, and a population for it to work with.
-
-    The population has ``chunk`` Solvers. All of them become copies of one whose levels are to be
-    scored, and each gets one level of its own. So the sum of their returns, differentiated once,
-    gives each the gradient of its level.
+    """Makes the function that scores levels by the gradient of their exact return.
 
     Args:
         task: of the Solvers and levels.
-        chunk: levels at once, at least 1. As many networks, their gradients and their activations
-            are in memory; where a Solver has fewer levels, the others are computed for nothing.
+        chunk: see :func:`level_gradients`.
 
     Returns:
         A function of a learner of K Solvers, which it leaves as it is, and levels [K, n], each to
         be scored for its Solver: float [K, n], without gradients.
+
+    Raises:
+        ValueError: if ``chunk`` is less than 1.
+    """
+    lengths = level_gradients(task, chunk)
+
+    def score(learner: PPO, levels: Levels) -> Tensor:
+        def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            some = levels[solver, which].unsqueeze(-1)
+            return task.differentiable_performance(agent, some)["return"].squeeze(-1)
+
+        return lengths(learner, returns, *levels.batch_size)
+
+    return score
+
+
+def squared_policy_gradients(
+    task: Task, chunk: int = 16
+) -> Callable[[PPO, TensorDictBase, Tensor], Tensor]:
+    """Makes the function that scores levels by the policy gradient of episodes on them.
+
+    The estimate of a level's gradient has the length of its noise, too: short rollouts score higher
+    than the exact gradient by its variance.
+
+    Args:
+        task: of the Solvers.
+        chunk: see :func:`level_gradients`.
+
+    Returns:
+        A function of a learner of K Solvers, a rollout [K, n, T] of theirs and its advantages,
+        float [K, n, T]: float [K, n], the squared length of the gradient of the mean over the steps
+        of A_t log pi(a_t | s_t).
+
+    Raises:
+        ValueError: if ``chunk`` is less than 1.
+    """
+    lengths = level_gradients(task, chunk)
+
+    def score(learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
+        def gained(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            steps = rollout[solver][which].unsqueeze(1)  # [m, 1, T]
+            return surrogate(agent, steps, advantage[solver, which].unsqueeze(1)).squeeze(-1)
+
+        return lengths(learner, gained, *rollout.batch_size[:2])
+
+    return score
+
+
+def level_gradients(task: Task, chunk: int) -> Callable[[PPO, Worth, int, int], Tensor]:
+    """Makes what takes the gradient of each level by itself, and a population for it to work with.
+
+    The population has ``chunk`` Solvers. All of them become copies of one whose levels are to be
+    scored, and each gets one level of its own. So the sum of what they are worth, differentiated
+    once, gives each the gradient of its level.
+
+    Args:
+        task: that makes Solvers.
+        chunk: levels at once, at least 1. As many networks, their gradients and their activations
+            are in memory; where a Solver has fewer levels, the others are computed for nothing.
+
+    Returns:
+        A function of a learner of K Solvers, what a level is worth, K, and the number n of levels
+        of each: the squared lengths of its gradients, float [K, n].
 
     Raises:
         ValueError: if ``chunk`` is less than 1.
@@ -54,26 +117,22 @@ def squared_gradients(task: ExactTask, chunk: int = 16) -> Callable[[PPO, Levels
             for name, parameter in learner.agent.named_parameters():
                 parameters[name].copy_(parameter[solver])
 
-    def score(levels: Levels) -> Tensor:
-        """Of at most ``chunk`` levels [m]: float [m]."""
-        count = len(levels)
-        # Filled up with the last one.
-        number = torch.arange(chunk, device=task.device).clamp_(max=count - 1)
-        with torch.enable_grad():
-            performance = task.differentiable_performance(agent, levels[number].unsqueeze(-1))
-            gradients = torch.autograd.grad(
-                performance["return"].sum(),  # of [chunk, 1]
-                list(parameters.values()),
-                allow_unused=True,
-                materialize_grads=True,
-            )
-        return squared_length(dict(zip(parameters, gradients, strict=True)))[:count]
-
-    def scores(learner: PPO, levels: Levels) -> Tensor:
+    def lengths(learner: PPO, worth: Worth, solvers: int, count: int) -> Tensor:
         found = []
-        for solver in range(len(levels)):
+        for solver in range(solvers):
             become(learner, solver)
-            found.append(torch.cat([score(part) for part in levels[solver].split(chunk)]))
-        return torch.stack(found)
+            for start in range(0, count, chunk):
+                # Filled up with the last one.
+                which = torch.arange(start, start + chunk, device=task.device).clamp_(max=count - 1)
+                with torch.enable_grad():
+                    gradients = torch.autograd.grad(
+                        worth(agent, solver, which).sum(),
+                        list(parameters.values()),
+                        allow_unused=True,
+                        materialize_grads=True,
+                    )
+                named = dict(zip(parameters, gradients, strict=True))
+                found.append(squared_length(named)[: count - start])
+        return torch.cat(found).unflatten(0, (solvers, count))
 
-    return scores
+    return lengths

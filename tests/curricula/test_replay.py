@@ -79,6 +79,7 @@ MADE = {
     "ncc": ncc,
     "traced": traced,
     "gradients": lambda: replay("gradient_norm", "exact"),
+    "policy gradients": lambda: replay("gradient_norm"),
 }
 
 

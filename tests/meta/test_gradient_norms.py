@@ -12,7 +12,7 @@ from torch import Tensor
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.mazes import Level
 from proposer_rl.meta.first_order import moved
-from proposer_rl.meta.gradient_norms import squared_gradients
+from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
 from tests.meta.test_first_order import learner, performance, some_levels
@@ -77,6 +77,25 @@ def test_they_are_those_of_single_levels_also_after_training() -> None:
         assert (ppo.snapshot() == before).all()
         torch.testing.assert_close(found, one_by_one(ppo, levels), rtol=1e-4, atol=1e-9)
         ppo.update([Streams(k).generator("actions") for k in (0, 1)])
+
+
+def test_those_of_episodes_are_of_single_policy_gradients() -> None:
+    ppo = TASK.learner([Streams(0), Streams(1)])
+    ppo.update([Streams(k).generator("first") for k in (0, 1)])  # a fresh policy is nearly even
+    rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
+    advantage = torch.randn(rollout.shape, generator=torch.Generator().manual_seed(0))
+    found = squared_policy_gradients(TASK, 3)(ppo, rollout, advantage)
+    expected = torch.zeros(found.shape)
+    for k in range(2):
+        for i in range(found.shape[1]):
+            ppo.agent.zero_grad()
+            steps = ppo.agent(rollout.exclude("next").clone())["logits"].log_softmax(-1)
+            taken = steps.gather(-1, rollout["action"].unsqueeze(-1)).squeeze(-1)
+            (taken * advantage).mean(-1)[k, i].backward()
+            for parameter in ppo.agent.parameters():
+                if parameter.grad is not None:
+                    expected[k, i] += parameter.grad.square().sum()
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-9)
 
 
 def test_nothing_is_drawn_at_random() -> None:
