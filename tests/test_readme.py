@@ -32,7 +32,9 @@ def commands(program: str) -> list[list[str]]:
     calls = [shlex.split(line, comments=True) for line in lines]
     found = {tuple(call[1:]) for call in calls if call and call[0] == program}
     # Those that only show settings, or need a folder of the reader's own, are in test_docs.py.
-    found = {call for call in found if not {"--cfg", "--info", "--config-dir"} & set(call)}
+    found = {
+        call for call in found if not {"--cfg", "--info", "--config-dir", "--help"} & set(call)
+    }
     return [list(call) for call in sorted(found)]
 
 
