@@ -53,7 +53,7 @@ def live(
     return lived
 
 
-def check_it_resumes(make: Callable[[], Curriculum], after: int = 5, more: int = 4) -> None:
+def check_it_resumes(make: Callable[[], Curriculum], after: int = 4, more: int = 3) -> None:
     """A curriculum restored from a file goes on, bit by bit, as if nothing had happened."""
     whole, learner = make(), solvers([0])
     live(whole, learner, [0], range(after))
@@ -73,7 +73,7 @@ def check_it_resumes(make: Callable[[], Curriculum], after: int = 5, more: int =
     assert (again.snapshot() == learner.snapshot()).all()
 
 
-def check_each_lives_alone(make: Callable[[], Curriculum], updates: int = 6) -> None:
+def check_each_lives_alone(make: Callable[[], Curriculum], updates: int = 4) -> None:
     """Several Solvers in one population get what each would get alone."""
     both = live(make(), solvers([3, 4]), [3, 4], range(updates))
     for copy, seed in enumerate([3, 4]):
@@ -86,11 +86,11 @@ def check_each_lives_alone(make: Callable[[], Curriculum], updates: int = 6) -> 
 def check_a_new_life_begins(make: Callable[[], Curriculum]) -> None:
     """Nothing of one Solver's life is left in the next one's."""
     used = make()
-    live(used, solvers([0]), [0], range(5))
+    live(used, solvers([0]), [0], range(4))
     used.begin()
     for one, other in zip(
-        live(used, solvers([1]), [1], range(4)).levels,
-        live(make(), solvers([1]), [1], range(4)).levels,
+        live(used, solvers([1]), [1], range(3)).levels,
+        live(make(), solvers([1]), [1], range(3)).levels,
         strict=True,
     ):
         assert (one == other).all()
