@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 import pytest
 import torch
@@ -87,6 +89,21 @@ def inner(one: dict[str, Tensor], other: dict[str, Tensor]) -> Tensor:
     return torch.stack([(one[name] * other[name]).flatten(1).sum(1) for name in one]).sum(0)
 
 
+def central_differences(
+    agent: ActorCritic, value: Callable[[], Tensor]
+) -> Iterator[tuple[str, int, Tensor]]:
+    """Slopes of values [K, ...] along the i-th number of each parameter, of all Solvers at once."""
+    for name, parameter in agent.named_parameters():
+        for i in range(parameter[0].numel()):
+            values = []
+            for change in (1e-6, -1e-6):
+                one = {n: torch.zeros_like(p) for n, p in agent.named_parameters()}
+                one[name].flatten(1)[:, i] = change
+                with torch.no_grad(), moved(agent, one, 1.0):
+                    values.append(value())
+            yield name, i, (values[0] - values[1]) / 2e-6
+
+
 def gradient(agent: ActorCritic, value: Tensor) -> dict[str, Tensor]:
     names, parameters = zip(*agent.named_parameters(), strict=True)
     found = torch.autograd.grad(value, parameters, materialize_grads=True)
@@ -98,21 +115,19 @@ def test_the_direction_is_the_preconditioned_slope_of_the_targets_performance(me
     levels = some_levels(2, 5)
     ppo = learner(levels)
     found = exact_direction(ppo, levels, measure)
+
+    def value() -> Tensor:
+        result = EVALUATE(levels, cell_logits(ppo.agent, planes(levels)))
+        worth = result["return"] if measure == "return" else (result["success"] + 1e-3).log()
+        return worth.mean(1)
+
+    slopes = {name: torch.zeros_like(p) for name, p in ppo.agent.named_parameters()}
+    for name, i, slope in central_differences(ppo.agent, value):
+        slopes[name].flatten(1)[:, i] = slope
     expected = {}
-    for name, parameter in ppo.agent.named_parameters():
-        slope = torch.zeros_like(parameter)
-        for i in range(parameter[0].numel()):  # the same number of both Solvers at once
-            values = []
-            for change in (1e-6, -1e-6):
-                one = {n: torch.zeros_like(p) for n, p in ppo.agent.named_parameters()}
-                one[name].flatten(1)[:, i] = change
-                with torch.no_grad(), moved(ppo.agent, one, 1.0):
-                    result = EVALUATE(levels, cell_logits(ppo.agent, planes(levels)))
-                worth = result["return"] if measure == "return" else result["success"] + 1e-3
-                values.append((worth if measure == "return" else worth.log()).mean(1))
-            slope.flatten(1)[:, i] = (values[0] - values[1]) / 2e-6
+    for name, slope in slopes.items():
         second = ppo.snapshot()[name, "exp_avg_sq"] / (1 - 0.999**3)
-        expected[name] = slope.detach() / (second.sqrt() + 1e-5)
+        expected[name] = slope / (second.sqrt() + 1e-5)
     for k in range(2):
         flat = torch.cat([x[k].flatten() for x in expected.values()])
         scale = flat.square().mean().sqrt()

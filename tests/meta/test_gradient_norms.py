@@ -11,11 +11,10 @@ from torch import Tensor
 
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.mazes import Level
-from proposer_rl.meta.first_order import moved
 from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
-from tests.meta.test_first_order import learner, performance, some_levels
+from tests.meta.test_first_order import central_differences, learner, performance, some_levels
 from tests.tiny import TASK
 
 
@@ -34,15 +33,10 @@ class Precise:
 def numerical(ppo: PPO, levels: Level) -> Tensor:
     """Sums of squared central differences over every single parameter: float [K, n]."""
     total = torch.zeros(levels.batch_size, dtype=torch.float64)
-    for name, parameter in ppo.agent.named_parameters():
-        for i in range(parameter[0].numel()):  # the same number of all Solvers at once
-            returns = []
-            for change in (1e-6, -1e-6):
-                one = {n: torch.zeros_like(p) for n, p in ppo.agent.named_parameters()}
-                one[name].flatten(1)[:, i] = change
-                with torch.no_grad(), moved(ppo.agent, one, 1.0):
-                    returns.append(performance(ppo.agent, levels)["return"])
-            total += ((returns[0] - returns[1]) / 2e-6).square()
+    for *_, slope in central_differences(
+        ppo.agent, lambda: performance(ppo.agent, levels)["return"]
+    ):
+        total += slope.square()
     return total
 
 
