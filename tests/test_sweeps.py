@@ -173,7 +173,7 @@ def composed(train, monkeypatch: pytest.MonkeyPatch):
     return call
 
 
-@pytest.mark.parametrize("name", ["paper", "quick"])
+@pytest.mark.parametrize("name", ["paper", "medium", "quick"])
 def test_the_experiment_is_one_command(name: str, composed) -> None:
     made = composed(f"+sweep={name}", "seed=0,3")
     found = {method for _, method, _, _ in made}
