@@ -87,13 +87,11 @@ class Parts(NamedTuple):
 
 def target(parts: Parts) -> Curriculum:
     """Train on the target distribution itself (the paper's baseline)."""
-    _no_copies(parts)
     return SamplingCurriculum(parts.task.target)
 
 
 def domain_randomization(parts: Parts) -> Curriculum:
     """Train on levels drawn evenly from the Proposer's space."""
-    _no_copies(parts)
     return SamplingCurriculum(parts.task.space)
 
 
@@ -108,7 +106,6 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
     Raises:
         ValueError: for an unknown name, or as :class:`ScheduleCurriculum`.
     """
-    _no_copies(parts)
     known = parts.task.distributions
     unknown = [name for name in distributions if name not in known]
     if unknown:
@@ -177,7 +174,6 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
         ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
         CheckpointError: if it cannot be read.
     """
-    _no_copies(parts)
     _one_solver(parts)
     if not checkpoint:
         raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
@@ -207,7 +203,6 @@ def first_order_gain(parts: Parts, **numbers: Any) -> FirstOrderCurriculum:
         parts: the task, whose performance must have gradients.
         numbers: see :class:`FirstOrderCurriculum`.
     """
-    _no_copies(parts)
     return FirstOrderCurriculum(parts.task, **numbers)
 
 
@@ -218,7 +213,6 @@ def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurric
         parts: the task.
         numbers: see :class:`SampledFirstOrderCurriculum`.
     """
-    _no_copies(parts)
     return SampledFirstOrderCurriculum(parts.task, **numbers)
 
 
@@ -249,7 +243,6 @@ def replay(
             that count; None for the whole space.
         numbers: see :class:`ReplayCurriculum`.
     """
-    _no_copies(parts)
     rule = ReplayRule(
         prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
     )
@@ -271,7 +264,6 @@ def learnability(
         rollouts: on each candidate, from episodes.
         numbers: see :class:`SelectionCurriculum`.
     """
-    _no_copies(parts)
     return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
 
 
@@ -315,7 +307,6 @@ def _problem_policy(
         learning_rate: of the policy.
         entropy_coeff: of the policy.
     """
-    _no_copies(parts)
     _one_solver(parts)
     task, chosen = parts.task, parts.proposer
     with Streams(parts.seeds[0], "proposer").as_default("weights"):
@@ -333,7 +324,6 @@ def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculu
         parts: the task.
         numbers: see :class:`LearningProgressCurriculum`.
     """
-    _no_copies(parts)
     return LearningProgressCurriculum(parts.task, **numbers)
 
 
@@ -344,7 +334,6 @@ def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
         parts: the task.
         numbers: see :class:`MixtureCurriculum`.
     """
-    _no_copies(parts)
     return MixtureCurriculum(parts.task, **numbers)
 
 
@@ -355,7 +344,6 @@ def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
         parts: the task, which must know where its target lies.
         numbers: see :class:`TransportCurriculum`.
     """
-    _no_copies(parts)
     return TransportCurriculum(parts.task, **numbers)
 
 
@@ -428,14 +416,6 @@ def _head(
         return MixtureHead(width, directions, hidden=hidden, spread=action.spread), normal
     head = ProblemHead(width, task.batch_size, task.space.size, hidden=hidden, bands=action.bands)
     return head, joint_categorical if action.ratio == "joint" else categorical
-
-
-def _no_copies(parts: Parts) -> None:
-    if parts.workers is not None:
-        raise ValueError(
-            f"compute.collector={parts.workers.settings.engine}: this method trains no copies of "
-            "the Solver, so there is nothing for workers to do; leave compute.collector=single"
-        )
 
 
 def _one_solver(parts: Parts) -> None:

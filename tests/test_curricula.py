@@ -140,6 +140,13 @@ def test_a_schedule_passes_everything_on_and_changes_at_the_exact_update() -> No
     assert calls == [(name, "close") for name in "abc"]
 
 
+def test_a_schedule_trains_copies_where_a_stage_does() -> None:
+    stages = [Stage("a", []), Stage("b", [])]
+    assert not ScheduleCurriculum(stages, [1]).trains_copies
+    stages[1].trains_copies = True
+    assert ScheduleCurriculum(stages, [1]).trains_copies
+
+
 def test_a_schedule_starts_anew_with_the_next_solver() -> None:
     calls: list = []
     curriculum = schedule(calls)

@@ -172,6 +172,11 @@ def _curriculum(config: RunConfig, task: Task, signals: StopSignals) -> Curricul
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
+    if chosen.workers is not None and not curriculum.trains_copies:
+        raise ConfigError(
+            f"compute.collector={config.compute.collector}: this method trains no copies of the "
+            "Solver, so there is nothing for workers to do; leave compute.collector=single"
+        )
     if config.proposer.advance != "train":
         _check_cycle(config)
     return curriculum

@@ -190,7 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--copies", type=positive, default=2, help="copies of each (2)")
     parser.add_argument("--levels", type=positive, default=512, help="of the target (512)")
     parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
-    parser.add_argument("--output", type=Path, help="a JSON file for the rows")
+    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     return parser
 
 

@@ -149,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("proposer", type=Path, help="folder of a run with a Proposer")
     parser.add_argument("solvers", type=Path, help="folder of a run; all its checkpoints are shown")
     parser.add_argument("--seed", type=int, default=0, help="of the levels it looks at (0)")
-    parser.add_argument("--output", type=Path, help="a JSON file for the rows")
+    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     return parser
 
 

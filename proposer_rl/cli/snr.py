@@ -211,7 +211,7 @@ def _parser() -> argparse.ArgumentParser:
         help="what gain is counted in (both, as far as the task tells them)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
-    parser.add_argument("--output", type=Path, help="a JSON file for the rows")
+    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     return parser
 
 

@@ -63,7 +63,12 @@ class Curriculum:
     A learner is a :class:`~proposer_rl.learning.PPO` of a population of K Solvers; ``streams`` are
     the random streams of each, for the present update or cycle. A curriculum that is made of others
     passes everything on to them.
+
+    Attributes:
+        trains_copies: whether it trains copies of the Solver, which other processes can do.
     """
+
+    trains_copies = False
 
     def begin(self) -> None:
         """A fresh Solver begins: forget the last one, but not what was learnt from it."""

@@ -56,6 +56,7 @@ class ProposerCurriculum(Curriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
+        self.trains_copies = trainer is not None
         self._began = 0  # the Solver's updates at the start of this cycle
         self._action: Tensor | None = None
 

@@ -30,6 +30,7 @@ class ScheduleCurriculum(Curriculum):
             )
         self._stages = list(stages)
         self._until = list(until)
+        self.trains_copies = any(stage.trains_copies for stage in stages)
 
     def begin(self) -> None:
         """Let every stage begin."""
