@@ -109,7 +109,8 @@ class Mazes(Skills):
 
 
 def mazes(**options: Any) -> FirstOrderCurriculum:
-    return FirstOrderCurriculum(Mazes(), **{"target_levels": 8, "candidates": 3, **options})
+    small = {"every": 1, "target_levels": 8, "candidates": 3}
+    return FirstOrderCurriculum(Mazes(), **{**small, **options})
 
 
 def learner(copies: int = 2) -> PPO:
