@@ -155,3 +155,11 @@ def test_pages_link_to_what_is_there() -> None:
     for page, text in PAGES.items():
         for target in re.findall(r"\]\((\.\./[^)#]+)\)", text):
             assert (DOCS / target).is_file(), f"{page}.md: {target}"
+
+
+def test_every_example_is_on_the_site() -> None:
+    shown = set(re.findall(r"^```\{literalinclude\} \.\./(\S+)$", PAGES["examples"], re.MULTILINE))
+    files = [*(ROOT / "examples").rglob("*.py"), *(ROOT / "examples").rglob("*.yaml")]
+    assert shown == {str(path.relative_to(ROOT)) for path in files}
+    for name in re.findall(r"\]\(examples\.md#(\w+)\)", PAGES["own_parts"]):
+        assert f"## `{name.removesuffix('py')}.py`" in PAGES["examples"]
