@@ -57,3 +57,33 @@ def test_they_start_their_modules_through_links(
         )
         expected = [BIN.parent, tmp_path, "-m", MODULES[name], "--help", "two words"]
         assert ended.stdout.splitlines() == [str(part) for part in expected]
+
+
+@pytest.mark.parametrize(
+    ("held", "asked", "enough"),
+    [
+        ("", "", True),
+        ("", "docs", False),
+        ("docs", "", True),
+        ("docs", "docs", True),
+        ("docs", "dev", False),
+        ("dev", "docs", True),
+        ("dev", "dev", True),
+    ],
+)
+def test_an_environment_is_added_to_only_where_something_is_missing(
+    held: str, asked: str, enough: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to("/bin/sh")
+    (tmp_path / "stamp").write_text(f"hash {held}\n")
+    places = f'VENV="{tmp_path}" STAMP="{tmp_path}/stamp"'
+    for known in ("hash", "other"):
+        script = f'. "{BIN}/_environment"; {places}; up_to_date {known} {asked}'
+        done = subprocess.run(["bash", "-c", script], check=False)
+        assert (done.returncode == 0) == (enough and known == "hash")
+
+
+def test_the_site_needs_only_its_own_extra() -> None:
+    assert "use_environment docs\n" in (BIN / "docs").read_text(encoding="utf-8")
+    assert "use_environment dev\n" in (BIN / "test").read_text(encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import re
 import shlex
 import sys
@@ -128,6 +129,10 @@ def test_the_config_folder_of_ones_own_works(train) -> None:
     folders = sorted(path.parent.name for path in Path().glob("outputs/*/*/summary.json"))
     assert len(folders) == sum("-m" not in call for call in own)
     assert len(list(Path().glob("multirun/*/*/summary.json"))) == 2
+    # What a reader of the report is told of it, and what the command needs beside its settings.
+    facts = json.loads(next(Path().glob("outputs/*/*/run.json")).read_text(encoding="utf-8"))
+    given = own[0][own[0].index("--config-dir") + 1]
+    assert facts["arguments"]["config_dir"] == given and facts["about"]["method"]
 
 
 @pytest.mark.usefixtures("own_folder")
@@ -150,3 +155,11 @@ def test_pages_link_to_what_is_there() -> None:
     for page, text in PAGES.items():
         for target in re.findall(r"\]\((\.\./[^)#]+)\)", text):
             assert (DOCS / target).is_file(), f"{page}.md: {target}"
+
+
+def test_every_example_is_on_the_site() -> None:
+    shown = set(re.findall(r"^```\{literalinclude\} \.\./(\S+)$", PAGES["examples"], re.MULTILINE))
+    files = [*(ROOT / "examples").rglob("*.py"), *(ROOT / "examples").rglob("*.yaml")]
+    assert shown == {str(path.relative_to(ROOT)) for path in files}
+    for name in re.findall(r"\]\(examples\.md#(\w+)\)", PAGES["own_parts"]):
+        assert f"## `{name.removesuffix('py')}.py`" in PAGES["examples"]

@@ -104,7 +104,8 @@ def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -
 def test_a_source_archive_holds_no_results_and_no_tests(installed: Installed) -> None:
     with tarfile.open(installed.archive) as archive:
         top = {name.split("/")[1] for name in archive.getnames()}
-    assert {"proposer_rl", "conf", "docs", "LICENSE", "README.md", "CHANGELOG.md"} <= top
+    assert {"proposer_rl", "conf", "docs", "examples", "README.md", "CHANGELOG.md"} <= top
+    assert "LICENSE" in top
     assert not {"results", "tests", ".ci", "site", "outputs"} & top
 
 

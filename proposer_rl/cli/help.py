@@ -47,18 +47,25 @@ def help_text(arguments: Sequence[str]) -> str:
     parts = [USAGE]
     for option, meaning in GROUPS.items():
         parts.append(f"{option} {meaning}")
-        parts += [f"  {name:24} {line}" for name, line in _choices(option.strip("+="), folders)]
+        lines = choices(option.strip("+="), folders).items()
+        parts += [f"  {name:24} {line}" for name, line in lines]
         parts.append("")
     return "\n".join([*parts, EXAMPLES])
 
 
-def _choices(group: str, folders: Sequence[Path]) -> list[tuple[str, str]]:
-    """Names and first lines; of two files with one name the first folder's counts, as in Hydra."""
+def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
+    """What a group has, by name, each with its file's first line.
+
+    Args:
+        group: such as ``method``.
+        folders: of configurations; of two files with one name the first folder's counts, as in
+            Hydra.
+    """
     found: dict[str, str] = {}
     for folder in folders:
         for name in names(folder, group):
             found.setdefault(name, _first_comment(folder / group / f"{name}.yaml"))
-    return sorted(found.items())
+    return dict(sorted(found.items()))
 
 
 def _first_comment(file: Path) -> str:

@@ -16,7 +16,8 @@ from rich.console import Console
 from tqdm import tqdm
 
 from proposer_rl.cli.config import RunConfig
-from proposer_rl.cli.places import PACKAGE
+from proposer_rl.cli.help import choices
+from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.terminal import screen
@@ -48,6 +49,7 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "ablation": config.ablation,
         "seed": config.seed,
         "seeds": config.seeds,
+        "about": _about(config),
         "overrides": overrides(),
         "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
         "solver_parameters": parameters,
@@ -60,17 +62,33 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     }
 
 
+def _about(config: RunConfig) -> dict[str, str]:
+    """What method and ablation do, in the words of their files; those of one's own, too."""
+    own = _config_folder()
+    folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
+    chosen = {"method": config.method, "ablation": config.ablation}
+    return {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
+
+
 def _config_folder() -> str | None:
     """The folder given with ``--config-dir``."""
     sources = HydraConfig.get().runtime.config_sources
-    return next((source.path for source in sources if source.provider == "command-line"), None)
+    given = (source.path for source in sources if source.provider == "command-line")
+    return next(map(_from_here, given), None)
 
 
 def _python_path() -> str | None:
     """The caller's PYTHONPATH: that of this process without the checkout, which bin/ adds."""
     own = str(PACKAGE.parent)
     given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return os.pathsep.join(part for part in given if part != own) or None
+    return os.pathsep.join(_from_here(part) for part in given if part != own) or None
+
+
+def _from_here(path: str) -> str:
+    """A path as it can be given again on another machine: from the working folder, if inside it."""
+    inside = Path(path).resolve()
+    here = Path.cwd().resolve()
+    return str(inside.relative_to(here)) if inside.is_relative_to(here) else path
 
 
 def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:

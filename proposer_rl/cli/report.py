@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.errors import command
+from proposer_rl.cli.help import choices
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.report.build import write_report
 
 EPILOG = """\
@@ -36,6 +38,7 @@ def _run(options: argparse.Namespace) -> None:
         options.threshold,
         options.baseline,
         progress=not options.quiet,
+        meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
     print(f"Report: {page}")
 

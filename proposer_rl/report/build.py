@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -10,9 +11,12 @@ from pathlib import Path
 from tqdm import tqdm
 
 from proposer_rl.report import curves, levels, outcomes, page, proposals, single_levels
+from proposer_rl.report.answer import Meanings, answer, glossary
+from proposer_rl.report.charts import charts
 from proposer_rl.report.findings import finding_table, findings
-from proposer_rl.report.records import is_rate
+from proposer_rl.report.records import is_rate, words
 from proposer_rl.report.runs import find_runs
+from proposer_rl.report.stages import stages
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, save
 from proposer_rl.report.tables import Cell, escape_markdown, to_csv
@@ -37,6 +41,17 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     proposals.diagnostics,
 )
 
+# Of these the page has charts.
+CHARTED = {
+    curves.learning_curves,
+    curves.cost_curves,
+    curves.worst_levels,
+    single_levels.worst_curves,
+    curves.difficulty,
+    proposals.diagnostics,
+}
+# And of these, where levels of several stages can be shown.
+STAGED = {proposals.heat_maps, levels.along_training}
 
 # Numbers behind the figures, as CSV alone.
 TIDY: Mapping[str, Callable[[Study], tuple[list[str], list[list[Cell]]]]] = {
@@ -59,6 +74,7 @@ def write_report(
     threshold: float | None = None,
     baseline: str | None = None,
     progress: bool = True,
+    meanings: Meanings | None = None,
 ) -> Path:
     """Write a report.
 
@@ -69,6 +85,8 @@ def write_report(
         baseline: label of the method that the others are measured against; None for
             ``domain_randomization`` or, where that is missing, the first.
         progress: whether to draw a progress bar.
+        meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
+            that do not tell.
 
     Returns:
         The page.
@@ -93,10 +111,14 @@ def write_report(
     ) as bar:
         for study in studies:
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
-            sections.append(_section(study, prefix, files, bar))
+            sections.append(_section(study, prefix, files, bar, meanings or {}))
     title = "Curricula: what the runs show"
     command = page.report_command(folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
+    if len(html) > page.LARGEST:  # the figures that are charts there, too, are files anyway
+        for section in sections:
+            section["figures"] = [one for one in section["figures"] if not one["drawn"]]
+        html = page.render(title=title, command=command, sections=sections, notes=notes)
     files["report.md"] = _markdown(title, command, sections).encode()
     _write(output, files)
     write_atomically(output / PAGE, html.encode())
@@ -113,7 +135,9 @@ def _check_output(output: Path) -> None:
         )
 
 
-def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> page.Section:
+def _section(
+    study: Study, prefix: str, files: dict[str, bytes], bar: tqdm, meanings: Meanings
+) -> page.Section:
     """What the page shows of a study; its files are added to the others."""
     found = findings(study)
     claims, methods = finding_table(study, found), outcomes.group_table(study)
@@ -125,21 +149,31 @@ def _section(study: Study, prefix: str, files: dict[str, bytes], bar: tqdm) -> p
         header, rows = tidy(study)
         if rows:
             files[f"{TABLES}/{prefix}{name}.csv"] = to_csv(header, rows).encode()
+    staged = stages(study)
+    charted = CHARTED | (STAGED if staged else set())
     figures = []
     for draw in DRAWINGS:
         bar.set_postfix_str(draw.__name__.replace("_", " "))
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
-            figures.append(page.figure(drawing))
+            figures.append(page.figure(drawing, draw in charted))
             files |= {f"{path}.{suffix}": content for suffix, content in save(drawing).items()}
             animations = [panel.animation for panel in drawing.panels if panel.animation]
             files |= {f"{path}_{_slug(name)}.gif": content for name, content in animations}
         bar.update()
+    data = {**charts(study), "stages": staged}
     return {
         "study": study,
+        "headline": words(study.headline),
+        "answer": answer(study),
+        "glossary": glossary(study),
         "facts": page.facts(study),
+        "origin": page.origin(study),
         "unfinished": page.unfinished(study),
+        "looks": page.methods(study, meanings),
+        "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
+        "staged": staged is not None,
         "methods": methods,
         "claims": claims,
         "findings": found,
@@ -168,9 +202,11 @@ def _markdown(title: str, command: str, sections: Sequence[page.Section]) -> str
     parts += ["It is written by\n", f"```bash\n{command}\n```\n"]
     for section in sections:
         parts += [f"## {escape_markdown(section['study'].title)}\n"]
-        parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in section["facts"]]
+        parts += [f"{escape_markdown(' '.join(section['answer']))}\n"]
+        facts = section["facts"] + section["origin"]
+        parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in facts]
         parts.append(f"\n![Learning curves and updates to the threshold]({section['picture']})\n")
-        for table in (section["claims"], section["methods"]):
+        for table in filter(lambda table: table.rows, (section["claims"], section["methods"])):
             parts += [f"### {table.title}\n", f"{table.note}\n", table.to_markdown()]
         parts += ["### Commands\n", "```bash", *section["commands"], "```\n"]
     return "\n".join(parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from textwrap import fill
 
@@ -12,12 +12,11 @@ from matplotlib.figure import FigureBase
 
 from proposer_rl.report.comparisons import updates_needed, waiting_outcome
 from proposer_rl.report.records import Column, is_rate, level_text, words
-from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.series import COSTS, UPDATES, Series, band, over_cost, over_updates
+from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import PANEL, Drawing, Look, Panel, axes_of, style
 
-GRID_POINTS = 200
 MOST_PANELS = 12
 
 
@@ -65,10 +64,6 @@ def worst_levels(study: Study) -> Drawing | None:
 def cost_curves(study: Study) -> Drawing:
     """The headline against updates, and against what was paid for it with the curriculum's part."""
     name = words(study.headline)
-    costs: dict[str, Callable[[Run], Column]] = {
-        "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
-        "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
-    }
     return Drawing(
         "cost",
         f"The same {name} against updates and against its whole cost",
@@ -80,9 +75,9 @@ def cost_curves(study: Study) -> Drawing:
             *(
                 Panel(
                     f"{name} against {axis}, the curriculum's counted, by method.",
-                    partial(_draw_against_cost, study=study, axis=axis, x=cost),
+                    partial(_draw_against_cost, study=study, axis=axis),
                 )
-                for axis, cost in costs.items()
+                for axis in COSTS
             ),
         ],
         3,
@@ -118,13 +113,10 @@ def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
     Returns:
         The mean, float [n].
     """
-    mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
-    whole = ~np.isnan(rows).any(0)
+    mean, whole, low, high = band(rows)
     axes.plot(x, mean, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
     axes.plot(x, np.where(whole, mean, np.nan), **style(look, len(x)))
-    if len(rows) > 1 and whole.any():
-        _, low, high = np.array([mean_interval(values) for values in rows.T[whole]]).T
-        axes.fill_between(x[whole], low, high, color=look.colour, alpha=0.15, linewidth=0)
+    axes.fill_between(x, low, high, color=look.colour, alpha=0.15, linewidth=0)
     return mean
 
 
@@ -162,38 +154,29 @@ def _curve_panel(study: Study, name: str, table: str = "metrics") -> Panel:
 
 
 def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: str) -> None:
-    axes = axes_of(figure)
-    means = []
-    for group in groups:
-        columns = [getattr(run, table) for run in group.runs if name in getattr(run, table)]
-        if columns:
-            x = np.unique(np.concatenate([own["updates"] for own in columns]))
-            rows = np.full((len(columns), len(x)), np.nan)
-            for row, own in zip(rows, columns, strict=True):
-                row[np.searchsorted(x, own["updates"])] = own[name]
-            means.append(draw_curve(axes, x, rows, group.look))
     trained = table == "training"
-    text = name.replace("_", " ") if trained else _axis(name)
-    finish(axes, "Solver updates", text, means, rate=is_rate(name), zero=trained)
+    found = [(group, over_updates(group, name, table)) for group in groups]
+    text = name.replace("_", " ") if trained else axis_text(name)
+    _draw_series(figure, found, UPDATES, text, rate=is_rate(name), zero=trained)
 
 
-def _draw_against_cost(
-    figure: FigureBase, study: Study, axis: str, x: Callable[[Run], Column]
+def _draw_against_cost(figure: FigureBase, study: Study, axis: str) -> None:
+    name = study.headline
+    found = [(group, over_cost(group, name, COSTS[axis])) for group in study.groups]
+    _draw_series(figure, found, axis, axis_text(name), rate=is_rate(name))
+
+
+def _draw_series(
+    figure: FigureBase, found: Sequence[tuple[Group, Series | None]], x: str, y: str, **limits: bool
 ) -> None:
-    """Runs stand at different costs when they are measured, so they are interpolated in between."""
-    axes, name = axes_of(figure), study.headline
-    means = []
-    for group in study.groups:
-        grid = np.linspace(0, max(x(run)[-1] for run in group.runs), GRID_POINTS)
-        rows = [
-            np.interp(grid, x(run), run.metrics[name], left=np.nan, right=np.nan)
-            for run in group.runs
-        ]
-        means.append(draw_curve(axes, grid, np.array(rows), group.look))
-    finish(axes, axis, _axis(name), means, rate=is_rate(name))
+    axes = axes_of(figure)
+    drawn = [(group.look, series) for group, series in found if series is not None]
+    means = [draw_curve(axes, series.x, series.rows, look) for look, series in drawn]
+    finish(axes, x, y, means, **limits)
 
 
-def _axis(name: str) -> str:
+def axis_text(name: str) -> str:
+    """A measurement as an axis is named."""
     rate = " rate" if is_rate(name) else ""
     return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
 

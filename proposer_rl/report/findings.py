@@ -8,7 +8,8 @@ decide is said to be undecided, never taken as refuted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from typing import Literal, NamedTuple
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from proposer_rl.report.comparisons import (
     ALIKE,
     TOO_FEW,
+    Decision,
     decisions,
     difference,
     learnt,
@@ -31,9 +33,15 @@ from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_in
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
 
-Verdict = Literal["supported", "contradicted", "undecided", "too few seeds", "no data"]
+Verdict = Literal["supported", "contradicted", "undecided", "too few seeds"]
 Evidence = tuple[Verdict, str]
+Test = Callable[[Sequence[Group]], Evidence]  # whether the first of two methods beats the second
 
+PAPER = "paper"
+TITLE = (
+    "All Life is Problem Creation: Learning to Generate Environments that Maximize Performance "
+    "Gain (SEA workshop, NeurIPS 2025)"
+)
 # The paper's methods, by the labels of groups without an ablation.
 BASELINE, GAIN, DIFFICULTY = "target", "perf_gain", "task_difficulty"
 STARTED = 0.1  # success at which learning has begun: the end of a stall
@@ -57,20 +65,25 @@ class Finding(NamedTuple):
 
 
 def findings(study: Study) -> list[Finding]:
-    """All findings of the paper, then whether each method beats the baseline."""
-    tests: list[tuple[str, Callable[[Study], Evidence]]] = [
+    """The paper's findings whose methods are there, then whether each beats the baseline."""
+    beats = partial(_beats, study=study, decided=decisions(study))
+    tests: list[tuple[str, Callable[[Study], Evidence | None]]] = [
         ("The baseline that trains on the target alone stalls at first.", _stall),
         ("Both Proposers learn almost at once.", _learn_at_once),
-        ("Performance gain learns faster than the baseline.", _faster),
+        ("Performance gain learns faster than the baseline.", partial(_faster, beats=beats)),
         ("Out of distribution the methods end up alike.", _alike),
-        ("Performance gain beats task difficulty slightly, not significantly.", _slightly),
+        (
+            "Performance gain beats task difficulty slightly, not significantly.",
+            partial(_slightly, beats=beats),
+        ),
         ("Proposals start easy and grow harder.", _grow_harder),
         ("The maximum gain of the copies stays positive while the mean falls below zero.", _gains),
     ]
-    found = [Finding(claim, "paper", *test(study)) for claim, test in tests]
+    tested = [(claim, test(study)) for claim, test in tests]
+    found = [Finding(claim, PAPER, *evidence) for claim, evidence in tested if evidence]
     baseline = study.baseline
     return found + [
-        Finding(f"{one.label} beats {baseline.label}.", "ours", *_beats((one, baseline), study))
+        Finding(f"{one.label} beats {baseline.label}.", "ours", *beats((one, baseline)))
         for one in study.compared
         if one is not baseline
     ]
@@ -86,6 +99,8 @@ def finding_table(study: Study, rows: Sequence[Finding]) -> Table:
         "are first minus second, with 95 % intervals. Undecided: neither the claim nor its "
         f"contrary is excluded. It takes {FEWEST} seeds of each method."
     )
+    if any(row.source == PAPER for row in rows):
+        note += f" Of the {PAPER}: claims of {TITLE}, whose method is {GAIN}."
     named: list[dict[str, Cell]] = [
         {"finding": claim, "source": source, "verdict": verdict, "evidence": evidence}
         for claim, source, verdict, evidence in rows
@@ -93,15 +108,16 @@ def finding_table(study: Study, rows: Sequence[Finding]) -> Table:
     return Table("findings", "Findings", note, named)
 
 
-def _faster(study: Study) -> Evidence:
+def _faster(study: Study, beats: Test) -> Evidence | None:
     groups = _present(study, GAIN, BASELINE)
-    return _beats(groups, study) if len(groups) == 2 else _missing(GAIN, BASELINE)
+    return beats(groups) if len(groups) == 2 else None
 
 
-def _beats(groups: Sequence[Group], study: Study) -> Evidence:
+def _beats(
+    groups: Sequence[Group], study: Study, decided: Mapping[tuple[str, str], Decision]
+) -> Evidence:
     """Does the first of two methods beat the second, and at what cost in frames?"""
     one, other = (group.label for group in groups)
-    decided = decisions(study)
     decision = decided.get((one, other)) or decided[other, one]
     verdict: Verdict = "too few seeds" if decision.verdict == TOO_FEW else "undecided"
     if decision.winner:
@@ -116,20 +132,20 @@ def _beats(groups: Sequence[Group], study: Study) -> Evidence:
     return verdict, f"{text}; frames: {ratio:.1f} times as many"
 
 
-def _stall(study: Study) -> Evidence:
+def _stall(study: Study) -> Evidence | None:
     groups = _present(study, BASELINE)
     if not groups or not is_rate(study.headline):
-        return _missing(BASELINE)
+        return None
     soon, count, text = _started(study, groups[0])
     if count < FEWEST:
         return "too few seeds", text
     return _either(majority(count - soon, count), majority(soon, count)), text
 
 
-def _learn_at_once(study: Study) -> Evidence:
+def _learn_at_once(study: Study) -> Evidence | None:
     groups = _present(study, GAIN, DIFFICULTY)
     if len(groups) < 2 or not is_rate(study.headline):
-        return _missing(GAIN, DIFFICULTY)
+        return None
     found = [_started(study, group) for group in groups]
     text = "; ".join(text for *_, text in found)
     if min(count for _, count, _ in found) < FEWEST:
@@ -152,11 +168,11 @@ def _started(study: Study, group: Group) -> tuple[int, int, str]:
     return soon, len(known), text
 
 
-def _alike(study: Study) -> Evidence:
+def _alike(study: Study) -> Evidence | None:
     groups = _present(study, BASELINE, GAIN, DIFFICULTY)
     names = [name for name in study.measurements if is_rate(name) and name != study.headline]
     if len(groups) < 2 or not names:
-        return _missing(BASELINE, GAIN, DIFFICULTY)
+        return None
     name = f"{words(names[0])} after {study.horizon} updates"
     (outcome,) = (outcome for outcome in outcomes(study) if outcome.name == name)
     pairs = list(combinations(groups, 2))
@@ -177,11 +193,11 @@ def _alike(study: Study) -> Evidence:
     return _either(math.nan, smallest), text
 
 
-def _slightly(study: Study) -> Evidence:
+def _slightly(study: Study, beats: Test) -> Evidence | None:
     groups = _present(study, GAIN, DIFFICULTY)
     if len(groups) < 2:
-        return _missing(GAIN, DIFFICULTY)
-    verdict, text = _beats(groups, study)
+        return None
+    verdict, text = beats(groups)
     if verdict == "too few seeds":
         return verdict, text
     if verdict != "undecided":
@@ -192,7 +208,7 @@ def _slightly(study: Study) -> Evidence:
     return "undecided", f"{text}; it is not shown to be small either"
 
 
-def _grow_harder(study: Study) -> Evidence:
+def _grow_harder(study: Study) -> Evidence | None:
     parts: list[str] = []
     verdict: Verdict = "undecided"
     for group in study.groups:
@@ -212,8 +228,8 @@ def _grow_harder(study: Study) -> Evidence:
             sure = {np.sign(c.value) for c, p in zip(changes, p, strict=True) if p <= ERROR}
             verdict = "supported" if sure == {1} else "contradicted" if sure == {-1} else verdict
             verdict = "too few seeds" if len(known) < FEWEST else verdict
-    if not parts:
-        return _missing(GAIN)
+    if not parts or study.group(GAIN) is None:
+        return None
     return verdict, "; ".join(parts) + "; first against last quarter of the cycles"
 
 
@@ -226,7 +242,7 @@ def _change(run: Run, like: Run) -> NDArray[np.float64] | None:
     return np.array([np.mean(means[:quarter], 0), np.mean(means[-quarter:], 0)])
 
 
-def _gains(study: Study) -> Evidence:
+def _gains(study: Study) -> Evidence | None:
     group = study.group(GAIN)
     found = [
         [
@@ -238,7 +254,7 @@ def _gains(study: Study) -> Evidence:
     ]
     gains = [run for run in found if run]
     if not gains:
-        return _missing(GAIN)
+        return None
     positive = [copies.max() > 0 for run in gains for copies in run]
     late = [np.mean([copies.mean() for copies in run[-max(len(run) // 4, 1) :]]) for run in gains]
     interval, share = mean_interval(late), float(np.mean(positive))
@@ -262,7 +278,3 @@ def _either(p_for: float, p_against: float) -> Verdict:
 
 def _present(study: Study, *labels: str) -> list[Group]:
     return [group for label in labels for group in study.compared if group.label == label]
-
-
-def _missing(*labels: str) -> Evidence:
-    return "no data", f"needs full runs of {' and '.join(labels)}, each in one variant"

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure, FigureBase
 from proposer_rl.report.curves import finish
 from proposer_rl.report.records import LevelRecord, SampleRecord, is_rate, picture, words
 from proposer_rl.report.runs import Run, read_run
+from proposer_rl.report.series import UPDATES
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import SETTINGS, SKY, VERMILLION, Drawing, Panel, axes_of
 
@@ -133,7 +134,7 @@ def _draw_measurements(axes: Axes, runs: Sequence[Run]) -> None:
             label = words(name) if run is runs[0] else None
             axes.plot(run.metrics["updates"], run.metrics[name], color=colour, label=label)
     rates, every = all(map(is_rate, names)), [run.metrics[name] for run in runs for name in names]
-    finish(axes, "Solver updates", "rate" if rates else "measurement", every, rate=rates)
+    finish(axes, UPDATES, "rate" if rates else "measurement", every, rate=rates)
     axes.legend()
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import gzip
+import hashlib
+import io
 import json
 import re
 import shlex
@@ -12,14 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
+from PIL import Image
 
-from proposer_rl.report.proposals import ANIMATION
+from proposer_rl.report.answer import Meanings, meaning
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, save_panel
+from proposer_rl.report.style import Drawing, Look, Panel, panel_as_png
 
 PIXELS = 78  # of an inch of a figure
+COLOURS = 256
+LARGEST = 8 * 2**20  # bytes of a page
 LONGEST_WORD = 2000  # of a command
 WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
@@ -30,55 +36,84 @@ Section = dict[str, Any]  # all that the page shows of a study, as the template 
 
 
 def render(**content: Any) -> str:
-    """The page as HTML; whatever comes from a run is escaped."""
+    """The page as HTML; whatever comes from a run is escaped or packed."""
+    from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
+
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    source = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
-    return environment.from_string(source).render(content)
+    source, script = (
+        files(__package__).joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.html.j2", "page.js")
+    )
+    library = get_plotlyjs()
+    return environment.from_string(source).render(
+        content,
+        script=script,
+        library=pack(library),
+        # Nothing else is run, whatever may have got into the page.
+        allowed=" ".join(f"'{_digest(text)}'" for text in (script, library)),
+    )
 
 
-def figure(drawing: Drawing) -> Section:
-    """A figure as the page shows it: each panel an image of its own, so that they can wrap."""
-    images = []
-    for panel in drawing.panels:
-        images.append(_image(save_panel(panel), "image/svg+xml", panel.description, panel.size))
-        if panel.animation is not None:
-            height = panel.size[1] * 1.2
-            size = (height * ANIMATION[0] / ANIMATION[1], height)
-            text = f"{panel.description} As an animation over the cycles."
-            images.append(_image(panel.animation[1], "image/gif", text, size))
-    legend = [
-        {"label": label, "colour": look.colour, "dash": DASHES[look.dash], "mark": MARKS[look.mark]}
-        for label, look in drawing.legend.items()
-    ]
+def pack(text: str) -> str:
+    """A text as the page's script unpacks it: gzip in base64, which ends no element of HTML."""
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+
+def figure(drawing: Drawing, drawn: bool = False) -> Section:
+    """A figure as the page shows it: each panel an image of its own, so that they can wrap.
+
+    Args:
+        drawing: the figure.
+        drawn: whether the page has a chart of the same, which stands in for it in a browser.
+    """
+    legend = [{"label": label, **_look(look)} for label, look in drawing.legend.items()]
     return {
         "title": drawing.title,
         "caption": drawing.caption,
-        "images": images,
+        "images": [_image(panel) for panel in drawing.panels],
         "legend": legend,
+        "drawn": drawn,
     }
 
 
+def methods(study: Study, meanings: Meanings) -> list[Section]:
+    """The methods with their looks and what they do, in their order in the charts."""
+    return [
+        {"label": group.label, "meaning": meaning(group, meanings), **_look(group.look)}
+        for group in study.groups
+    ]
+
+
+def _look(look: Look) -> Section:
+    return {"colour": look.colour, "dash": DASHES[look.dash], "mark": MARKS[look.mark]}
+
+
 def facts(study: Study) -> list[tuple[str, str]]:
-    """What, with which versions, where, and how long."""
+    """What was compared."""
+    threshold = level_text(study.headline, study.threshold)
+    return [
+        (
+            "Runs",
+            f"{len(study.runs)}, of {len(study.groups)} methods or variants, compared at "
+            f"{study.horizon} updates of the Solver",
+        ),
+        *study.example.task.about.items(),
+        ("Threshold", f"{threshold} {words(study.headline)}"),
+    ]
+
+
+def origin(study: Study) -> list[tuple[str, str]]:
+    """With which versions, where, and for how much."""
     runs = study.runs
     own, spent, evaluations = (
         sum(float(run.metrics[name][-1]) for run in runs) for name in COST[1:4]
     )
     seconds = sum(float(run.own_seconds[-1]) for run in runs)
-    threshold = level_text(study.headline, study.threshold)
     return [
-        (
-            "Runs",
-            f"{len(runs)}, of {len(study.groups)} methods or variants, compared at "
-            f"{study.horizon} updates of the Solver",
-        ),
-        *study.example.task.about.items(),
-        ("Threshold", f"{threshold} {words(study.headline)}"),
         ("Versions", _distinct(runs, _versions)),
         ("Hardware", _distinct(runs, _hardware)),
-        *((group.label, group.setting) for group in study.groups if group.setting),
         (
             "Cost of all runs",
             f"{(own + spent) / 1e6:.1f} million environment frames ({spent / 1e6:.1f} of the "
@@ -110,14 +145,26 @@ def configs(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _image(content: bytes, kind: str, description: str, size: tuple[float, float]) -> Section:
+def _image(panel: Panel) -> Section:
+    """A panel in few colours: a page of vectors is five times as large."""
+    file = io.BytesIO()
+    with Image.open(io.BytesIO(panel_as_png(panel))) as image:
+        # The other ways to choose colours make those of two methods one.
+        far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
+        few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
+    few.save(file, format="PNG", optimize=True)
     return {
-        "address": f"data:{kind};base64,{base64.b64encode(content).decode()}",
-        "description": description,
-        "width": round(size[0] * PIXELS),
-        "height": round(size[1] * PIXELS),
-        "wide": size[0] >= WIDE,
+        "address": f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}",
+        "description": panel.description,
+        "width": round(panel.size[0] * PIXELS),
+        "height": round(panel.size[1] * PIXELS),
+        "wide": panel.size[0] >= WIDE,
     }
+
+
+def _digest(script: str) -> str:
+    """A script as the page's Content-Security-Policy names it."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
 def report_command(folders: Sequence[Path], threshold: float | None, baseline: str | None) -> str:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from proposer_rl.report.curves import draw_curve, finish
 from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
 from proposer_rl.report.runs import Run, read_run, share_map
+from proposer_rl.report.series import UPDATES, over_cycles
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of
 
@@ -99,14 +100,7 @@ def heat_maps(study: Study) -> Drawing | None:
 def diagnostics(study: Study) -> Drawing | None:
     """How the curricula's own training goes: whatever numbers they recorded."""
     groups = [group for group in study.groups if group.logs]
-    names = _scalars(groups)
-    chosen = {name: text for name, text in DIAGNOSTICS.items() if name in names}
-    chosen |= {name: name.replace("_", " ") for name in sorted(names - chosen.keys())}
-    values: dict[str, Value] = {
-        text: partial(_value, name=name) for name, text in list(chosen.items())[:MOST_PANELS]
-    }
-    if any(map(recorded_gain, groups)):
-        values["total gain: mean / sd of copies"] = partial(_of_gains, names=GAINS, reduce=_ratio)
+    values = own_numbers(study)
     if not values:
         return None
     return Drawing(
@@ -126,6 +120,20 @@ def diagnostics(study: Study) -> Drawing | None:
         3,
         {group.label: group.look for group in groups},
     )
+
+
+def own_numbers(study: Study) -> dict[str, Value]:
+    """The numbers of their own that curricula recorded in cycles, by what they are called."""
+    groups = [group for group in study.groups if group.logs]
+    names = _scalars(groups)
+    chosen = {name: text for name, text in DIAGNOSTICS.items() if name in names}
+    chosen |= {name: name.replace("_", " ") for name in sorted(names - chosen.keys())}
+    values: dict[str, Value] = {
+        text: partial(_value, name=name) for name, text in list(chosen.items())[:MOST_PANELS]
+    }
+    if any(map(recorded_gain, groups)):
+        values["total gain: mean / sd of copies"] = partial(_of_gains, names=GAINS, reduce=_ratio)
+    return values
 
 
 def axis_means(run: Run, cycle: Record) -> list[float] | None:
@@ -169,11 +177,11 @@ def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> N
     axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
     reductions: list[tuple[str, Any, str]] = [("maximum", np.max, "-"), ("mean", np.mean, "--")]
     for text, reduce, dash in reductions:
-        x, rows = _per_cycle(group, partial(_of_gains, names=[name], reduce=reduce))
+        x, rows, _ = over_cycles(group, partial(_of_gains, names=[name], reduce=reduce))
         mean = np.ma.masked_invalid(rows).mean(0)
         axes.plot(x, mean, dash, color=colour, label=f"{text} of the copies")
     axes.axhline(0, color="0.2", linewidth=0.8)
-    finish(axes, "Solver updates", f"total gain in target {GAINS[name]}", [every])
+    finish(axes, UPDATES, f"total gain in target {GAINS[name]}", [every])
     axes.set_title(group.label)
     axes.legend(loc="best")
 
@@ -244,21 +252,10 @@ def _draw_over_cycles(figure: FigureBase, groups: Sequence[Group], value: Value,
     axes = axes_of(figure)
     means = []
     for group in groups:
-        x, rows = _per_cycle(group, value)
+        x, rows, _ = over_cycles(group, value)
         seen = ~np.isnan(rows).all(0)
         means.append(draw_curve(axes, x[seen], rows[:, seen], group.look))
-    finish(axes, "Solver updates", axis, means)
-
-
-def _per_cycle(group: Group, value: Value) -> tuple[Column, Column]:
-    """A number of every cycle: the Solver's updates [n] and the values [runs, n]."""
-    logs = group.logs
-    x = np.unique([number(cycle["updates"]) for run in logs for cycle in run.cycles])
-    rows = np.full((len(logs), len(x)), np.nan)
-    for row, run in zip(rows, logs, strict=True):
-        for cycle in run.cycles:
-            row[np.searchsorted(x, number(cycle["updates"]))] = value(cycle)
-    return x, rows
+    finish(axes, UPDATES, axis, means)
 
 
 def _lists(group: Group, name: str) -> list[tuple[float, Column]]:

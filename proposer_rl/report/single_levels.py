@@ -11,12 +11,13 @@ from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
 from proposer_rl.report.curves import draw_curve, finish
 from proposer_rl.report.records import Column, is_rate, words
+from proposer_rl.report.series import Series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import Drawing, Panel, axes_of
 from proposer_rl.report.tables import Cell
 
-LEAST_SHARE, SHARES = 0.01, 61
+SHARES = np.geomspace(0.01, 1.0, 61)
 TICKS = (0.01, 0.03, 0.1, 0.3, 1.0)
 MOST_PANELS = 8
 SIDE = 3.3  # inches of a scatter
@@ -51,9 +52,15 @@ def worst_means(scores: Column, shares: Column) -> Column:
     return np.array(whole) / (shares * levels)
 
 
+def worst_series(study: Study, group: Group, name: str) -> Series | None:
+    """A group's means over the worst levels against their share; None where no run tells."""
+    runs, scores = study.tellers(group, name), study.scores(group, name)
+    return None if scores is None else Series(SHARES, worst_means(scores, SHARES), runs)
+
+
 def worst_curves(study: Study) -> Drawing | None:
     """Mean over the worst levels against their share, of each distribution; None without any."""
-    names = _told(study)
+    names = told(study)
     if not names:
         return None
     levels = study.example.task.levels
@@ -76,8 +83,8 @@ def worst_curves(study: Study) -> Drawing | None:
 
 def level_by_level(study: Study) -> Drawing | None:
     """Every method against the baseline on each level; None where there are no two."""
-    told = _told(study)
-    name = study.headline if study.headline in told else next(iter(told), None)
+    names = told(study)
+    name = study.headline if study.headline in names else next(iter(names), None)
     if name is None or _means(study, study.baseline, name) is None:
         return None
     known = [
@@ -109,21 +116,21 @@ def level_by_level(study: Study) -> Drawing | None:
 
 def worst_table(study: Study) -> tuple[list[str], list[list[Cell]]]:
     """The numbers behind the curves over the worst levels."""
-    shares = _shares()
     rows: list[list[Cell]] = []
-    for name in _told(study):
+    for name in told(study):
         for group in study.groups:
-            scores = study.scores(group, name)
-            if scores is not None:
-                for share, values in zip(shares, worst_means(scores, shares).T, strict=True):
-                    rows.append([name, group.label, share, len(values), *mean_interval(values)])
+            found = worst_series(study, group, name)
+            if found is not None:
+                for share, values in zip(found.x, found.rows.T, strict=True):
+                    row = (name, group.label, float(share), len(values), *mean_interval(values))
+                    rows.append(list(row))
     return ["measurement", "method", "share", "seeds", "mean", "mean, low", "mean, high"], rows
 
 
 def level_table(study: Study) -> tuple[list[str], list[list[Cell]]]:
     """Every level's mean over seeds, a column for each method."""
     rows: list[list[Cell]] = []
-    for name in _told(study):
+    for name in told(study):
         means = [_means(study, group, name) for group in study.groups]
         count = max(len(one) for one in means if one is not None)
         columns = [np.full(count, np.nan) if one is None else one for one in means]
@@ -132,7 +139,7 @@ def level_table(study: Study) -> tuple[list[str], list[list[Cell]]]:
     return ["measurement", "level", *(group.label for group in study.groups)], rows
 
 
-def _told(study: Study) -> list[str]:
+def told(study: Study) -> list[str]:
     """The measurements that some run tells of every level."""
     groups = study.groups
     return [n for n in study.measurements if any(study.scores(g, n) is not None for g in groups)]
@@ -143,17 +150,10 @@ def _means(study: Study, group: Group, name: str) -> Column | None:
     return None if scores is None else scores.mean(0)
 
 
-def _shares() -> Column:
-    return np.geomspace(LEAST_SHARE, 1.0, SHARES)
-
-
 def _draw_worst(figure: FigureBase, study: Study, name: str) -> None:
-    axes, shares = axes_of(figure), _shares()
-    means = [
-        draw_curve(axes, shares, worst_means(scores, shares), group.look)
-        for group in study.groups
-        if (scores := study.scores(group, name)) is not None
-    ]
+    axes = axes_of(figure)
+    found = [(group.look, worst_series(study, group, name)) for group in study.groups]
+    means = [draw_curve(axes, one.x, one.rows, look) for look, one in found if one is not None]
     text = f"worst share of the {study.example.task.levels}"
     finish(axes, text, words(name), means, rate=is_rate(name))
     axes.set_xscale("log")

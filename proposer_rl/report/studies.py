@@ -7,6 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class Study:
         """Columns of the distributions that were measured on, one for each."""
         return self.example.measurements
 
-    @property
+    @cached_property
     def horizon(self) -> int:
         """The length at which runs are compared: that of most finished runs."""
         lengths = Counter(run.updates for run in self.runs if run.finished)
@@ -126,10 +127,14 @@ class Study:
         Returns:
             None where no run tells.
         """
-        full = [run.levels[name] for run in self.runs if self._tells(run, name)]
-        own = [run.levels[name] for run in group.runs if self._tells(run, name)]
-        alike = [row for row in own if len(row) == len(full[0])]
-        return np.array(alike) if alike else None
+        rows = [run.levels[name] for run in self.tellers(group, name)]
+        return np.array(rows) if rows else None
+
+    def tellers(self, group: Group, name: str) -> list[Run]:
+        """A group's runs of full length that tell of as many levels as the study's first."""
+        counts = [len(run.levels[name]) for run in self.runs if self._tells(run, name)]
+        own = [run for run in group.runs if self._tells(run, name)]
+        return [run for run in own if len(run.levels[name]) == counts[0]]
 
     def _tells(self, run: Run, name: str) -> bool:
         return name in run.levels and run.updates == self.horizon

@@ -154,12 +154,12 @@ def save(drawing: Drawing) -> dict[str, bytes]:
         return {suffix: _render(figure, suffix) for suffix in ("svg", "png")}
 
 
-def save_panel(panel: Panel) -> bytes:
-    """One panel alone, as SVG."""
+def panel_as_png(panel: Panel) -> bytes:
+    """One panel alone."""
     with rc_context(SETTINGS):
         figure = Figure(figsize=panel.size, layout="constrained")
         panel.draw(figure)
-        return _render(figure, "svg")
+        return _render(figure, "png")
 
 
 def _render(figure: Figure, suffix: str) -> bytes:

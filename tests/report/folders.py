@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import io
+import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -152,3 +155,14 @@ def cycle(
         "kl_approx": 0.01,
         "histogram": list(histogram),
     }
+
+
+def page_data(page: Path) -> list[dict[str, Any]]:
+    """What is packed into a page for its charts, of each of its sections."""
+    packed = re.findall(r'class="data">([^<]*)</script>', page.read_text(encoding="utf-8"))
+    return [json.loads(gzip.decompress(base64.b64decode(text))) for text in packed]
+
+
+def write_jsonl(path: Path, lines: Sequence[Any]) -> None:
+    """Lines in place of those of a file."""
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")

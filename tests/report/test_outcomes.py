@@ -212,9 +212,10 @@ def test_badge_and_text_tell_the_same(tmp_path: Path) -> None:
             assert ("the difference is significant" in finding.evidence) <= (p <= 0.05)
 
 
-def test_findings_without_their_methods_have_no_data(tmp_path: Path) -> None:
-    found = verdicts(study_of(tmp_path, domain_randomization=SLOW))
-    assert set(found.values()) == {"no data"}
+def test_findings_without_their_methods_are_left_out(tmp_path: Path) -> None:
+    assert not findings(study_of(tmp_path / "one", domain_randomization=SLOW))
+    found = findings(study_of(tmp_path / "two", domain_randomization=SLOW, mine=FAST))
+    assert [finding.claim for finding in found] == ["mine beats domain_randomization."]
 
 
 def test_numbers_are_written_with_their_interval() -> None:

@@ -1,0 +1,136 @@
+"""What a reader is told first: what came out, in two sentences, and what the words mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from proposer_rl.report.comparisons import TOO_FEW, Decision, decisions, primary
+from proposer_rl.report.records import LONGEST_TEXT, is_rate, printable, words
+from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.tables import write
+
+# What methods and ablations do, by ``method`` or ``ablation`` and name.
+Meanings = Mapping[str, Mapping[str, str]]
+
+LISTED = 6  # methods that a sentence names
+
+
+def answer(study: Study) -> tuple[str, str]:
+    """Which method is best and how that is known, then how the others stand to the baseline."""
+    outcome, baseline = primary(study), study.baseline
+    ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
+    best, *others = ranked
+    reached = f"{outcome.name}: {write(mean_interval(outcome.values(best)))}"
+    if not others:
+        return (
+            f"{best.label} is the only method here ({reached}).",
+            "Nothing is compared, so whether that is good cannot be told from this page.",
+        )
+    found = decisions(study)
+    first = (
+        f"Of {len(ranked)} methods, {best.label} has the highest {reached}; "
+        f"{_shown(best, [_between(found, best, other) for other in others])}."
+    )
+    return first, _against(baseline, [group for group in ranked if group is not baseline], found)
+
+
+def glossary(study: Study) -> list[tuple[str, str]]:
+    """The words that a reader needs, for those who have not seen any of this before."""
+    levels, measured = study.example.task.levels, study.headline
+    told = f"what is measured of the Solver on the distribution {measured.rpartition('_')[0]!r}"
+    if is_rate(measured):
+        told += f": the share of its {levels} that the Solver solves, from 0 to 1"
+    return [
+        (
+            "Solver",
+            f"the agent that is trained on batches of {levels}, with reinforcement learning (PPO). "
+            "It is the same under every method; one update is one training step on one batch.",
+        ),
+        (
+            "Proposer",
+            f"a second agent, whose actions are the {levels} of the next batches; it is rewarded "
+            "with what the Solver learns from them. Not every method has one.",
+        ),
+        (
+            "Method",
+            f"what decides which {levels} the Solver trains on. Nothing else differs between "
+            "methods.",
+        ),
+        (
+            "Seed",
+            "one independent run of a method. [a, b] is a 95 % interval over seeds, given from "
+            f"{FEWEST} seeds on.",
+        ),
+        (words(measured), f"{told}. Methods are compared by its mean along training."),
+    ]
+
+
+def meaning(group: Group, meanings: Meanings) -> str:
+    """What a method does, in a line: as its runs recorded it, or else as the caller knows it.
+
+    Args:
+        group: of the method, perhaps with an ablation.
+        meanings: for runs that recorded none.
+    """
+    run = group.runs[0]
+    about = run.facts.get("about")
+    own = about if isinstance(about, Mapping) else {}
+    said = []
+    for kind, name in (("method", run.method), ("ablation", run.ablation)):
+        text = own.get(kind) or meanings.get(kind, {}).get(name, "")
+        said.append(printable(str(text))[:LONGEST_TEXT])
+    text = said[0] or "Its runs do not say what it does."
+    text += f" Changed here: {said[1]}" if said[1] else ""
+    return f"{text} ({group.setting})" if group.setting else text
+
+
+def _between(
+    found: Mapping[tuple[str, str], Decision], one: Group, other: Group
+) -> tuple[Group, Decision]:
+    return other, found.get((one.label, other.label)) or found[other.label, one.label]
+
+
+def _shown(best: Group, pairs: Sequence[tuple[Group, Decision]]) -> str:
+    """Whether the best is shown to be better, and than how many."""
+    beaten = [decision.winner == best.label for _, decision in pairs]
+    if all(decision.verdict == TOO_FEW for _, decision in pairs):
+        return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
+    if all(beaten):
+        return f"it is shown to be better than {'all others' if len(pairs) > 1 else 'the other'}"
+    if not any(beaten):
+        return "but it is not shown to be better than any of the others"
+    left = [group.label for group, decision in pairs if decision.winner != best.label]
+    return (
+        f"it is shown to be better than {sum(beaten)} of the {len(pairs)} others, and undecided "
+        f"against {_listed(left)}"
+    )
+
+
+def _against(
+    baseline: Group, others: Sequence[Group], found: Mapping[tuple[str, str], Decision]
+) -> str:
+    """How the others stand to the baseline."""
+    pairs = [_between(found, baseline, other) for other in others]
+    if all(decision.verdict == TOO_FEW for _, decision in pairs):
+        return f"How they stand to the baseline, {baseline.label}, is not decided either."
+    better = [group.label for group, decision in pairs if decision.winner == group.label]
+    worse = [group.label for group, decision in pairs if decision.winner == baseline.label]
+    rest = len(pairs) - len(better) - len(worse)
+    first = f"{_listed(better) or 'No method'} {_is(better)}"
+    parts = [f"{first} shown to be better than the baseline, {baseline.label}"]
+    parts += [f"{_listed(worse)} {_is(worse)} shown to be worse"] if worse else []
+    parts += [f"{rest} {'are' if rest > 1 else 'is'} undecided"] if rest else []
+    return f"{'; '.join(parts)}."
+
+
+def _listed(labels: Sequence[str]) -> str:
+    if len(labels) > LISTED:
+        return f"{len(labels)} methods"
+    return " and ".join(filter(None, [", ".join(labels[:-1]), *labels[-1:]]))
+
+
+def _is(labels: Sequence[str]) -> str:
+    return "are" if len(labels) > 1 else "is"

@@ -1,0 +1,238 @@
+// Draws the charts of the report's page, and lets its tables be sorted and filtered.
+// Whatever comes from a run is set as text, never as HTML.
+"use strict";
+(() => {
+  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  const make = (tag, properties, ...inside) => {
+    const element = Object.assign(document.createElement(tag), properties);
+    element.append(...inside);
+    return element;
+  };
+  const short = (value) => (value === null ? "–" : value.toLocaleString("en", { maximumSignificantDigits: 4 }));
+  const FONT = { family: "system-ui, Liberation Sans, sans-serif", size: 13, color: "#1b1f24" };
+  const OPTIONS = { responsive: true, displaylogo: false, toImageButtonOptions: { format: "svg" } };
+  const layout = (more) => ({
+    font: FONT, margin: { l: 64, r: 16, t: 12, b: 48 }, showlegend: false, hovermode: "closest", ...more,
+  });
+  const axis = (title, more) => ({
+    title: { text: plain(title) }, gridcolor: "#e6e9ec", zerolinecolor: "#c8ccd0", automargin: true, ...more,
+  });
+  const draw = (place, traces, shape) => window.Plotly.react(place, traces, layout(shape), OPTIONS);
+
+  // What was packed into the page, as text: gzip in base64.
+  const unpack = async (element) => {
+    const bytes = Uint8Array.from(atob(element.textContent), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Response(stream).text();
+  };
+
+  // ---- Curves: a line and a band for each method, and lines of single seeds.
+  const bandOf = (series) => {
+    const x = [], y = [];
+    for (let i = 0, start = null; i <= series.x.length; i++) {
+      const known = i < series.x.length && series.low[i] !== null;
+      if (known && start === null) start = i;
+      if (known || start === null) continue;
+      const part = (values) => values.slice(start, i);
+      x.push(...part(series.x), ...part(series.x).reverse(), null);
+      y.push(...part(series.high), ...part(series.low).reverse(), null);
+      start = null;
+    }
+    return { x, y };
+  };
+  const curveTraces = (data, measure, along, methods, seeds) => {
+    const bands = [], lines = [], single = [];
+    data.methods.forEach((method, m) => {
+      const series = measure.axes[along][m];
+      if (!series || !methods.has(m)) return;
+      const name = plain(method.label);
+      const look = { type: "scatter", mode: series.x.length < 3 ? "lines+markers" : "lines", name };
+      const line = { color: method.colour, dash: method.dash, width: 2.2 };
+      bands.push({ ...look, ...bandOf(series), mode: "lines", fill: "toself", fillcolor: method.colour,
+        line: { width: 0 }, opacity: 0.13, hoverinfo: "skip", meta: "band" });
+      const text = series.mean.map((mean, i) => (series.low[i] === null ? short(mean)
+        : `${short(mean)} [${short(series.low[i])}, ${short(series.high[i])}]`));
+      const hover = { text, hovertemplate: `<b>${name}</b><br>%{text}<br>at %{x:,.4~g}<extra></extra>` };
+      const whole = (mean, i) => (series.whole[i] ? mean : null);
+      if (!series.whole.every(Boolean))
+        lines.push({ ...look, x: series.x, y: series.mean, line: { ...line, width: 0.8 }, ...hover });
+      lines.push({ ...look, x: series.x, y: series.mean.map(whole), line, ...hover, meta: "mean" });
+      measure.rows[m].forEach((row, r) => {
+        if (!row || !seeds.has(method.seeds[r])) return;
+        const x = measure.own ? series.x : data.places[m][r][along];
+        single.push({ ...look, x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
+          hovertemplate: `<b>${name}</b>, seed ${method.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
+      });
+    });
+    return [...bands, ...single, ...lines];
+  };
+  const drawCurves = (place, data, measure, along, methods, seeds) => {
+    const rate = measure.rate ? { range: [-0.02, 1.02] } : {};
+    const log = measure.log ? { type: "log", tickformat: ".0%", dtick: 0.5 } : {};
+    return draw(place, curveTraces(data, measure, along, methods, seeds),
+      { height: 470, xaxis: axis(along, log), yaxis: axis(measure.name, rate), uirevision: measure.name + along });
+  };
+
+  // ---- Outcomes: the methods in their order, with intervals and a dot for each seed.
+  const drawOutcomes = (place, data, outcome, methods) => {
+    const rank = (m) => (outcome.methods[m].estimate.length ? outcome.sign * outcome.methods[m].estimate[0] : -Infinity);
+    const order = data.methods.map((_, m) => m).filter((m) => methods.has(m)).sort((a, b) => rank(a) - rank(b));
+    const traces = [];
+    order.forEach((m, y) => {
+      const { estimate, values } = outcome.methods[m], { label, colour, seeds } = data.methods[m];
+      const name = plain(label), spread = values.map((_, i) => y - 0.2 + (0.4 * (i + 0.5)) / values.length);
+      traces.push({ type: "scatter", mode: "markers", x: values, y: spread, text: seeds.map((s) => `seed ${s}`),
+        marker: { color: colour, size: 6, opacity: 0.35 }, hovertemplate: `<b>${name}</b>, %{text}<br>%{x:.4~g}<extra></extra>` });
+      if (!estimate.length) return;
+      const [mean, low, high] = estimate, known = low !== null;
+      traces.push({ type: "scatter", mode: "markers", x: [mean], y: [y], name, meta: "estimate",
+        marker: { color: colour, size: 11, symbol: "diamond" },
+        error_x: { type: "data", symmetric: false, array: [known ? high - mean : 0], arrayminus: [known ? mean - low : 0],
+          color: colour, thickness: 2.5, width: 5, visible: known },
+        hovertemplate: `<b>${name}</b><br>${short(mean)}${known ? ` [${short(low)}, ${short(high)}]` : ""}<extra></extra>` });
+    });
+    const labels = order.map((m) => plain(data.methods[m].label));
+    return draw(place, traces, { height: 90 + 27 * order.length, xaxis: axis(outcome.name),
+      yaxis: axis("", { tickvals: order.map((_, y) => y), ticktext: labels, range: [-0.6, order.length - 0.4], gridcolor: "#f2f4f6" }) });
+  };
+
+  // ---- Through training: proposals, levels and success at one moment.
+  const drawStage = (parts, data, found, number) => {
+    const stage = found.stages[number], [x, y] = found.curve, [rows, columns] = data.stages.axes.length > 1
+      ? data.stages.axes : [null, data.stages.axes[0]];
+    const reached = y[x.indexOf(stage.updates)] ?? null;
+    parts.moment.textContent = `update ${stage.updates}: ${short(reached)}`;
+    parts.levels.replaceChildren(...stage.levels.map((level, i) => {
+      const name = `number ${i + 1} of the batch at update ${stage.updates}`;
+      if (typeof level === "number")
+        return make("img", { src: `data:image/png;base64,${data.stages.pictures[level]}`, alt: name, title: name });
+      return make("pre", { title: name }, level.join("\n"));
+    }));
+    draw(parts.success, [
+      { type: "scatter", mode: "lines", x, y, line: { color: parts.colour, width: 2 }, hovertemplate: "%{y:.4~g} at update %{x}<extra></extra>" },
+      { type: "scatter", mode: "markers", x: [stage.updates], y: [reached], marker: { color: parts.colour, size: 12 }, hoverinfo: "skip", meta: "now" },
+    ], { height: 300, xaxis: axis(data.axes[0]), yaxis: axis(data.headline.name, data.headline.rate ? { range: [-0.02, 1.02] } : {}),
+      shapes: [{ type: "line", x0: stage.updates, x1: stage.updates, yref: "paper", y0: 0, y1: 1, line: { color: "#8c959f", dash: "dot", width: 1 } }] });
+    const maps = found.stages.map((each) => each.map).filter(Boolean);
+    parts.mapPart.hidden = !maps.length;
+    parts.noMap.hidden = Boolean(maps.length);
+    if (!maps.length) return;
+    const even = 1 / maps[0].flat().length, largest = Math.max(2 * even, ...maps.flat(2));
+    const ticks = (side) => ({ tickvals: side ? side.values.map((_, i) => i) : [], ticktext: side ? side.values.map(String) : [] });
+    const grid = stage.map ?? maps[0].map((row) => row.map(() => null));
+    draw(parts.map, [{ type: "heatmap", z: grid, zmin: 0, zmax: largest, xgap: 2, ygap: 2,
+      colorscale: [[0, "#542788"], [even / largest, "#f7f7f7"], [1, "#b35806"]], colorbar: { tickformat: ".0%", thickness: 12 },
+      hovertemplate: "%{z:.2%} of the proposals<extra></extra>" }],
+    { height: 300, xaxis: axis(columns.name, ticks(columns)), yaxis: axis(rows ? rows.name : "", ticks(rows)) });
+  };
+
+  // ---- One study: its controls and charts.
+  const checked = (boxes) => new Set(boxes.filter((box) => box.checked).map((box) => Number(box.value)));
+  const study = async (section) => {
+    const data = JSON.parse(await unpack(section.querySelector(".data")));
+    const one = (name) => section.querySelector(`.${name}`);
+    const option = (text, value) => make("option", { textContent: text, value });
+    const seeds = [...new Set(data.methods.flatMap((method) => method.seeds))].sort((a, b) => a - b);
+    one("seeds").append(...seeds.map((seed) => make("label", {}, make("input", { type: "checkbox", value: seed }), ` ${seed}`)));
+    const boxes = (name) => [...one(name).querySelectorAll("input")];
+    const kinds = [...new Set(data.measures.map((measure) => measure.kind))];
+    one("measure").append(...kinds.map((kind) => make("optgroup", { label: kind },
+      ...data.measures.flatMap((measure, i) => (measure.kind === kind ? [option(measure.name, i)] : [])))));
+    one("outcome").append(...data.outcomes.map((outcome, i) => option(outcome.name, i)));
+    let along = data.axes[0];
+    const redraw = () => {
+      const measure = data.measures[Number(one("measure").value)], possible = Object.keys(measure.axes);
+      const shown = possible.includes(along) ? along : possible[0];
+      one("axes").replaceChildren(...[...new Set([...data.axes, shown])].map((name) => {
+        const button = make("button", { type: "button", textContent: name, disabled: !possible.includes(name) });
+        button.setAttribute("aria-pressed", name === shown);
+        button.addEventListener("click", () => { along = name; redraw(); });
+        return button;
+      }));
+      drawCurves(one("curves"), data, measure, shown, checked(boxes("methods")), checked(boxes("seeds")));
+      drawOutcomes(one("outcomes"), data, data.outcomes[Number(one("outcome").value)], checked(boxes("methods")));
+    };
+    for (const name of ["methods", "seeds"])
+      one(name).addEventListener("click", (event) => {
+        if (!event.target.dataset.all) return;
+        boxes(name).forEach((box) => { box.checked = event.target.dataset.all === "1"; });
+        redraw();
+      });
+    for (const name of ["methods", "seeds", "measure", "outcome"]) one(name).addEventListener("change", redraw);
+    redraw();
+    if (one("through")) through(one, data, option);
+  };
+  const through = (one, data, option) => {
+    const range = one("moment-slider"), choice = one("staged");
+    data.stages.methods.forEach((found, m) => found && choice.append(option(`${data.methods[m].label}, seed ${found.seed}`, m)));
+    choice.value = String(data.stages.first);
+    const show = () => {
+      const found = data.stages.methods[Number(choice.value)];
+      range.max = found.stages.length - 1;
+      const parts = Object.fromEntries(["moment", "levels", "success", "map"].map((name) => [name, one(name)]));
+      drawStage({ ...parts, mapPart: one("map-part"), noMap: one("no-map"), colour: data.methods[Number(choice.value)].colour },
+        data, found, Number(range.value));
+      range.setAttribute("aria-valuetext", parts.moment.textContent);
+    };
+    let timer = null;
+    const stop = () => { clearInterval(timer); timer = null; one("play").textContent = "Play"; };
+    one("play").addEventListener("click", () => {
+      if (timer) return stop();
+      if (range.value === range.max) range.value = 0;
+      one("play").textContent = "Stop";
+      timer = setInterval(() => { range.value = Number(range.value) + 1; show(); if (range.value === range.max) stop(); }, 500);
+    });
+    choice.addEventListener("change", show);
+    range.addEventListener("input", show);
+    show();
+  };
+
+  // ---- Tables: a button in each head sorts, a field filters.
+  const numeric = (text) => parseFloat(text.replace(/,/g, "").replace("−", "-"));
+  const compare = (a, b) => {
+    const [x, y] = [numeric(a), numeric(b)];
+    if (Number.isNaN(x) || Number.isNaN(y)) return Number.isNaN(x) && Number.isNaN(y) ? a.localeCompare(b) : Number.isNaN(x) - Number.isNaN(y);
+    return x - y;
+  };
+  const sortable = (table) => {
+    const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
+    const text = (row, column) => row.cells[column].textContent;
+    heads.forEach((head, column) => {
+      const button = make("button", { type: "button" }, ...head.childNodes);
+      head.replaceChildren(button);
+      button.addEventListener("click", () => {
+        const up = head.getAttribute("aria-sort") !== "ascending";
+        heads.forEach((each) => each.removeAttribute("aria-sort"));
+        head.setAttribute("aria-sort", up ? "ascending" : "descending");
+        const empty = (row) => text(row, column) === "–";
+        body.append(...[...body.rows].sort((a, b) => empty(a) - empty(b)
+          || (up ? 1 : -1) * compare(text(a, column), text(b, column))));
+      });
+    });
+    if (body.rows.length < 6) return;
+    const count = make("span", { className: "dim" }), field = make("input", { type: "search", placeholder: "Filter rows" });
+    field.setAttribute("aria-label", "Filter rows");
+    count.setAttribute("aria-live", "polite");
+    field.addEventListener("input", () => {
+      const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
+      let left = 0;
+      for (const row of body.rows) {
+        row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+        left += !row.hidden;
+      }
+      count.textContent = ` ${left} of ${body.rows.length} rows`;
+    });
+    table.parentElement.before(make("p", { className: "filter" }, field, count));
+  };
+
+  document.querySelectorAll("table").forEach(sortable);
+  const start = async () => {
+    const script = make("script", { textContent: await unpack(document.getElementById("plotly")) });
+    document.head.append(script);
+    document.documentElement.classList.add("live-page");
+    for (const section of document.querySelectorAll("section.study")) await study(section);
+    document.documentElement.dataset.ready = "1";
+  };
+  // A browser that cannot do this shows the still figures.
+  start().catch(() => document.documentElement.classList.remove("live-page"));
+})();

@@ -1,0 +1,91 @@
+"""What a reader is told first, from runs whose outcome is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from proposer_rl.report.answer import answer, glossary, meaning
+from proposer_rl.report.studies import Study, read_studies
+from tests.report.folders import write_rockets, write_run
+
+NOISE = np.random.default_rng(1).normal(0, 0.01, (8, 6))
+
+
+def study_of(folder: Path, ends: Mapping[str, float], seeds: int = 6) -> Study:
+    """Methods whose mean along training is about half of their end."""
+    for number, (method, end) in enumerate(ends.items()):
+        for seed in range(seeds):
+            curve = [0.0, (end + NOISE[number, seed]) / 2, end + NOISE[number, seed]]
+            write_run(folder / f"{method}{seed}", method, [seed], curve)
+    (study,), _ = read_studies(sorted(folder.iterdir()), None)
+    return study
+
+
+def told(folder: Path, ends: Mapping[str, float], seeds: int = 6) -> Sequence[str]:
+    sentences = answer(study_of(folder, ends, seeds))
+    assert all(sentence.endswith(".") for sentence in sentences)
+    return sentences
+
+
+def test_the_best_is_named_with_how_sure_that_is(tmp_path: Path) -> None:
+    ends = {"ours": 0.9, "domain_randomization": 0.5, "worse": 0.2}
+    first, second = told(tmp_path / "all", ends)
+    assert first.startswith(
+        "Of 3 methods, ours has the highest ID success, mean over 20 updates: 0.4"
+    )
+    assert first.endswith("it is shown to be better than all others.")
+    assert second == (
+        "ours is shown to be better than the baseline, domain_randomization; "
+        "worse is shown to be worse."
+    )
+    first, second = told(tmp_path / "some", {"twin": 0.9, **ends})
+    assert "better than 2 of the 3 others, and undecided against " in first
+    assert second.startswith("twin and ours are shown") or second.startswith("ours and twin are")
+
+
+def test_what_is_undecided_is_said_to_be(tmp_path: Path) -> None:
+    first, second = told(tmp_path, {"ours": 0.5, "domain_randomization": 0.5})
+    assert first.endswith("but it is not shown to be better than any of the others.")
+    assert second == (
+        "No method is shown to be better than the baseline, domain_randomization; 1 is undecided."
+    )
+
+
+def test_few_seeds_decide_nothing(tmp_path: Path) -> None:
+    first, second = told(tmp_path, {"ours": 0.9, "domain_randomization": 0.1}, seeds=4)
+    assert "shown" not in first and "it takes 5 seeds" in first
+    assert "not decided" in second
+
+
+def test_a_method_alone_is_compared_with_nothing(tmp_path: Path) -> None:
+    first, second = told(tmp_path, {"ours": 0.9})
+    assert first.startswith("ours is the only method here") and "Nothing is compared" in second
+
+
+def test_the_words_are_those_of_the_task(tmp_path: Path) -> None:
+    (mazes,), _ = read_studies([write_run(tmp_path / "a")], None)
+    (rockets,), _ = read_studies([write_rockets(tmp_path / "b", "plr", 0)], None)
+    for study, there, missing in ((mazes, "mazes", "rockets"), (rockets, "rockets", "mazes")):
+        words = dict(glossary(study))
+        assert {"Solver", "Proposer", "Method", "Seed"} < set(words)
+        assert there in words["Solver"] and missing not in "".join(words.values())
+    assert "from 0 to 1" in dict(glossary(mazes))["ID success"]
+    assert "from 0 to 1" not in dict(glossary(rockets))["target return"]
+
+
+def test_what_a_method_does_is_what_its_run_recorded(tmp_path: Path) -> None:
+    about = {"about": {"method": "Mine.\x07", "ablation": "Half."}}
+    write_run(tmp_path / "a", "mine", facts=about, ablation="less")
+    write_run(tmp_path / "b", "target")
+    write_run(tmp_path / "c", "unheard")
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    known = {"method": {"target": "No curriculum.", "mine": "Not this."}}
+    found = {group.label: meaning(group, known) for group in study.groups}
+    assert found == {
+        "mine, less": "Mine.? Changed here: Half.",
+        "target": "No curriculum.",
+        "unheard": "Its runs do not say what it does.",
+    }

@@ -1,0 +1,242 @@
+"""The numbers that the page's charts are drawn from, against the runs' own files."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import math
+import statistics
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from proposer_rl.report import build, page
+from proposer_rl.report.build import write_report
+from proposer_rl.report.curves import cost_curves, learning_curves
+from proposer_rl.report.levels import side_by_side
+from proposer_rl.report.studies import read_studies
+from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run
+
+SEEDS = 6
+STUDENT = 2.570582  # the 97.5 % point of Student's distribution with 5 degrees of freedom
+UPDATES, FRAMES, SECONDS = (
+    "Solver updates",
+    "environment frames, millions (all)",
+    "wall-clock seconds",
+)
+
+
+def rows_of(folder: Path) -> list[dict[str, float]]:
+    with (folder / "metrics.csv").open(encoding="utf-8") as file:
+        return [{name: float(text) for name, text in row.items()} for row in csv.DictReader(file)]
+
+
+def mean_and_interval(values: list[float]) -> list[float]:
+    mean = statistics.fmean(values)
+    half = STUDENT * statistics.stdev(values) / math.sqrt(len(values))
+    return [mean, mean - half, mean + half]
+
+
+def between(x: float, xs: list[float], ys: list[float]) -> float:
+    """The ordinate of a polygon, by hand."""
+    i = max(k for k in range(len(xs) - 1) if xs[k] <= x)
+    return ys[i] + (ys[i + 1] - ys[i]) * (x - xs[i]) / (xs[i + 1] - xs[i])
+
+
+def by_name(items: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    (found,) = (item for item in items if item["name"] == name)
+    return found
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    random = np.random.default_rng(3)
+    for method, copies in (("mine", 700), ("target", 0)):
+        for seed in range(SEEDS):
+            curve = np.sort(random.uniform(0, 1, 5)).round(4).tolist()
+            write_run(folder / f"{method}{seed}", method, [seed], curve, copies=copies)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "DRAWINGS", [])
+        written = write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
+    (found,) = page_data(written)
+    return found
+
+
+def test_lines_and_bands_are_mean_and_interval_of_the_files(
+    runs: Path, data: dict[str, Any]
+) -> None:
+    measure = by_name(data["measures"], "ID success rate")
+    for place, method in enumerate(["mine", "target"]):
+        assert data["methods"][place]["label"] == method
+        folders = [rows_of(runs / f"{method}{seed}") for seed in range(SEEDS)]
+        series = measure["axes"][UPDATES][place]
+        assert series["x"] == [row["updates"] for row in folders[0]]
+        expected = [
+            mean_and_interval([r["id_success"] for r in at]) for at in zip(*folders, strict=True)
+        ]
+        found = np.transpose([series["mean"], series["low"], series["high"]])
+        assert found == pytest.approx(np.array(expected), abs=2e-5)
+        assert measure["rows"][place] == [[r["id_success"] for r in rows] for rows in folders]
+
+
+def test_against_a_cost_runs_stand_between_their_measurements(
+    runs: Path, data: dict[str, Any]
+) -> None:
+    measure = by_name(data["measures"], "ID success rate")
+    costs = {
+        FRAMES: lambda row: (row["frames"] + row["curriculum_frames"]) / 1e6,
+        SECONDS: lambda row: row["seconds"],
+    }
+    folders = [rows_of(runs / f"mine{seed}") for seed in range(SEEDS)]
+    for axis, cost in costs.items():
+        series, places = measure["axes"][axis][0], data["places"][0]
+        assert [run[axis] for run in places] == [[cost(r) for r in rows] for rows in folders]
+        for i in (1, 20, 50, 98):
+            values = [
+                between(series["x"][i], [cost(r) for r in rows], [r["id_success"] for r in rows])
+                for rows in folders
+            ]
+            found = [series["mean"][i], series["low"][i], series["high"][i]]
+            assert found == pytest.approx(mean_and_interval(values), abs=1e-4)
+
+
+def test_outcomes_are_those_that_decide(runs: Path, data: dict[str, Any]) -> None:
+    outcome = data["outcomes"][0]
+    assert outcome["name"] == "ID success, mean over 40 updates"
+    values = []
+    for seed in range(SEEDS):
+        y = [row["id_success"] for row in rows_of(runs / f"mine{seed}")]
+        values.append(sum((a + b) / 2 for a, b in pairwise(y)) / 4)
+    assert outcome["methods"][0]["values"] == pytest.approx(values, abs=2e-5)
+    assert outcome["methods"][0]["estimate"] == pytest.approx(mean_and_interval(values), abs=2e-5)
+
+
+def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A short run leaves a mean that is not of all, and few seeds have no interval."""
+    monkeypatch.setattr(build, "DRAWINGS", [])
+    write_run(tmp_path / "a", seeds=[0])
+    write_run(tmp_path / "b", seeds=[1], curve=[0.0, 0.1], finished=False)
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    (series,) = by_name(data["measures"], "ID success rate")["axes"][UPDATES]
+    assert series == {
+        "x": [0, 10, 20],
+        "mean": [0, 0.3, 0.9],
+        "whole": [True, True, False],
+        "low": [None] * 3,
+        "high": [None] * 3,
+    }
+    assert data["outcomes"][0]["methods"][0]["values"][1] is None
+
+
+def test_stages_move_proposals_levels_and_success_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [])
+    maps = [[[6, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 3, 3]]]
+    cycles = [cycle(i, [0.1], maps[i], every=20) for i in range(2)]
+    curve = [0.0, 0.2, 0.4, 0.6]
+    write_run(tmp_path / "p", "perf_gain", [4], curve, cycles=cycles)
+    write_run(tmp_path / "t", "target", [4], curve)
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    found, plain = data["stages"]["methods"]
+    assert found["curve"] == [[0, 10, 20, 30], curve]
+    assert [stage["updates"] for stage in found["stages"]] == [10, 20, 30]
+    # The last map on record: that of update 0, then that of update 20.
+    assert [stage["map"][0][0] for stage in found["stages"]] == [1, 0, 0]
+    assert found["stages"][2]["map"][1] == [0, 0.5, 0.5]
+    assert all(stage["map"] is None for stage in plain["stages"])
+    # One picture, wherever it is shown.
+    assert len(data["stages"]["pictures"]) == 1
+    assert found["stages"][0]["levels"] == [0, 0, 0] == plain["stages"][2]["levels"]
+    assert data["stages"]["first"] == 0
+    axes = {axis["name"]: axis["values"] for axis in data["stages"]["axes"]}
+    assert axes == {"obstacle fraction": [0, 0.2], "path length": [2, 3, 4]}
+
+
+def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:
+    (study,), _ = read_studies(sorted(runs.iterdir()), None)
+    image = page.figure(learning_curves(study))["images"][0]
+    content = base64.b64decode(image["address"].removeprefix("data:image/png;base64,"))
+    with Image.open(io.BytesIO(content)) as file:
+        found = np.asarray(file.convert("RGB")).astype(int)
+    for look in study.legend.values():
+        colour = list(bytes.fromhex(look.colour[1:]))
+        assert (np.abs(found - colour).max(-1) <= 8).any(), colour
+
+
+SIZE = 8 * 2**20
+FIGURES = 2 * 2**20  # more than the pictures of 18 methods take
+
+
+@pytest.mark.slow
+def test_a_page_of_many_long_runs_stays_small(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """18 methods x 10 seeds with 76 evaluations each; noise, which cannot be packed."""
+    monkeypatch.setattr(build, "DRAWINGS", [])
+    random = np.random.default_rng(0)
+    cost = ["frames", "curriculum_frames", "evaluations", "seconds"]
+    names = [f"{d}_{kind}" for d in ("id", "ood") for kind in ("success", "return", "worst10")]
+    for number in range(18):
+        for seed in range(10):
+            folder = write_run(tmp_path / f"m{number}-{seed}", f"method_{number}", [seed], [0.0])
+            costs = np.sort(random.uniform(0, 1e6, (76, 4)), 0)
+            values = np.c_[np.full(76, seed), 10 * np.arange(76), costs, random.random((76, 6))]
+            header = ["seed", "updates", *cost, *names]
+            save(folder / "metrics.csv", header, values)
+            trained = np.c_[np.full(76, seed), 10 * np.arange(76), random.random((76, 4))]
+            save(folder / "training.csv", ["seed", "updates", *"abcd"], trained)
+        sample = [{"picture": png(random.integers(0, 256, (40, 40, 3)))} for _ in range(4)]
+        lines = [{"updates": 10 * i, "seed": 0, "levels": sample} for i in range(1, 76)]
+        write_jsonl(tmp_path / f"m{number}-0" / "curriculum.jsonl", lines)
+    written = write_report([tmp_path], tmp_path / "out", progress=False)
+    (data,) = page_data(written)
+    assert len(data["methods"]) == 18 and len(data["places"][0]) == 10
+    assert written.stat().st_size < SIZE - FIGURES
+
+
+def save(path: Path, header: list[str], values: Any) -> None:
+    np.savetxt(path, values, "%.17g", ",", header=",".join(header), comments="")
+
+
+def test_pictures_that_are_too_large_are_fewer_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [])
+    random = np.random.default_rng(0)
+
+    def noise() -> str:
+        return png(random.integers(0, 256, (160, 160, 3)))
+
+    for count, expected in ((1, 10), (4, None)):
+        folder = write_run(tmp_path / f"r{count}", seeds=[0], task={**TASK, "measured": count})
+        lines = [
+            {"updates": i, "seed": 0, "levels": [{"picture": noise()} for _ in range(count)]}
+            for i in range(12)
+        ]
+        write_jsonl(folder / "curriculum.jsonl", lines)
+        (data,) = page_data(write_report([folder], tmp_path / f"o{count}", progress=False))
+        shown = data["stages"] and data["stages"]["methods"][0]["stages"]
+        assert (shown and len(shown)) == expected
+
+
+def test_a_page_over_its_limit_leaves_out_figures_that_are_charts(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [cost_curves, side_by_side])
+    whole = write_report([runs], tmp_path / "whole", progress=False).read_text(encoding="utf-8")
+    monkeypatch.setattr(page, "LARGEST", len(whole) - 1)
+    left = write_report([runs], tmp_path / "left", progress=False).read_text(encoding="utf-8")
+    assert (whole.count("<figure"), left.count("<figure")) == (2, 1)
+    assert (tmp_path / "left" / "figures" / "cost.svg").is_file()
