@@ -26,8 +26,8 @@ def test_only_extras_that_there_are_are_asked_for() -> None:
     asked = {name for source in sources for name in CALL.findall(source)}
     named = {name.strip("\"'") for name in asked if name[0] in "\"'"}
     assert named == {"alp-gmm", "launchers", "ray"}
-    # The others are the definition and the logger's, whose extra has its name.
-    assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type"}
+    # The others are the definition, the logger's, whose extra has its name, and a setting of tasks.
+    assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type", "extra"}
     assert named | {"tensorboard", "wandb"} <= EXTRAS.keys()
 
 

@@ -1,4 +1,4 @@
-"""What is asked of every task, of both that there are."""
+"""What is asked of every task, of all that there are."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from PIL import Image
 
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
+from tests.gymnasium_task.toys import walk_task
 from tests.tiny import mountain_cars, tiny_task
 
 K, P, C, E = 2, 4, 3, 5
 
 
-@pytest.fixture(params=[tiny_task, mountain_cars], ids=["mazes", "cars"])
+@pytest.fixture(params=[tiny_task, mountain_cars, walk_task], ids=["mazes", "cars", "walk"])
 def task(request: pytest.FixtureRequest) -> Task:
     make: Callable[[], Task] = request.param
     return make()

@@ -34,7 +34,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.checks import one_of, whole
-from proposer_rl.learning import PPO
+from proposer_rl.learning import PPO, succeeded
 from proposer_rl.learning.advantages import gae
 from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.streams import Streams
@@ -52,7 +52,7 @@ class Episodes(NamedTuple):
         weight: of every step, float64 [K, P, T]: 1 / (steps of its episode), so that those of an
             episode add up to 1; 0 for steps of an episode that does not end.
         ended: episodes of each level, int64 [K, P].
-        successes: those of them that ended in a terminal state, int64 [K, P].
+        successes: those of them that were a success, int64 [K, P].
         total: sum of their undiscounted returns, float64 [K, P].
         best: the highest of these, float64 [K, P]; minus infinity without episodes.
     """
@@ -67,7 +67,7 @@ class Episodes(NamedTuple):
 def episodes(rollout: TensorDictBase) -> Episodes:
     """Split a rollout [K, P, T] into its episodes."""
     after = rollout["next"]
-    done, terminated, reward = (after[key].squeeze(-1) for key in ("done", "terminated", "reward"))
+    done, reward = (after[key].squeeze(-1) for key in ("done", "reward"))
     ends, reward = done.long(), reward.double()
     count = ends.sum(-1)
     number = ends.cumsum(-1) - ends  # of the episode that a step belongs to
@@ -78,7 +78,7 @@ def episodes(rollout: TensorDictBase) -> Episodes:
     return Episodes(
         weight=(1 / steps.gather(-1, number)).where(number < count.unsqueeze(-1), 0.0),
         ended=count,
-        successes=(terminated & done).sum(-1),
+        successes=(succeeded(rollout) & done).sum(-1),
         total=returns.where(exists, 0.0).sum(-1),
         best=returns.where(exists, -torch.inf).amax(-1),
     )

@@ -8,6 +8,7 @@ from proposer_rl.learning.rollout import (
     RolloutPolicy,
     first_episode_return,
     first_episode_success,
+    succeeded,
 )
 from proposer_rl.learning.snapshot import load_agent
 
@@ -22,4 +23,5 @@ __all__ = [
     "first_episode_success",
     "load_agent",
     "located",
+    "succeeded",
 ]

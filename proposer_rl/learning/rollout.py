@@ -156,11 +156,21 @@ def first_episode_return(rollout: TensorDictBase) -> Tensor:
     return (rollout["next", "reward"].squeeze(-1) * _in_first_episode(rollout)).sum(-1)
 
 
+def succeeded(rollout: TensorDictBase) -> Tensor:
+    """Whether each step of a rollout [*B, T] ended an episode that is a success, bool [*B, T].
+
+    ``("next", "success")`` [*B, T, 1] tells it; without such an entry, success is termination.
+    """
+    after = rollout["next"]
+    return after.get("success", after["terminated"]).squeeze(-1)
+
+
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Whether the first episode of every environment terminated, rather than was truncated or cut.
+    """Whether the first episode of every environment was a success; not if the rollout cut it off.
 
     Args:
-        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "terminated")`` [*B, T, 1].
+        rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
+            reads.
 
     Returns:
         bool [*B].
@@ -174,7 +184,7 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
         >>> first_episode_success(rollout)  # the second one does not count
         tensor([False])
     """
-    return (rollout["next", "terminated"].squeeze(-1) & _in_first_episode(rollout)).any(-1)
+    return (succeeded(rollout) & _in_first_episode(rollout)).any(-1)
 
 
 def _in_first_episode(rollout: TensorDictBase) -> Tensor:

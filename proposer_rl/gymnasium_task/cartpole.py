@@ -1,0 +1,28 @@
+"""What a level sets in Gymnasium's CartPole beside plain attributes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def set_length(environment: Any, length: float) -> None:
+    """Set half the pole's length, in metres, and what CartPole computes from it once.
+
+    Args:
+        environment: ``CartPole-v1`` without wrappers.
+        length: half of the pole's.
+    """
+    environment.length = length
+    environment.polemass_length = environment.masspole * length
+
+
+def set_pole_mass(environment: Any, mass: float) -> None:
+    """Set the pole's mass, in kilograms, and what CartPole computes from it once.
+
+    Args:
+        environment: ``CartPole-v1`` without wrappers.
+        mass: of the pole.
+    """
+    environment.masspole = mass
+    environment.total_mass = mass + environment.masscart
+    environment.polemass_length = mass * environment.length
