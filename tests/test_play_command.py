@@ -16,7 +16,7 @@ import pytest
 
 from proposer_rl.cli import play
 from proposer_rl.extras import install_command
-from tests.play.conftest import trained
+from tests.play.pages import trained
 
 SMOKE = ("+method=target", "+scale=smoke", "compute.progress=false", "schedule.updates=2")
 

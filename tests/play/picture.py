@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import expect, sync_playwright
 
-from tests.play.conftest import served
+from tests.play.pages import served
 from tests.play.test_browser import CHROMIUM, OPTIONS
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from functools import partial
@@ -20,7 +21,7 @@ from proposer_rl.mazes.level_files import read_levels, shipped_levels
 from proposer_rl.mazes.levels import Level, planes
 from proposer_rl.models import cell_logits
 from tests.mazes.oracles import path_length
-from tests.play.conftest import Page
+from tests.play.pages import Page, served
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 OPTIONS = [
@@ -182,6 +183,22 @@ def test_the_slider_shows_every_checkpoint(tab: Tab, page: Page) -> None:
     expect(tab.locator("#updates")).to_have_text("3 of 3 · update 6")
 
 
+def test_checkpoints_that_are_gone_leave_the_slider(
+    context: BrowserContext, run: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    with served(copy) as page:
+        for tab in opened(context, page.address):
+            expect(tab.locator("#updates")).to_have_text("3 of 3 · update 6")
+            first = checkpoints(copy)[0]
+            first.rename(tmp_path / "gone")
+            slide(tab, 0)
+            expect(tab.locator("#updates")).to_have_text("2 of 2 · update 6")
+            expect(tab.locator("#status")).to_contain_text("After 6 updates")
+        (tmp_path / "gone").rename(first)
+
+
 def test_it_is_played_with_the_arrow_keys(tab: Tab) -> None:
     drag(tab, (1, 0), (1, 1))
     status = tab.locator("#status")
@@ -197,6 +214,10 @@ def test_it_is_played_with_the_arrow_keys(tab: Tab) -> None:
     expect(you).to_contain_text("yes90.91")
     expect(row_of(tab, "Shortest path")).to_contain_text("yes80.92")
     tab.keyboard.press("r")
+    tab.mouse.click(*place(tab, 0, 4))  # one move towards there
+    tab.mouse.click(*place(tab, 3, 2))
+    expect(you).to_contain_text("…2…")
+    tab.keyboard.press("r")
     for _ in range(17):
         tab.keyboard.press("ArrowLeft")
     expect(status).to_have_text("Out of steps: 16 are all there are.")
@@ -205,17 +226,17 @@ def test_it_is_played_with_the_arrow_keys(tab: Tab) -> None:
     expect(you).to_have_count(0)
 
 
-@pytest.mark.parametrize("kind", ["likely", "sampled"])
+@pytest.mark.parametrize("kind", ["greedy", "sampled"])
 def test_the_solver_is_watched(tab: Tab, kind: str) -> None:
     expect(tab.locator("#status")).to_contain_text("success")
     tab.locator("#episode").select_option(kind)
     tab.get_by_role("button", name="Watch the Solver").click()
     expect(tab.locator("#status")).to_contain_text("The Solver ")
-    reaches = "yes" in row_of(tab, "most probable").inner_text()
+    reaches = "yes" in row_of(tab, "greedy").inner_text()
     told = tab.locator("#status").inner_text()
-    if kind == "likely":
+    if kind == "greedy":
         assert ("reaches" in told) == reaches
-        moves = row_of(tab, "most probable").locator("td").nth(1).inner_text()
+        moves = row_of(tab, "greedy").locator("td").nth(1).inner_text()
         assert not reaches or f"in {moves} moves" in told
 
 
@@ -250,16 +271,26 @@ def test_levels_are_taken_from_the_run_a_set_and_a_file(
 
 
 def test_cars_are_shown_in_pictures(car_tab: Tab) -> None:
+    caption, updates = car_tab.locator("#caption"), car_tab.locator("#updates")
     expect(car_tab.locator("#editor")).to_be_hidden()
-    expect(car_tab.locator("#caption")).to_contain_text("gravity")
-    expect(car_tab.locator("#updates")).to_have_text("2 of 2 · update 4")
+    expect(updates).to_have_text("2 of 2 · update 4")
     car_tab.locator("#gallery button").nth(2).click()
-    expect(car_tab.locator("#caption")).to_contain_text("target_0_2 · gravity")
+    expect(caption).to_contain_text("target_0_2 · ")
+    expect(car_tab.locator("#lines")).to_have_text(re.compile(r"gravity 1\.00\s+power 0\.70"))
     assert car_tab.evaluate("document.getElementById('picture').naturalWidth") == 120
     slide(car_tab, 0)
-    expect(car_tab.locator("#updates")).to_have_text("1 of 2 · update 2")
-    expect(car_tab.locator("#caption")).to_contain_text("target_0_2 · gravity")
+    expect(updates).to_have_text("1 of 2 · update 2")
     expect(car_tab.locator("#found")).to_contain_text("update 2: mean")
+    expect(caption).to_contain_text("target_0_2 · ")
+    expect(car_tab.locator("#along .unknown")).to_have_count(0)
+    car_tab.get_by_label("Take levels from").select_option(label="update 4")
+    expect(car_tab.locator("#found")).to_have_text("update 4")
+    expect(caption).to_have_text("update_4_0")
+    expect(updates).to_have_text("1 of 2 · update 2")
+    car_tab.get_by_label("Take levels from").select_option(label="all")
+    car_tab.get_by_role("button", name="Go through all checkpoints").click()
+    expect(car_tab.locator("#along .unknown")).to_have_count(0)
+    expect(updates).to_have_text("2 of 2 · update 4")
 
 
 def test_it_fits_a_phone_and_everything_has_a_name(

@@ -24,7 +24,7 @@ from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.play.server import STATIC
 from proposer_rl.runs.folder import read_jsonl
 from proposer_rl.streams import Streams
-from tests.play.conftest import Page, served
+from tests.play.pages import Page, served
 
 ROWS = ["S....", ".##..", "....G", ".....", "#...."]
 # One for all: each would read the certificates of the machine anew.

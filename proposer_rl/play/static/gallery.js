@@ -1,12 +1,14 @@
-// Levels to choose from, as pictures.
+// Levels as pictures in a list.
+
+import { percent } from "./page.js";
 
 /** Fills a list with levels; chosen(level) is called with the one that is clicked. */
-export function fill(list, levels, isShown, chosen) {
+export function fill(list, levels, chosen) {
   const items = levels.map((level) => {
     const item = document.createElement("li");
     const button = document.createElement("button");
     button.type = "button";
-    button.setAttribute("aria-pressed", String(isShown(level)));
+    button.level = level;
     const name = document.createElement("span");
     name.textContent = level.name;
     button.append(picture(level), name);
@@ -15,16 +17,18 @@ export function fill(list, levels, isShown, chosen) {
       note.textContent = summary(level.results);
       button.append(note);
     }
-    button.addEventListener("click", () => {
-      for (const other of list.querySelectorAll("button")) {
-        other.setAttribute("aria-pressed", String(other === button));
-      }
-      chosen(level);
-    });
+    button.addEventListener("click", () => chosen(level));
     item.append(button);
     return item;
   });
   list.replaceChildren(...items);
+}
+
+/** Marks those of a list's levels that are shown. */
+export function mark(list, isShown) {
+  for (const button of list.querySelectorAll("button")) {
+    button.setAttribute("aria-pressed", String(isShown(button.level)));
+  }
 }
 
 /** What a Solver reached on a level, in a word. */
@@ -33,19 +37,13 @@ export function summary(results) {
   return `return ${results.return.toFixed(2)}`;
 }
 
-export function percent(share) {
-  return `${(100 * share).toFixed(share > 0.9995 || share < 0.0005 ? 0 : 1)} %`;
-}
-
-/** The mean of what was reached, in a sentence; nothing where nothing is known. */
-export function mean(levels) {
+/** The means of what was reached on levels, by name; null where nothing is known. */
+export function means(levels) {
   const known = levels.filter(hasResults);
-  if (!known.length) return "";
-  const names = Object.keys(known[0].results);
-  const means = Object.fromEntries(names.map((name) => [
+  if (!known.length) return null;
+  return Object.fromEntries(Object.keys(known[0].results).map((name) => [
     name, known.reduce((sum, level) => sum + level.results[name], 0) / known.length,
   ]));
-  return `mean ${summary(means)} over ${known.length}`;
 }
 
 export function picture(level) {
