@@ -232,3 +232,96 @@ class ScoringTask(Protocol):
             ValueError: if there is no such set, or its levels are none for these Solvers.
             StorageError: if a file cannot be read.
         """
+
+
+class CellKind(NamedTuple):
+    """What a cell of a drawing can be.
+
+    Attributes:
+        mark: its character.
+        name: what it is called, one word.
+        once: whether a drawing has exactly one of it.
+    """
+
+    mark: str
+    name: str
+    once: bool = False
+
+
+class Board(Protocol):
+    """Levels as drawings with one character per cell, and all that a Solver does on one.
+
+    Attributes:
+        kinds: of cells, the empty one first.
+        size: rows and columns of the run's own levels.
+        actions: what each action is called: up, down, left and right, in any order.
+        sets: names of the sets of levels that come along.
+    """
+
+    kinds: Sequence[CellKind]
+    size: tuple[int, int]
+    actions: Sequence[str]
+    sets: Sequence[str]
+
+    def read(self, rows: Sequence[str]) -> Levels:
+        """The level [] that is drawn.
+
+        Raises:
+            ValueError: if it is none, or none for the Solvers of this task.
+        """
+
+    def draw(self, level: Levels) -> list[str]:
+        """The drawing of a level [], one text for each row; the inverse of :meth:`read`."""
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """The drawing of the level in one of the task's records (:meth:`Task.record`)."""
+
+    def level_set(self, name: str) -> Mapping[str, Levels]:
+        """The levels [] of one of the sets, by their names."""
+
+    def read_file(self, text: str) -> Mapping[str, Levels]:
+        """The levels [] in the text of a file, by their names.
+
+        Raises:
+            ValueError: if it is no such text.
+        """
+
+    def write_file(self, name: str, level: Levels) -> str:
+        """The text of a file with one level [].
+
+        Raises:
+            ValueError: if the name or the level cannot stand in a file.
+        """
+
+    def examine(
+        self, agent: ActorCritic, solver: int, level: Levels, max_steps: int | None
+    ) -> dict[str, Any]:
+        """What one of K Solvers does on a level [] with H x W cells, for JSON.
+
+        - ``results``: numbers by name, ``success`` and ``return`` of the sampled policy among them;
+        - ``policy``: for every cell the probability of each action; None where there is none to
+          take: [H][W][A];
+        - ``maps``: further numbers of every cell by what they are, [H][W], None where there is
+          none;
+        - ``paths``: ``solver``, the cells (row, column) of the most probable actions, and
+          ``shortest``, or None where there is no path;
+        - ``next``: where each action leads from each cell, [A][H * W], cells counted row by row;
+        - ``goal``: the cell (row, column) that ends an episode with success;
+        - ``max_steps``, ``step_penalty``: the rules.
+
+        Args:
+            agent: K Solvers.
+            solver: which of them.
+            level: as :meth:`read` gives it.
+            max_steps: step limit; None for the task's choice.
+
+        Raises:
+            ValueError: if what the Solver answers is no policy.
+        """
+
+
+@runtime_checkable
+class PlayableTask(Protocol):
+    """A task whose levels can be drawn by hand, and played in ``bin/play``."""
+
+    board: Board

@@ -25,7 +25,7 @@ def test_only_extras_that_there_are_are_asked_for() -> None:
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "proposer_rl").rglob("*.py")]
     asked = {name for source in sources for name in CALL.findall(source)}
     named = {name.strip("\"'") for name in asked if name[0] in "\"'"}
-    assert named == {"alp-gmm", "launchers", "ray"}
+    assert named == {"alp-gmm", "launchers", "play", "ray"}
     # The others are the definition, the logger's, whose extra has its name, and a setting of tasks.
     assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type", "extra"}
     assert named | {"tensorboard", "wandb"} <= EXTRAS.keys()

@@ -13,8 +13,8 @@ PACKAGE = "proposer_rl"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # Only the command line composes configurations; everything else takes plain arguments. What is
-# read back from a run's folder is checked with pydantic, too.
-CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"cli", "report"}}
+# read back from a run's folder is checked with pydantic, too, and what a browser asks.
+CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"cli", "play", "report"}}
 # What reads runs must start at once.
 HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")

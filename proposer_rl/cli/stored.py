@@ -12,7 +12,13 @@ from tensordict import TensorDict
 
 from proposer_rl.cli.config import ConfigError, RunConfig
 from proposer_rl.learning import PPO
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
+from proposer_rl.runs.checkpoint import (
+    CheckpointError,
+    State,
+    checkpoint_files,
+    load_checkpoint,
+    load_latest,
+)
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -24,7 +30,7 @@ def checkpoints(folder: Path) -> list[Path]:
     Raises:
         ConfigError: if there are none.
     """
-    files = sorted((folder / "checkpoints").glob("step_*.pt"))
+    files = [file for _, file in checkpoint_files(folder / "checkpoints")]
     if not files:
         raise ConfigError(f"{folder}: holds no checkpoints; give the folders of runs")
     return files

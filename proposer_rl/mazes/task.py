@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from proposer_rl.learning import PPO, first_episode_success
+from proposer_rl.mazes.board import MazeBoard
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.edits import edit_levels
@@ -128,6 +129,7 @@ class MazeTask:
             f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
             f"or a distribution: {', '.join(distributions)}"
         )
+        self.board = MazeBoard(maze, self._check_size, self._limit, self.device)
         self.exact_performance = evaluation.evaluator == "exact"
         self._measured_on = {
             name: self.evaluation_levels(name) for name in evaluation.distributions
@@ -293,22 +295,29 @@ class MazeTask:
         measurements; other levels at least twice the shortest path.
         """
         levels, slack = self._named_levels(name)
-        least = 2 ** (len(self._network.channels) - 1)
-        for level, grid in levels.items():
-            height, width = grid.walls.shape
-            if min(height, width) < least:
-                raise ValueError(
-                    f"level {level!r}: its {height}x{width} cells are halved to nothing by this "
-                    f"Solver; it sees levels of {least}x{least} cells and more"
-                )
-        limit = self.maze.max_steps
+        for named in levels.items():
+            self._check_size(*named)
         return score_levels(
             agent,
             levels,
-            lambda length: max_steps or max(limit, slack * length),
+            lambda length: max_steps or self._limit(length, slack),
             self.maze.step_penalty,
             self.device,
         )
+
+    def _check_size(self, name: str, level: Level) -> None:
+        """Refuse a level that the Solver's network cannot see."""
+        least = 2 ** (len(self._network.channels) - 1)
+        height, width = level.walls.shape
+        if min(height, width) < least:
+            raise ValueError(
+                f"level {name!r}: its {height}x{width} cells are halved to nothing by this "
+                f"Solver; it sees levels of {least}x{least} cells and more"
+            )
+
+    def _limit(self, length: int, slack: int = SLACK) -> int:
+        """The step limit of a level, given the length of its shortest path."""
+        return max(self.maze.max_steps, slack * length)
 
     def _named_levels(self, name: str) -> tuple[dict[str, Level], int]:
         """Levels, and the steps that they allow for each move of the shortest path."""

@@ -8,7 +8,7 @@ from proposer_rl.models.actor_critic import (
     normal,
     uniform_noise,
 )
-from proposer_rl.models.maps import cell_logits, map_actor_critic, read_maps
+from proposer_rl.models.maps import cell_logits, cell_maps, map_actor_critic, read_maps
 from proposer_rl.models.population import Population, available_cores
 from proposer_rl.models.proposer import (
     MapEncoder,
@@ -31,6 +31,7 @@ __all__ = [
     "available_cores",
     "categorical",
     "cell_logits",
+    "cell_maps",
     "draw",
     "fourier_encoding",
     "joint_categorical",

@@ -79,19 +79,35 @@ def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) 
     Returns:
         float [*B, A, H, W].
     """
+    return cell_maps(agent, planes, gradients=gradients)[0]
+
+
+def cell_maps(
+    agent: ActorCritic, planes: Tensor, *, gradients: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Action logits and values at every cell of levels; the arguments are :func:`cell_logits`'.
+
+    Returns:
+        Logits float [*B, A, H, W] and the critic's values float [*B, 1, H, W].
+    """
     batch, (height, width) = planes.shape[:-3], planes.shape[-2:]
     with torch.set_grad_enabled(gradients):
         if agent.encoder is not None:
             (planes_key,) = agent.level_keys
-            return agent.encode(TensorDict({planes_key: planes}, batch))["policy_map"]
+            context = agent.encode(TensorDict({planes_key: planes}, batch))
+            return context["policy_map"], context["value_map"]
         planes_key, agent_key = agent.step_keys
-        logits = []
+        outputs = []
         rows, columns = (torch.arange(side, device=planes.device) for side in (height, width))
         for cell, position in enumerate(torch.cartesian_prod(rows, columns)):
             row, column = divmod(cell, width)
             drawn = torch.zeros_like(planes[..., :1, :, :])
             drawn[..., row, column].fill_(1.0)
             shown, at = torch.cat([planes, drawn], -3), position.expand(*batch, 2)
-            step = TensorDict({planes_key: shown, agent_key: at}, batch)
-            logits.append(agent(step)["logits"])
-        return torch.stack(logits, -1).unflatten(-1, (height, width))
+            output = agent(TensorDict({planes_key: shown, agent_key: at}, batch))
+            outputs.append((output["logits"], output["state_value"]))
+        logits, values = (
+            torch.stack(each, -1).unflatten(-1, (height, width))
+            for each in zip(*outputs, strict=True)
+        )
+        return logits, values

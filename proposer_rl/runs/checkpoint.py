@@ -71,7 +71,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
     payload = io.BytesIO()
     torch.save(_plain(state, "state"), payload)
     body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()
-    later = [old for number, old in _files(folder) if number > step]
+    later = [old for number, old in checkpoint_files(folder) if number > step]
     for old in later:  # all of them damaged, or else this run is not theirs
         with suppress(_DamagedError):
             _verified(old)
@@ -86,9 +86,15 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
     with storage(folder):
         for old in later:
             old.unlink()
-        for _, old in _files(folder)[:-keep]:
+        for _, old in checkpoint_files(folder)[:-keep]:
             old.unlink()
     return path
+
+
+def checkpoint_files(folder: Path) -> list[tuple[int, Path]]:
+    """Returns the steps and files of the checkpoints in a folder, oldest step first."""
+    matches = [(_FILE_NAME.fullmatch(path.name), path) for path in folder.glob("step_*.pt")]
+    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
@@ -102,7 +108,7 @@ def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
             was written by another version or holds more than plain data.
         StorageError: if one cannot be read.
     """
-    files = _files(Path(folder))
+    files = checkpoint_files(Path(folder))
     for _, path in reversed(files):
         try:
             return load_checkpoint(path)
@@ -176,9 +182,3 @@ def _verified(path: Path) -> tuple[int, int, bytes]:
         return int(header["format"]), int(header["step"]), payload
     except (ValueError, KeyError, TypeError, RecursionError):
         raise CheckpointError(f"{path} is not a checkpoint of proposer_rl") from None
-
-
-def _files(folder: Path) -> list[tuple[int, Path]]:
-    """Returns the steps and files of the checkpoints in a folder, oldest step first."""
-    matches = [(_FILE_NAME.fullmatch(path.name), path) for path in folder.glob("step_*.pt")]
-    return sorted((int(match[1]), path) for match, path in matches if match)

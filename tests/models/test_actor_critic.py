@@ -15,6 +15,7 @@ from proposer_rl.models import (
     UNet,
     categorical,
     cell_logits,
+    cell_maps,
     draw,
     joint_categorical,
     map_actor_critic,
@@ -78,10 +79,11 @@ def test_read_maps_indexes_the_agents_cell(extra: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("per_step", [False, True])
-def test_cell_logits_are_what_the_solver_says_at_each_cell(per_step: bool) -> None:
+def test_cell_maps_are_what_the_solver_says_at_each_cell(per_step: bool) -> None:
     agent = solver(per_step)
     planes = torch.rand(K, P, 3, H, W)
-    logits = cell_logits(agent, planes)
+    logits, values = cell_maps(agent, planes)
+    assert torch.equal(cell_logits(agent, planes), logits) and values.shape == (K, P, 1, H, W)
     for row, column in [(0, 0), (2, 5), (H - 1, W - 1)]:
         shown = planes
         if per_step:
@@ -90,7 +92,8 @@ def test_cell_logits_are_what_the_solver_says_at_each_cell(per_step: bool) -> No
             shown = torch.cat([planes, drawn], 2)
         at = torch.tensor([row, column]).expand(K, P, 2)
         step = agent(TensorDict({"planes": shown, "agent": at}, [K, P]))
-        torch.testing.assert_close(logits[..., row, column], step["logits"], rtol=1e-4, atol=1e-5)
+        for maps, key in ((logits, "logits"), (values, "state_value")):
+            torch.testing.assert_close(maps[..., row, column], step[key], rtol=1e-4, atol=1e-5)
 
 
 @given(

@@ -1,0 +1,108 @@
+"""``bin/play`` and ``proposer-play``: draw levels in a browser, and see what a run's Solvers do."""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import webbrowser
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from proposer_rl.cli.build import make_task
+from proposer_rl.cli.config import ConfigError, saved_config
+from proposer_rl.cli.errors import command
+from proposer_rl.cli.outcome import run_name
+from proposer_rl.cli.stored import checkpoints, restored
+from proposer_rl.extras import install_command
+from proposer_rl.learning import PPO
+from proposer_rl.runs.checkpoint import load_checkpoint
+
+if TYPE_CHECKING:
+    from proposer_rl.play.session import Session
+
+EPILOG = """\
+examples:
+  bin/play my_run                  prints the page's address
+  bin/play my_run --open           opens it, too
+  bin/play my_run --port 8123      a port that stays, for a tunnel or a bookmark
+
+The page is for a browser on this machine alone; docs/play.md says how to reach it from another."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; Ctrl-C ends it well, else the exit codes are those of ``cli/errors.py``."""
+    command(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> None:
+    missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"bin/play needs {' and '.join(missing)}; install with: {install_command('play')}"
+        )
+    from proposer_rl.play.server import application, listen, server
+
+    session = open_session(options.run)
+    token = secrets.token_urlsafe()
+    try:
+        listening = listen(options.port)
+    except OSError as error:
+        raise ConfigError(f"--port {options.port}: {error.strerror}") from error
+    with listening, suppress(KeyboardInterrupt):
+        address = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
+        print(f"Open {address} in a browser on this machine; Ctrl-C ends it.", flush=True)
+        if options.open:
+            webbrowser.open(address)
+        server(application(session, token)).run(sockets=[listening])
+    print("Ended.")
+
+
+def open_session(folder: Path) -> Session:
+    """What there is to see of the run in a folder.
+
+    Raises:
+        ConfigError: if it is no run's, or holds no checkpoints.
+    """
+    from proposer_rl.play.session import Session
+
+    config = saved_config(folder)
+    checkpoints(folder)
+    task = make_task(config)
+
+    def load(file: Path) -> tuple[int, PPO]:
+        state = load_checkpoint(file)[1]
+        learner = restored(task, config, state)
+        return int(state["updates"]), learner
+
+    return Session(folder=folder, title=run_name(config), task=task, seeds=config.seeds, load=load)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bin/play",
+        description="Open a run on a local page: draw levels, or take some of the run, and see "
+        "what the Solver of any checkpoint does there; play them yourself.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run's folder")
+    parser.add_argument(
+        "--port", type=_port, default=0, help="on which the page is served (default: a free one)"
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    return parser
+
+
+def _port(text: str) -> int:
+    number = int(text)
+    if not 0 <= number < 2**16:
+        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {number}")
+    return number
+
+
+if __name__ == "__main__":
+    main()

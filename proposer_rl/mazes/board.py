@@ -1,0 +1,184 @@
+"""Mazes drawn by hand, and all that a Solver does there: what ``bin/play`` shows of mazes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from proposer_rl.mazes.dynamics import successors
+from proposer_rl.mazes.evaluation import ExactEvaluator, policy_path
+from proposer_rl.mazes.level_files import (
+    levels_from_text,
+    levels_to_text,
+    shipped_levels,
+    shipped_sets,
+)
+from proposer_rl.mazes.levels import FREE, GOAL, START, WALL, Level, cell_index, planes
+from proposer_rl.mazes.occupancy import expected_visits, success_from_cells
+from proposer_rl.mazes.settings import MazeSettings
+from proposer_rl.models import ActorCritic, cell_maps
+from proposer_rl.task import CellKind
+
+DIGITS = 4  # of the numbers of a map: what can be seen
+
+
+class MazeBoard:
+    """Mazes as drawings; a :class:`~proposer_rl.task.Board`.
+
+    Args:
+        maze: the inner environment.
+        check: refuses a level that the Solver's network cannot see, given its name.
+        max_steps: the step limit of a level, given the length of its shortest path.
+        device: that of the Solvers.
+    """
+
+    kinds = (
+        CellKind(FREE, "free"),
+        CellKind(WALL, "wall"),
+        CellKind(START, "start", once=True),
+        CellKind(GOAL, "goal", once=True),
+    )
+    actions = ("up", "down", "left", "right")
+
+    def __init__(
+        self,
+        maze: MazeSettings,
+        check: Callable[[str, Level], None],
+        max_steps: Callable[[int], int],
+        device: torch.device,
+    ) -> None:
+        self.size = (maze.height, maze.width)
+        self.sets = shipped_sets()
+        self._step_penalty = maze.step_penalty
+        self._check = check
+        self._max_steps = max_steps
+        self._device = device
+
+    def read(self, rows: Sequence[str]) -> Level:
+        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        # The message of a drawing shows it; here it was seen already.
+        try:
+            level = Level.from_text("\n".join(rows))
+        except ValueError as error:
+            raise ValueError(str(error).partition(", got")[0]) from error
+        self._check("drawn", level)
+        return level
+
+    def draw(self, level: Level) -> list[str]:
+        """The rows of a level's drawing."""
+        return str(level.to_text()).splitlines()
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """The drawing in a record, whose text has spaces, and dots where an episode went."""
+        return [line.replace(" ", "").replace("•", FREE) for line in record["text"]]
+
+    def level_set(self, name: str) -> Mapping[str, Level]:
+        """The levels of a set that comes along."""
+        return shipped_levels(name)
+
+    def read_file(self, text: str) -> Mapping[str, Level]:
+        """The levels of a file's text; docs/levels.md has the format."""
+        return levels_from_text(text)
+
+    def write_file(self, name: str, level: Level) -> str:
+        """A file's text; docs/levels.md has the format."""
+        return levels_to_text({name: level})
+
+    @torch.no_grad()
+    def examine(
+        self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
+    ) -> dict[str, Any]:
+        """What a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
+
+        ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
+        ``maps``: the critic's values; the probability of success from every cell with the whole
+        step limit; how often a step of an episode begins there.
+        """
+        shortest = shortest_path(level)
+        limit = max_steps or self._max_steps(0 if shortest is None else len(shortest) - 1)
+        level = level.to(self._device)
+        copies = planes(level.expand(agent.copies, 1))
+        logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
+        logits, values = logits.float(), values[0].float()
+        if not (logits.isfinite().all() and values.isfinite().all()):
+            raise ValueError("the Solver of this checkpoint answers with numbers without an end")
+        policy = logits.softmax(0)
+        visits = expected_visits(level, policy, limit)
+        results = ExactEvaluator(limit, self._step_penalty)(level, logits)
+        goal = _cells(level.goal, level.walls)
+        maps = {
+            "critic's value": (values, level.walls | goal),
+            "success from here": (success_from_cells(level, policy, limit), level.walls),
+            "expected visits": (visits, level.walls),
+        }
+        path = policy_path(level, logits, limit).tolist()
+        return {
+            "results": {
+                "success": float(results["success"]),
+                "return": float(results["return"]),
+                "steps": float(visits.sum()),
+            },
+            "policy": _numbers(policy, level.walls | goal),
+            "maps": {name: _numbers(*values) for name, values in maps.items()},
+            "paths": {"solver": _until_it_ends(path, level.goal.tolist()), "shortest": shortest},
+            "next": successors(level).tolist(),
+            "goal": level.goal.tolist(),
+            "max_steps": limit,
+            "step_penalty": self._step_penalty,
+        }
+
+
+def shortest_path(level: Level) -> list[list[int]] | None:
+    """A shortest path of a level ``[]``: its cells (row, column), start and goal included.
+
+    Returns:
+        Of several the one whose moves come first in :data:`~proposer_rl.mazes.dynamics.MOVES`,
+        seen from the goal; None where there is no path.
+    """
+    width = level.walls.shape[1]
+    following = successors(level).T.tolist()  # [H*W][4]
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    # Backwards: moves can be undone, so that the way back is a way there.
+    towards, waiting = {goal: goal}, deque([goal])
+    while waiting and start not in towards:
+        cell = waiting.popleft()
+        for neighbour in following[cell]:
+            if neighbour not in towards:
+                towards[neighbour] = cell
+                waiting.append(neighbour)
+    if start not in towards:
+        return None
+    path = [start]
+    while path[-1] != goal:
+        path.append(towards[path[-1]])
+    return [list(divmod(cell, width)) for cell in path]
+
+
+def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
+    """A path up to the goal, or to the first cell that is entered again: it circles from there."""
+    seen: set[tuple[int, ...]] = set()
+    for length, cell in enumerate(path, 1):
+        if cell == goal or tuple(cell) in seen:
+            return path[:length]
+        seen.add(tuple(cell))
+    return path
+
+
+def _cells(cell: Tensor, walls: Tensor) -> Tensor:
+    """Bool ``[H, W]``, True at one cell."""
+    marked = torch.zeros_like(walls)
+    marked[tuple(cell.tolist())] = True
+    return marked
+
+
+def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:
+    """Values ``[*A, H, W]`` as lists [H][W][*A]; None where ``without``, bool ``[H, W]``, is."""
+    rows = values.movedim((-2, -1), (0, 1)).double().round(decimals=DIGITS).tolist()
+    return [
+        [None if left_out else value for value, left_out in zip(row, line, strict=True)]
+        for row, line in zip(rows, without.tolist(), strict=True)
+    ]

@@ -1,0 +1,181 @@
+"""The page's server: what a browser on this machine may ask, and nothing else.
+
+Other pages in the same browser are strangers: they do not know the token in the address, may not
+read answers of another origin, and cannot pretend to be this host. Nothing is written, and no file
+is read but those of the page, which are in memory, and the run's.
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from proposer_rl.play.requests import LARGEST_BODY, Examine, Source, Write, parsed
+from proposer_rl.play.session import Session
+from proposer_rl.report.records import printable
+
+HOSTS = ["127.0.0.1", "localhost"]
+CONNECTIONS = 256  # at once; more are told to come back later
+STATIC = Path(__file__).parent / "static"
+TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+# Scripts, styles and connections of this server alone; pictures also as data, as records have them.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+def application(session: Session, token: str) -> Starlette:
+    """The page and what it asks, all below ``/TOKEN/``.
+
+    Args:
+        session: the run that is looked at.
+        token: the secret part of the address.
+    """
+    asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+        "examine": (Examine, session.examine),
+        "levels": (Source, session.levels),
+        "file": (Write, session.write),
+    }
+    routes = [
+        *(
+            Route(f"/{'' if file.name == 'play.html' else file.name}", _file(file))
+            for file in STATIC.iterdir()
+            if file.suffix in TYPES
+        ),
+        Route("/api/run", partial(_told, session.about)),
+        *(
+            Route(f"/api/{name}", partial(_answered, *question), methods=["POST"])
+            for name, question in asked.items()
+        ),
+    ]
+    guards = [
+        Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS),
+        Middleware(Guard, token=token),
+    ]
+    return Starlette(routes=[Mount("/{token}", routes=routes)], middleware=guards)
+
+
+class Guard:
+    """Lets through what comes from this server's own page, and says how browsers treat answers.
+
+    Args:
+        app: what is guarded.
+        token: that the address must begin with.
+    """
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app, self._token = app, token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        app = self._app
+        if scope["type"] == "http" and (reason := self._refused(Request(scope))):
+            app = PlainTextResponse(reason, status_code=403)
+        await app(scope, receive, send_guarded)
+
+    def _refused(self, request: Request) -> str | None:
+        given = request.url.path.split("/")[1]
+        if not secrets.compare_digest(given.encode(), self._token):
+            return "The address is not complete: take the one that bin/play printed."
+        origin = request.headers.get("origin")
+        if origin not in (None, f"http://{request.headers['host']}"):
+            return "Another page may not ask."
+        return None
+
+
+def listen(port: int) -> socket.socket:
+    """A socket on the loopback address.
+
+    Args:
+        port: its port; 0 for a free one.
+
+    Raises:
+        OSError: if it cannot be had.
+    """
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((HOSTS[0], port))
+        listening.listen()
+    except OSError:
+        listening.close()
+        raise
+    return listening
+
+
+def server(app: Starlette) -> uvicorn.Server:
+    """What answers: ``run(sockets=[listen(0)])`` it, until a signal comes."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_level="warning",  # no addresses with tokens in the terminal
+            server_header=False,
+            ws="none",
+            lifespan="off",
+            limit_concurrency=CONNECTIONS,
+            timeout_graceful_shutdown=2,
+        )
+    )
+
+
+def _file(file: Path) -> Callable[[Request], Awaitable[Response]]:
+    content, kind = file.read_bytes(), TYPES[file.suffix]
+
+    async def answer(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return answer
+
+
+async def _told(function: Callable[[], Any], _: Request) -> Response:
+    return await _result(function)
+
+
+async def _answered(kind: Any, function: Callable[[Any], Any], request: Request) -> Response:
+    if request.headers.get("content-type") != "application/json":
+        return JSONResponse({"error": "must be application/json"}, status_code=415)
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_BODY:
+            error = f"at most {LARGEST_BODY:,} bytes are read"
+            return JSONResponse({"error": error}, status_code=413, headers={"Connection": "close"})
+    return await _result(lambda: function(parsed(kind, bytes(body))))
+
+
+async def _result(function: Callable[[], Any]) -> Response:
+    """What a function returns, as JSON; or in one line why it does not."""
+    try:
+        return JSONResponse(await run_in_threadpool(function))
+    except (ValueError, OSError) as error:
+        return JSONResponse({"error": printable(str(error))}, status_code=400)

@@ -1,0 +1,223 @@
+"""What there is to see of one run: its levels, and its Solvers on levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import torch
+
+from proposer_rl.learning import PPO
+from proposer_rl.play.requests import (
+    LARGEST_SIDE,
+    MOST_STEPS,
+    Drawn,
+    Examine,
+    OfCurriculum,
+    OfFile,
+    OfSet,
+    Write,
+)
+from proposer_rl.report.records import SampleRecord, checked
+from proposer_rl.runs.checkpoint import checkpoint_files
+from proposer_rl.runs.folder import read_jsonl
+from proposer_rl.streams import Streams
+from proposer_rl.task import Board, Levels, PlayableTask, Task
+
+SHOWN = 12  # levels of a draw
+MOST_LEVELS = 200  # of a file
+KEPT = 4  # checkpoints in memory
+
+Load = Callable[[Path], tuple[int, PPO]]
+
+
+class Session:
+    """A run that is looked at; nothing in its folder is changed.
+
+    One thread at a time computes; the others wait.
+
+    Args:
+        folder: the run's.
+        title: what the run is, in a few words.
+        task: the run's.
+        seeds: of its Solvers, in their order.
+        load: the updates made at a checkpoint, and PPO of the Solvers in it.
+    """
+
+    def __init__(
+        self, *, folder: Path, title: str, task: Task, seeds: Sequence[int], load: Load
+    ) -> None:
+        self._folder, self._title, self._task, self._seeds = folder, title, task, seeds
+        # By the file's time, too: a run that is resumed may write a checkpoint anew.
+        self._load = lru_cache(KEPT)(lambda file, _written: load(file))
+        self._lock = Lock()
+        self._board = task.board if isinstance(task, PlayableTask) else None
+        facts = task.facts
+        self._facts = {key: facts[key] for key in ("title", "levels", "key")}
+
+    def about(self) -> dict[str, Any]:
+        """The run as it is now: what can be asked for, for JSON."""
+        board = self._board
+        return {
+            "title": self._title,
+            **{f"task_{key}": value for key, value in self._facts.items()},
+            "checkpoints": list(self._checkpoints()),
+            "seeds": list(self._seeds),
+            "distributions": list(self._task.distributions),
+            "curriculum": [
+                {"updates": sample.updates, "seed": sample.seed} for sample in self._samples()
+            ],
+            "board": board
+            and {
+                "kinds": [kind._asdict() for kind in board.kinds],
+                "size": board.size,
+                "actions": board.actions,
+                "sets": board.sets,
+                "largest": LARGEST_SIDE,
+                "most_steps": MOST_STEPS,
+            },
+        }
+
+    def examine(self, question: Examine) -> dict[str, Any]:
+        """What a Solver does on a drawing; see :meth:`~proposer_rl.task.Board.examine`.
+
+        Raises:
+            ValueError: if there is no such Solver, or the drawing is no level.
+            StorageError: if a checkpoint cannot be read.
+        """
+        board = self._require_board()
+        level = board.read(question.rows)
+        with self._lock, torch.no_grad():
+            updates, learner = self._learner(question.checkpoint, question.solver)
+            found = board.examine(learner.agent, question.solver, level, question.max_steps)
+        return {"updates": updates, **found}
+
+    def levels(self, question: Drawn | OfSet | OfCurriculum | OfFile) -> dict[str, Any]:
+        """Levels to choose from: pictures, with drawings where the task has a board.
+
+        Raises:
+            ValueError: if there are no such levels.
+            StorageError: if the run's files cannot be read.
+        """
+        with self._lock:
+            if isinstance(question, Drawn):
+                return self._drawn(question)
+            if isinstance(question, OfCurriculum):
+                return self._trained_on(question.row)
+            if isinstance(question, OfFile):
+                return self._named(self._require_board().read_file(question.text))
+            if question.name not in self._require_board().sets:
+                raise ValueError(f"there is no set {question.name!r}")
+            return self._named(self._require_board().level_set(question.name))
+
+    def write(self, question: Write) -> dict[str, Any]:
+        """The text of a file with a drawing.
+
+        Raises:
+            ValueError: if it cannot stand in a file.
+        """
+        board = self._require_board()
+        return {"text": board.write_file(question.name, board.read(question.rows))}
+
+    def _require_board(self) -> Board:
+        if self._board is None:
+            raise ValueError(f"{self._facts['levels']} cannot be drawn")
+        return self._board
+
+    def _checkpoints(self) -> dict[int, Path]:
+        return dict(checkpoint_files(self._folder / "checkpoints"))
+
+    def _samples(self) -> list[SampleRecord]:
+        file = self._folder / "curriculum.jsonl"
+        recorded = read_jsonl(file) if file.is_file() else []
+        return checked(list[SampleRecord], recorded, file.name)
+
+    def _learner(self, checkpoint: int, solver: int) -> tuple[int, PPO]:
+        files = self._checkpoints()
+        if checkpoint not in files:
+            raise ValueError(f"there is no checkpoint {checkpoint}; there are {list(files)}")
+        if solver >= len(self._seeds):
+            raise ValueError(f"there is no Solver {solver}; there are {len(self._seeds)}")
+        file = files[checkpoint]
+        return self._load(file, file.stat().st_mtime_ns)
+
+    def _drawn(self, question: Drawn) -> dict[str, Any]:
+        """Draws of a distribution, what the Solver does there, and the episode that it played."""
+        if question.name not in self._task.distributions:
+            raise ValueError(f"there is no distribution {question.name!r}")
+        updates, learner = self._learner(question.checkpoint, question.solver)
+        copies, batch = learner.env.batch_size
+        streams = Streams(question.seed, "play", question.name)
+        distribution = self._task.distributions[question.name]
+        levels = distribution.sample(batch, streams.generator("levels"))
+        learner.env.set_levels(levels.expand(copies, batch))
+        device = learner.env.device
+        actions = [streams.generator("actions", k, device=device) for k in range(copies)]
+        some, solver = slice(SHOWN), question.solver
+        with torch.no_grad():
+            rollout = learner.collect(actions)[solver, some]
+            generator = streams.generator("performance", device=device)
+            reached = self._task.performance(learner.agent, levels[some], generator)[solver].cpu()
+        records = self._task.record(levels[some], rollout)
+        return {
+            "updates": updates,
+            "levels": [
+                self._shown(
+                    f"{question.name}_{question.seed}_{number}",
+                    record,
+                    self._drawing(level),
+                    {str(key): float(value) for key, value in reached[number].items()},
+                )
+                for number, (record, level) in enumerate(zip(records, levels[some], strict=True))
+            ],
+        }
+
+    def _trained_on(self, row: int) -> dict[str, Any]:
+        samples = self._samples()
+        if row >= len(samples):
+            raise ValueError(f"there is no row {row} in curriculum.jsonl")
+        sample = samples[row]
+        shown = []
+        for number, level in enumerate(sample.levels):
+            record, rows = level.model_dump(), None
+            if self._board is not None:  # read, since the file may hold anything
+                rows = self._drawing(self._board.read(self._board.drawing(record)))
+            shown.append(self._shown(f"update_{sample.updates}_{number}", record, rows))
+        return {"updates": sample.updates, "levels": shown}
+
+    def _named(self, levels: Mapping[str, Levels]) -> dict[str, Any]:
+        if len(levels) > MOST_LEVELS:
+            raise ValueError(f"at most {MOST_LEVELS} levels of a file are shown")
+        drawings = {name: self._drawing(level) for name, level in levels.items()}
+        return {
+            "levels": [
+                self._shown(name, self._task.record(level.unsqueeze(0), None)[0], drawings[name])
+                for name, level in levels.items()
+            ]
+        }
+
+    def _drawing(self, level: Levels) -> list[str] | None:
+        if self._board is None:
+            return None
+        rows = self._board.draw(level)
+        if len(rows) > LARGEST_SIDE or len(rows[0]) > LARGEST_SIDE:
+            raise ValueError(f"levels of more than {LARGEST_SIDE} cells on a side are not shown")
+        return rows
+
+    def _shown(
+        self,
+        name: str,
+        record: Mapping[str, Any],
+        rows: list[str] | None,
+        results: Mapping[str, float] | None = None,
+    ) -> dict[str, Any]:
+        return {
+            "name": name,
+            "picture": record["picture"],
+            "text": record.get("text", []) if rows is None else [],
+            "rows": rows,
+            "results": dict(results or {}),
+        }

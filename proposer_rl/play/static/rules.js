@@ -1,0 +1,31 @@
+// Where moves lead, as the task has told of the level: the page knows no rules of its own.
+
+import { state } from "./page.js";
+
+const same = ([row, column], [otherRow, otherColumn]) => row === otherRow && column === otherColumn;
+
+/** The cell that an action leads to. */
+export function after([row, column], action) {
+  const { width } = state.level;
+  const cell = state.found.next[action][row * width + column];
+  return [Math.floor(cell / width), cell % width];
+}
+
+/** Whether a way ends at the goal within the step limit. */
+export const arrives = (cells) =>
+  same(cells.at(-1), state.found.goal) && cells.length - 1 <= state.found.max_steps;
+
+/** Whether an episode has come to its end. */
+export const over = (cells) => arrives(cells) || cells.length - 1 >= state.found.max_steps;
+
+/** An episode whose moves are drawn from the policy. */
+export function sampled() {
+  const cells = [state.found.paths.solver[0]];
+  while (!over(cells)) {
+    const [row, column] = cells.at(-1);
+    let left = Math.random();
+    const action = state.found.policy[row][column].findIndex((chance) => (left -= chance) < 0);
+    cells.push(after(cells.at(-1), Math.max(action, 0)));
+  }
+  return cells;
+}

@@ -1,0 +1,36 @@
+"""Two runs of seconds, mazes and cars, and the page of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.play.pages import CARS, MAZES, Page, served, trained
+from tests.tiny import EXAMPLES
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Mazes, two Solvers side by side, three checkpoints."""
+    return trained(tmp_path_factory.mktemp("runs") / "mazes", *MAZES, "seeds=[3,5]")
+
+
+@pytest.fixture(scope="session")
+def car_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        yield trained(tmp_path_factory.mktemp("runs") / "cars", *CARS)
+
+
+@pytest.fixture(scope="session")
+def page(run: Path) -> Iterator[Page]:
+    with served(run) as page:
+        yield page
+
+
+@pytest.fixture(scope="session")
+def car_page(car_run: Path) -> Iterator[Page]:
+    with served(car_run) as page:
+        yield page

@@ -1,0 +1,72 @@
+"""Runs of seconds, and their pages: a server in a thread."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from time import monotonic, sleep
+from typing import NamedTuple
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from proposer_rl.cli.play import open_session
+from proposer_rl.cli.train import main
+from proposer_rl.play.server import application, listen, server
+from tests.tiny import EXAMPLES
+
+TOKEN = "a-token-of-the-tests"
+MAZES = [
+    *("+method=target", "+scale=smoke", "compute.progress=false"),
+    *("schedule.keep_checkpoints=100", "schedule.checkpoint_every=2"),
+]
+CARS = [
+    *("--config-dir", f"{EXAMPLES}/conf", "task=mountain_car", "+method=target"),
+    *("compute.progress=false", "schedule.updates=4", "schedule.checkpoint_every=2"),
+    *("task.levels=8", "solver.ppo.horizon=10", "schedule.keep_checkpoints=100"),
+]
+
+
+class Page(NamedTuple):
+    """The page of a run: its server's port, its address, and the run's folder."""
+
+    port: int
+    address: str
+    run: Path
+
+
+def trained(folder: Path, *settings: str) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *settings, f"hydra.run.dir={folder}"])
+        GlobalHydra.instance().clear()
+        main()
+    return folder
+
+
+def files(folder: Path) -> dict[Path, tuple[int, int]]:
+    # Hydra has set this process's logging up to go into a file of the run.
+    found = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log"]
+    return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in found}
+
+
+@contextmanager
+def served(run: Path) -> Iterator[Page]:
+    """The page of a run; whoever asked whatever, the run's folder is as it was."""
+    before = files(run)
+    with listen(0) as listening:
+        port = listening.getsockname()[1]
+        running = server(application(open_session(run), TOKEN))
+        thread = Thread(target=running.run, kwargs={"sockets": [listening]})
+        thread.start()
+        until = monotonic() + 60
+        while not running.started and monotonic() < until:
+            sleep(0.01)
+        try:
+            yield Page(port, f"http://127.0.0.1:{port}/{TOKEN}/", run)
+        finally:
+            running.should_exit = True
+            thread.join()
+    assert files(run) == before

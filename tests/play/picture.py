@@ -1,0 +1,32 @@
+"""The picture of the page in docs/play.md: ``python -m tests.play.picture RUN FILE``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from playwright.sync_api import expect, sync_playwright
+
+from tests.play.pages import served
+from tests.play.test_browser import CHROMIUM, OPTIONS
+
+
+def main(run: Path, file: Path) -> None:
+    """Take a level of the run, go through its checkpoints, and show all that there is to see."""
+    with served(run) as page, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        tab = browser.new_page(viewport={"width": 1180, "height": 800}, color_scheme="light")
+        tab.goto(page.address)
+        tab.locator("#gallery button").nth(1).click()
+        tab.get_by_label("Shortest path").check()
+        expect(tab.locator("#status")).to_contain_text("success")
+        tab.locator("#heat").select_option("success from here")
+        tab.get_by_role("button", name="Go through all checkpoints").click()
+        expect(tab.locator("#along .unknown")).to_have_count(0, timeout=120_000)
+        tab.wait_for_timeout(1000)  # the gallery's own answer
+        tab.screenshot(path=file)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))

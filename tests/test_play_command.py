@@ -1,0 +1,112 @@
+"""``bin/play`` as users call it; the page itself is in ``tests/play``."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from signal import SIGINT
+
+import httpx
+import pytest
+
+from proposer_rl.cli import play
+from proposer_rl.extras import install_command
+from tests.play.pages import trained
+
+SMOKE = ("+method=target", "+scale=smoke", "compute.progress=false", "schedule.updates=2")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(tmp_path_factory.mktemp("runs") / "run", *SMOKE)
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The line with which the command is refused."""
+    with pytest.raises(SystemExit) as ended:
+        play.main([str(argument) for argument in arguments])
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and said.out == ""
+    return said.err.splitlines()[-1]
+
+
+def test_it_tells_its_address_and_ends_on_ctrl_c(run: Path, tmp_path: Path) -> None:
+    started = subprocess.Popen(
+        [sys.executable, "-m", "proposer_rl.cli.play", str(run)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"},
+    )
+    assert started.stdout is not None
+    line = started.stdout.readline()
+    found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{40,})/", line)
+    assert found, started.communicate()
+    assert httpx.get(f"{found[0]}api/run").json()["checkpoints"] == [1]
+    assert httpx.get(f"http://127.0.0.1:{found[1]}/").status_code == 403
+    for address in own_addresses():  # from outside of the machine there is nothing
+        with pytest.raises(OSError), socket.create_connection((address, int(found[1])), 5):
+            pass
+    started.send_signal(SIGINT)
+    assert started.communicate(timeout=60) == ("Ended.\n", "")
+    assert started.returncode == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def own_addresses() -> set[str]:
+    """Addresses of this machine that others may know."""
+    try:
+        found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+    except socket.gaierror:
+        return set()
+    return {str(entry[4][0]) for entry in found if not str(entry[4][0]).startswith("127.")}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: is no run's folder: it has no config.json"),
+        (["empty"], "empty: is no run's folder: it has no config.json"),
+        (["fresh"], "fresh: holds no checkpoints; give the folders of runs"),
+        (["foreign"], "config.json: does not hold the settings of a run"),
+        (["{run}", "--port", "65536"], "must be from 0 to 65535, got 65536"),
+        (["{run}", "--port", "http"], "invalid"),
+        ([], "required: RUN"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(
+    arguments: list[str],
+    message: str,
+    run: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "fresh", "foreign"):
+        Path(name).mkdir()
+    shutil.copy(run / "config.json", "fresh")
+    Path("foreign", "config.json").write_text("{}")
+    assert message in refusal(capsys, *(word.format(run=run) for word in arguments))
+
+
+def test_a_port_in_use_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        line = refusal(capsys, run, "--port", port)
+    assert line == f"error: --port {port}: Address already in use"
+
+
+def test_without_its_extra_it_says_how_to_get_it(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play, "find_spec", lambda name: None)
+    line = refusal(capsys, run)
+    command = install_command("play")
+    assert line == f"error: bin/play needs starlette and uvicorn; install with: {command}"
