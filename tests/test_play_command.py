@@ -8,11 +8,13 @@ import shutil
 import socket
 import subprocess
 import sys
+import webbrowser
 from pathlib import Path
 from signal import SIGINT
 
 import httpx
 import pytest
+import uvicorn
 
 from proposer_rl.cli import play
 from proposer_rl.extras import install_command
@@ -57,6 +59,24 @@ def test_it_tells_its_address_and_ends_on_ctrl_c(run: Path, tmp_path: Path) -> N
     assert started.communicate(timeout=60) == ("Ended.\n", "")
     assert started.returncode == 0
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_browser_is_opened_only_when_asked(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: uvicorn.Server, sockets: object) -> None:
+        raise KeyboardInterrupt
+
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(uvicorn.Server, "run", interrupted)
+    play.main([str(run)])
+    assert opened == []
+    capsys.readouterr()
+    play.main([str(run), "--open"])
+    assert capsys.readouterr().out == f"Open {opened[0]} in a browser on this machine; " + (
+        "Ctrl-C ends it.\nEnded.\n"
+    )
 
 
 def own_addresses() -> set[str]:

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from proposer_rl.models.actor_critic import ActorCritic, categorical
 from proposer_rl.models.population import Population
 
+AT_ONCE = 2**17  # cells of grids that go through a network together
+
 
 def map_actor_critic(
     network: nn.Module,
@@ -97,17 +99,20 @@ def cell_maps(
             context = agent.encode(TensorDict({planes_key: planes}, batch))
             return context["policy_map"], context["value_map"]
         planes_key, agent_key = agent.step_keys
-        outputs = []
         rows, columns = (torch.arange(side, device=planes.device) for side in (height, width))
-        for cell, position in enumerate(torch.cartesian_prod(rows, columns)):
-            row, column = divmod(cell, width)
-            drawn = torch.zeros_like(planes[..., :1, :, :])
-            drawn[..., row, column].fill_(1.0)
-            shown, at = torch.cat([planes, drawn], -3), position.expand(*batch, 2)
-            output = agent(TensorDict({planes_key: shown, agent_key: at}, batch))
+        outputs = []
+        at_once = max(AT_ONCE // (batch.numel() * height * width), 1)
+        for cells in torch.cartesian_prod(rows, columns).split(at_once):  # [n, 2]
+            at = cells.expand(*batch, *cells.shape)
+            shown = planes.unsqueeze(-4).expand(*at.shape[:-1], *planes.shape[-3:])
+            drawn = planes.new_zeros(len(cells), height * width)
+            drawn.scatter_(1, cells[:, :1] * width + cells[:, 1:], 1.0)
+            drawn = drawn.view(-1, 1, height, width).expand(*at.shape[:-1], 1, height, width)
+            seen = {planes_key: torch.cat([shown, drawn], -3), agent_key: at}
+            output = agent(TensorDict(seen, at.shape[:-1]))
             outputs.append((output["logits"], output["state_value"]))
         logits, values = (
-            torch.stack(each, -1).unflatten(-1, (height, width))
+            torch.cat(each, -2).transpose(-1, -2).unflatten(-1, (height, width))
             for each in zip(*outputs, strict=True)
         )
         return logits, values

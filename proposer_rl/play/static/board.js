@@ -53,7 +53,7 @@ export class Board {
     if (!this.scene) return;
     const { level, cursor } = this.scene;
     const room = this.canvas.parentElement.clientWidth;
-    const tall = Math.min(room, Math.max(innerHeight * 0.62, 280));
+    const tall = Math.min(room, Math.max(innerHeight * 0.6, 280));
     this.cell = Math.max(4, Math.floor(Math.min(room / level.width, tall / level.height, 96)));
     const ratio = devicePixelRatio || 1;
     const [height, width] = [level.height * this.cell, level.width * this.cell];

@@ -1,6 +1,6 @@
 // Levels as pictures in a list.
 
-import { percent } from "./page.js";
+import { percent, short } from "./page.js";
 
 /** Fills a list with levels; chosen(level) is called with the one that is clicked. */
 export function fill(list, levels, chosen) {
@@ -34,7 +34,13 @@ export function mark(list, isShown) {
 /** What a Solver reached on a level, in a word. */
 export function summary(results) {
   if (results.success !== undefined) return percent(results.success);
-  return `return ${results.return.toFixed(2)}`;
+  return `return ${short(results.return)}`;
+}
+
+/** What a Solver reached, in full. */
+export function inWords(results) {
+  const known = results.success === undefined ? [] : [`${percent(results.success)} success`];
+  return [...known, `return ${short(results.return)}`].join(", ");
 }
 
 /** The means of what was reached on levels, by name; null where nothing is known. */

@@ -2,7 +2,7 @@
 
 import { ask, latest } from "./api.js";
 import { replace } from "./drawing.js";
-import { fill, means, picture, summary } from "./gallery.js";
+import { fill, inWords, means, picture } from "./gallery.js";
 import { Level } from "./level.js";
 import { $, checkpoint, forget, solver, state, tell, tellPlace, trouble } from "./page.js";
 import { show } from "./showing.js";
@@ -66,7 +66,7 @@ function offer({ levels, updates }) {
   fill($("gallery"), levels, take);
   const after = updates === undefined ? "" : `update ${updates}`;
   const mean = means(levels);
-  const reached = mean && `mean ${summary(mean)} over ${levels.length}`;
+  const reached = mean && `mean over ${levels.length} ${inWords(mean)}`;
   $("found").textContent = [after, reached].filter(Boolean).join(": ");
   const { board, chosen } = state;
   if (!board && levels.length) display(levels.find((one) => one.name === chosen) ?? levels[0]);
@@ -84,7 +84,7 @@ function take(one) {
 
 /** Shows a level that cannot be drawn. */
 function display(one) {
-  const results = Object.keys(one.results).length ? [summary(one.results)] : [];
+  const results = Object.keys(one.results).length ? [inWords(one.results)] : [];
   state.chosen = one.name;
   $("picture").src = picture(one).src;
   $("picture").alt = [one.name, ...one.text].join(", ");

@@ -28,12 +28,12 @@ async function begin() {
 }
 
 function setBoard({ kinds, size, actions, largest, most_steps: most }) {
-  for (const id of ["editor", "limit", "results", "files"]) $(id).hidden = false;
+  for (const id of ["editor", "help", "limit", "results", "files"]) $(id).hidden = false;
   $("rows").max = $("columns").max = largest;
   $("steps").max = most;
   state.board = new Board($("board"), actions, pointed);
   makeTools();
-  set(Level.empty(kinds, ...size));
+  set(Level.empty(kinds, ...size.map((side) => Math.min(side, largest))));
 }
 
 function wire() {
