@@ -79,7 +79,7 @@ class FirstOrderCurriculum(_AlignedBins):
         self,
         task: Task,
         *,
-        every: int = 2,
+        every: int = 1,
         target_levels: int = 256,
         candidates: int = 16,
         temperature: float = 0.1,
