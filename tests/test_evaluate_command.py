@@ -16,7 +16,7 @@ from proposer_rl.cli.evaluate import SHOWN, main
 from proposer_rl.cli.train import main as train
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
-from proposer_rl.runs.folder import read_csv
+from proposer_rl.runs.folder import read_csv, read_jsonl
 
 KEYS = ["success", "return", "greedy_success", "greedy_return"]
 
@@ -90,6 +90,19 @@ def test_the_set_that_comes_along(run: Path, tmp_path: Path, evaluate) -> None:
         assert (row["height"], row["width"]) == tuple(levels[row["level"]].walls.shape)
     assert files["sheet.png"].read_bytes().startswith(b"\x89PNG")
     assert files["sheet.png"].stat().st_size > 10_000
+
+
+def test_the_levels_that_a_run_trained_on(run: Path, tmp_path: Path, evaluate) -> None:
+    output = tmp_path / "rows.json"
+    assert evaluate(run, "--levels", run / "curriculum.jsonl", "-o", output)[0] == 0
+    recorded = [
+        f"seed_{row['seed']}_update_{row['updates']:05}_{place}"
+        for row in read_jsonl(run / "curriculum.jsonl")
+        for place in range(1, len(row["levels"]) + 1)
+    ]
+    rows = json.loads(output.read_text())
+    assert recorded and {row["level"] for row in rows} == set(recorded)
+    assert len(rows) == 2 * len(recorded)
 
 
 def test_a_file_of_levels_and_a_step_limit(run: Path, tmp_path: Path, evaluate) -> None:

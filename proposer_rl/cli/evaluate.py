@@ -220,7 +220,8 @@ def _parser() -> argparse.ArgumentParser:
         "--levels",
         metavar="FILE|NAME",
         help="a distribution of the run such as id or ood; where the task has files of levels also "
-        "one that ends in .txt or .json, or a set that comes along: shapes, the default there",
+        "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
+        "small, or shapes, the default there",
     )
     parser.add_argument(
         "--max-steps",

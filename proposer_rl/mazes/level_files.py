@@ -1,11 +1,11 @@
-"""Named levels as text and as JSON. docs/levels.md describes both formats."""
+"""Named levels as text and as JSON, and those of a run's record. docs/levels.md has the formats."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from proposer_rl.mazes import Level, shortest_path_length
 from proposer_rl.runs.folder import storage, write_atomically
 
 SUFFIXES = (".txt", ".json")
+RECORD = ".jsonl"  # of levels that a run trained on; read, not written
+EPISODE = "•"  # a free cell there that the Solver's episode went through
 LARGEST_FILE = 10**7  # bytes; files may come from anybody
 LONGEST_NAME = 80
 
@@ -25,7 +27,7 @@ def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
     """Reads a file of levels.
 
     Args:
-        path: A file whose name ends in ``.txt`` or ``.json``.
+        path: A file whose name ends in ``.txt`` or ``.json``, or a run's ``curriculum.jsonl``.
 
     Returns:
         Levels of batch shape ``[]`` by their names, in the file's order.
@@ -35,7 +37,7 @@ def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
         StorageError: If it cannot be read.
     """
     path = Path(path)
-    _check_suffix(path)
+    _check_suffix(path, (*SUFFIXES, RECORD))
     with storage(path, "read"), open(path, "rb") as file:
         content = file.read(LARGEST_FILE + 1)
     if len(content) > LARGEST_FILE:
@@ -44,6 +46,8 @@ def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
         text = content.decode()
         if path.suffix == ".json":
             return levels_from_json(text)
+        if path.suffix == RECORD:
+            return levels_from_record(text)
         return levels_from_text(text, path.stem)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -61,7 +65,7 @@ def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> N
         StorageError: If the disk cannot take it.
     """
     path = Path(path)
-    _check_suffix(path)
+    _check_suffix(path, SUFFIXES)
     text = levels_to_json(levels) if path.suffix == ".json" else levels_to_text(levels)
     write_atomically(path, text.encode())
 
@@ -128,6 +132,37 @@ def levels_from_json(text: str) -> dict[str, Level]:
     if not isinstance(items, list):
         raise ValueError('must be an object with a list "levels"')
     return _named([_from_item(number, item) for number, item in enumerate(items, 1)])
+
+
+def levels_from_record(text: str) -> dict[str, Level]:
+    """Reads the levels of a run's ``curriculum.jsonl``, those too whose goal is out of reach.
+
+    Args:
+        text: One JSON object per line: ``updates``, ``seed`` and ``levels``, each of which has its
+            drawing as ``text``, with the Solver's episode in it. A last line without its newline
+            was interrupted, and is left out.
+
+    Returns:
+        Levels by updates and place in the batch, as ``update_00010_1``, of several seeds by these,
+        too, as ``seed_0_update_00010_1``.
+
+    Raises:
+        ValueError: If a line is not like that, or there is no level.
+    """
+    found: dict[tuple[int, str], Level] = {}
+    for number, line in enumerate(text.split("\n")[:-1], 1):
+        try:
+            row = json.loads(line)
+            seed, updates = int(row["seed"]), int(row["updates"])
+            for nth, level in enumerate(row["levels"], 1):
+                drawn = "\n".join(level["text"]).replace(" ", "").replace(EPISODE, ".")
+                found[seed, f"update_{updates:05}_{nth}"] = Level.from_text(drawn)
+        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise ValueError(f"line {number} is no record of mazes") from error
+    if not found:
+        raise ValueError("holds no levels")
+    several = len({seed for seed, _ in found}) > 1
+    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in found.items()}
 
 
 def levels_to_text(levels: Mapping[str, Level]) -> str:
@@ -202,6 +237,6 @@ def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
     return length
 
 
-def _check_suffix(path: Path) -> None:
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"{path}: must end in one of {', '.join(SUFFIXES)}")
+def _check_suffix(path: Path, known: Sequence[str]) -> None:
+    if path.suffix not in known:
+        raise ValueError(f"{path}: must end in one of {', '.join(known)}")

@@ -23,7 +23,14 @@ from proposer_rl.mazes.evaluation import (
     optimal_return,
     worst_mean,
 )
-from proposer_rl.mazes.level_files import SUFFIXES, read_levels, shipped_levels, shipped_sets
+from proposer_rl.mazes.level_files import (
+    EPISODE,
+    RECORD,
+    SUFFIXES,
+    read_levels,
+    shipped_levels,
+    shipped_sets,
+)
 from proposer_rl.mazes.level_scores import score_levels
 from proposer_rl.mazes.levels import Level, planes
 from proposer_rl.mazes.rendering import draw_level
@@ -54,7 +61,7 @@ LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 SLACK = 2  # of a named level: steps allowed for each move of its shortest path
-TEXT_KEY = "S start, G goal, • the Solver's episode"
+TEXT_KEY = f"S start, G goal, {EPISODE} the Solver's episode"
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
@@ -126,8 +133,8 @@ class MazeTask:
             else RolloutEvaluator(*rules, episodes=evaluation.episodes)
         )
         self.levels_help = (
-            f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
-            f"or a distribution: {', '.join(distributions)}"
+            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
+            f"a run's curriculum{RECORD}, or a distribution: {', '.join(distributions)}"
         )
         self.board = MazeBoard(maze, self._check_size, self._limit, self.device)
         self.exact_performance = evaluation.evaluator == "exact"
@@ -281,7 +288,7 @@ class MazeTask:
             lines = [list(line) for line in text.splitlines()]
             for row, column in path or []:
                 if lines[row][column] == ".":
-                    lines[row][column] = "•"
+                    lines[row][column] = EPISODE
             yield {
                 "picture": png(draw_level(levels[i], path).numpy()),
                 "text": [" ".join(line) for line in lines],
@@ -321,7 +328,7 @@ class MazeTask:
 
     def _named_levels(self, name: str) -> tuple[dict[str, Level], int]:
         """Levels, and the steps that they allow for each move of the shortest path."""
-        if Path(name).suffix in SUFFIXES:
+        if Path(name).suffix in (*SUFFIXES, RECORD):
             if not Path(name).exists():
                 raise ValueError(f"--levels {name}: there is no such file")
             return read_levels(name), SLACK
@@ -333,8 +340,8 @@ class MazeTask:
             return shipped_levels(name), SLACK
         known = ", ".join([*self.distributions, *shipped_sets()])
         raise ValueError(
-            f"--levels {name}: must be a file that ends in {' or '.join(SUFFIXES)}, or one of: "
-            f"{known}"
+            f"--levels {name}: must be a file that ends in {' or '.join(SUFFIXES)}, a run's "
+            f"curriculum{RECORD}, or one of: {known}"
         )
 
     def _describe(self, name: str) -> str:

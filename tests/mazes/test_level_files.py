@@ -151,8 +151,10 @@ def test_bad_json_is_refused(text: str, message: str) -> None:
 
 
 def test_bad_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"levels.csv: must end in one of .txt, .json"):
+    with pytest.raises(ValueError, match=r"levels.csv: must end in one of .txt, .json, .jsonl"):
         read_levels("levels.csv")
+    with pytest.raises(ValueError, match=r"levels.jsonl: must end in one of .txt, .json$"):
+        write_levels("levels.jsonl", levels_from_text(HALLS))
     with pytest.raises(OSError, match=r"cannot read .*nothing.txt: No such file"):
         read_levels(tmp_path / "nothing.txt")
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
@@ -178,8 +180,8 @@ def test_levels_that_could_not_be_read_again_are_not_written(tmp_path: Path) -> 
 
 
 def test_the_sets_that_come_along() -> None:
-    assert shipped_sets() == ["shapes"]
-    with pytest.raises(ValueError, match=r"nothing: there is no such set .*\['shapes'\]"):
+    assert shipped_sets() == ["shapes", "small"]
+    with pytest.raises(ValueError, match=r"nothing: there is no such set .*\['shapes', 'small'\]"):
         shipped_levels("nothing")
 
 
@@ -196,8 +198,64 @@ def test_shapes_are_what_they_are_called() -> None:
     assert len(drawings) == len(levels)
 
 
-def test_the_recorded_path_lengths_of_shapes_are_right() -> None:
+def test_small_levels_are_small_and_each_is_another() -> None:
+    levels = shipped_levels("small")
+    assert len(levels) >= 15 and len({level.to_text() for level in levels.values()}) == len(levels)
+    for name, level in levels.items():
+        assert tuple(level.walls.shape) == (int(name[-1]),) * 2 and name[-2:] in ("_5", "_6")
+
+
+@pytest.mark.parametrize("name", shipped_sets())
+def test_the_recorded_path_lengths_are_right(name: str) -> None:
     """By networkx; reading them has compared them with our own routine."""
-    text = (Path(format_.__file__).parent / "shapes.txt").read_text()
+    text = (Path(format_.__file__).parent / f"{name}.txt").read_text()
     recorded = [int(line.split(":")[1]) for line in text.splitlines() if "path_length" in line]
-    assert recorded == [path_length(level) for level in shipped_levels("shapes").values()]
+    assert recorded == [path_length(level) for level in shipped_levels(name).values()]
+
+
+LINES = ["S • #", "# • G"]
+
+
+def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
+    rows = [
+        {"updates": 10, "seed": 3, "levels": [{"text": LINES, "picture": "x"}] * 2},
+        {"updates": 20, "seed": 3, "levels": [{"text": ["S # G"]}]},
+    ]
+    lines = [json.dumps(row) + "\n" for row in rows]
+    (tmp_path / "curriculum.jsonl").write_text("".join([*lines, '{"updates": 30']))
+    levels = read_levels(tmp_path / "curriculum.jsonl")
+    # The Solver's episode is gone, and a goal that is out of reach stays.
+    assert {name: level.to_text() for name, level in levels.items()} == {
+        "update_00010_1": "S.#\n#.G",
+        "update_00010_2": "S.#\n#.G",
+        "update_00020_1": "S#G",
+    }
+    rows[1]["seed"] = 4
+    (tmp_path / "two.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert list(read_levels(tmp_path / "two.jsonl"))[1:] == [
+        "seed_3_update_00010_2",
+        "seed_4_update_00020_1",
+    ]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "{",
+        "[]",
+        "3",
+        "[" * 10_000,
+        '{"seed": 0, "levels": []}',
+        '{"seed": 0, "updates": "x", "levels": []}',
+        '{"seed": 0, "updates": 1, "levels": [{}]}',
+        '{"seed": 0, "updates": 1, "levels": [{"text": [3]}]}',
+        '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',
+    ],
+)
+def test_a_line_that_is_no_record_is_named(line: str, tmp_path: Path) -> None:
+    (tmp_path / "a.jsonl").write_text(f'{{"seed": 0, "updates": 1, "levels": []}}\n{line}\n')
+    with pytest.raises(ValueError, match=r"a.jsonl: line 2 is no record of mazes"):
+        read_levels(tmp_path / "a.jsonl")
+    (tmp_path / "a.jsonl").write_text("")
+    with pytest.raises(ValueError, match=r"a.jsonl: holds no levels"):
+        read_levels(tmp_path / "a.jsonl")
