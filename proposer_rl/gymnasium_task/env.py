@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Mapping
+import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -26,10 +28,6 @@ from proposer_rl.gymnasium_task.success import Rule, Steps
 Vectorization = Literal["sync", "async"]
 # A forked process need not import torch again, of which it has no use: TorchRL's choice is spawn.
 CONTEXT = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
-VECTORS: dict[str, Callable[..., SyncVectorEnv | AsyncVectorEnv]] = {
-    "sync": SyncVectorEnv,
-    "async": partial(AsyncVectorEnv, context=CONTEXT),
-}
 
 
 class GymnasiumEnv(EnvBase):
@@ -65,7 +63,7 @@ class GymnasiumEnv(EnvBase):
         self._reward_scale = reward_scale
         self._once = once
         players = [partial(LevelPlayer, make, parameters, play) for play in plays(levels, once)]
-        self._vector = VECTORS[vectorization](players, autoreset_mode=AutoresetMode.DISABLED)
+        self._vector = _vectorized(players, vectorization)
         self._returns = np.zeros(len(players))
         self._make_specs()
 
@@ -135,6 +133,27 @@ class GymnasiumEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: what is random belongs to the levels."""
+
+
+def _vectorized(
+    players: Sequence[Callable[[], LevelPlayer]], vectorization: Vectorization
+) -> SyncVectorEnv | AsyncVectorEnv:
+    mode = AutoresetMode.DISABLED
+    if vectorization == "sync":
+        return SyncVectorEnv(players, autoreset_mode=mode)
+    alone = [partial(_in_own_process, player, os.getpid()) for player in players]
+    return AsyncVectorEnv(alone, autoreset_mode=mode, context=CONTEXT)
+
+
+def _in_own_process(make: Callable[[], LevelPlayer], parent: int) -> LevelPlayer:
+    """Make a player; in a process of its own, one that ends at once when its parent does.
+
+    A forked process would otherwise answer signals as its parent, which saves its work first.
+    """
+    if os.getpid() != parent:  # Gymnasium makes one in the parent, too
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return make()
 
 
 def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import Any
 
 import gymnasium
@@ -15,6 +16,7 @@ from proposer_rl.gymnasium_task.levels import ParameterSpace, space_bins
 from proposer_rl.gymnasium_task.player import MakeEnvironment
 from proposer_rl.gymnasium_task.settings import SuccessSettings
 from proposer_rl.gymnasium_task.success import Steps, success_rule
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from tests.gymnasium_task.toys import LIMIT, PARAMETERS, WALK, set_wind
 
@@ -64,6 +66,18 @@ def test_it_is_gymnasium_s_environments_side_by_side(vectorization: Any) -> None
             assert ours["next", "success"].squeeze(-1).tolist() == list(terminated)
             ends += sum(terminated) + sum(truncated)
     assert ends > K * P  # episodes began again
+
+
+def test_its_processes_end_when_a_run_does_and_leave_its_signals_alone() -> None:
+    with StopSignals():
+        before = signal.getsignal(signal.SIGTERM)
+        env: Any = make(vectorization="async")
+        env.reset()
+        assert signal.getsignal(signal.SIGTERM) is before is not signal.SIG_DFL
+        for process in env._vector.processes:
+            process.terminate()
+            process.join(60)
+            assert process.exitcode == -signal.SIGTERM
 
 
 def test_its_specs_hold() -> None:
