@@ -1,4 +1,4 @@
-"""What is asked of every task, of both that there are."""
+"""What is asked of every task, of all that there are."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from PIL import Image
 
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
-from tests.tiny import mountain_cars, tiny_task
+from tests.tiny import mountain_cars, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5
 
 
-@pytest.fixture(params=[tiny_task, mountain_cars], ids=["mazes", "cars"])
+@pytest.fixture(
+    params=[tiny_task, mountain_cars, tiny_view_task], ids=["mazes", "cars", "views"]
+)
 def task(request: pytest.FixtureRequest) -> Task:
     make: Callable[[], Task] = request.param
     return make()

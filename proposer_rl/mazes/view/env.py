@@ -85,7 +85,7 @@ class ViewMazeEnv(LevelEnv):
         device, count = self.device, self.batch_size.numel()
         rows, width = (side + 2 * RIM for side in self._grid)
         self._width = width
-        walls = pad(levels.walls, (RIM,) * 4, value=True).reshape(count, -1)
+        walls = pad(levels.walls, (RIM,) * 4, value=True).reshape(count, rows * width)
         objects = torch.where(walls, WALL, EMPTY).to(torch.uint8)
         goal = cell_index(levels.goal + RIM, width).reshape(count, 1)
         self._objects = objects.scatter_(1, goal, GOAL).flatten()
