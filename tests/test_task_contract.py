@@ -20,9 +20,7 @@ from tests.tiny import mountain_cars, tiny_task, tiny_view_task
 K, P, C, E = 2, 4, 3, 5
 
 
-@pytest.fixture(
-    params=[tiny_task, mountain_cars, tiny_view_task], ids=["mazes", "cars", "views"]
-)
+@pytest.fixture(params=[tiny_task, mountain_cars, tiny_view_task], ids=["mazes", "cars", "views"])
 def task(request: pytest.FixtureRequest) -> Task:
     make: Callable[[], Task] = request.param
     return make()

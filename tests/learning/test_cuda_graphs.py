@@ -129,6 +129,7 @@ class Mazes:
 
     device = torch.device("cpu")
     exact_performance = True
+    facts: ClassVar = {"exact": True}
 
     def __init__(self, observe_agent: bool = False) -> None:
         self.observe_agent = observe_agent

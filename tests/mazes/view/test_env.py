@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
+from benchmarks.minigrid_env import MiniGridMaze
 from proposer_rl.mazes.view.env import AGENT, GOAL, ViewMazeEnv
 from proposer_rl.mazes.view.levels import ViewLevel
-from tests.mazes.view.oracles import OracleEnv, random_levels
+from tests.mazes.view.oracles import random_levels
 
 LEVELS, STEPS, LIMIT = 1000, 10, 7
 
@@ -21,7 +22,7 @@ def arrays(state: TensorDictBase) -> dict[str, Any]:
     return {str(key): entry.numpy() for key, entry in state.items() if key != "next"}
 
 
-def assert_same(state: dict[str, Any], i: int, seen: dict[str, Any], oracle: OracleEnv) -> None:
+def assert_same(state: dict[str, Any], i: int, seen: dict[str, Any], oracle: MiniGridMaze) -> None:
     assert np.array_equal(state["view"][i], seen["image"][:, :, 0])
     assert state["direction"][i] == seen["direction"]
     column, row = oracle.agent_pos
@@ -32,7 +33,7 @@ def test_it_does_what_minigrid_does() -> None:
     """10,000 random steps on 1,000 levels: observations, rewards, ends, and resets to the start."""
     levels = random_levels(LEVELS)
     env = ViewMazeEnv(levels, max_steps=LIMIT)
-    oracles = [OracleEnv(levels[i], LIMIT) for i in range(LEVELS)]
+    oracles = [MiniGridMaze(levels[i], LIMIT) for i in range(LEVELS)]
     seen = [oracle.reset()[0] for oracle in oracles]
     state = env.reset()
     ends = {"terminated": 0, "truncated": 0}

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 
+from benchmarks.minigrid_env import MiniGridMaze
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.mazes.view.level_files import read_view_levels, shipped_view_levels
 from proposer_rl.mazes.view.levels import ViewLevel
-from tests.mazes.view.oracles import OracleEnv, random_levels
+from tests.mazes.view.oracles import random_levels
 
 # A module as jaxued's is written, with levels of our own.
 MODULE = '''
@@ -40,7 +41,7 @@ prefabs = {"Hall": Hall.strip()}
 
 def encoded(level: ViewLevel) -> np.ndarray:
     """As FullyObsWrapper shows MiniGrid's grid: with the agent, and with the border."""
-    env = OracleEnv(level, 10)
+    env = MiniGridMaze(level, 10)
     env.reset()
     full = env.grid.encode()
     column, row = env.agent_pos
@@ -127,9 +128,7 @@ NOBODY = [[[1, 0, 0], [8, 1, 0]]]
         ("a.csv", b"", "must end in one of .txt, .json, .py, .npy"),
     ],
 )
-def test_what_is_no_level_is_refused(
-    tmp_path: Path, name: str, content: bytes, said: str
-) -> None:
+def test_what_is_no_level_is_refused(tmp_path: Path, name: str, content: bytes, said: str) -> None:
     file = tmp_path / name
     file.write_bytes(content)
     with pytest.raises(ValueError) as caught:
