@@ -29,7 +29,8 @@ class MazeEnv(LevelEnv):
       elsewhere. A step that reaches the goal at the limit is terminated and not truncated, since
       nothing was cut off. ``done`` is either.
     - Reset: the agent goes back to the start of the *same* level, also when TorchRL resets finished
-      mazes by itself. Levels change only by :meth:`~proposer_rl.mazes.level_env.LevelEnv.set_levels`.
+      mazes by itself. Levels change only by
+      :meth:`~proposer_rl.mazes.level_env.LevelEnv.set_levels`.
 
     The dynamics are deterministic and depend on the tensordict that is stepped and on the levels
     alone; nothing is drawn at random.
