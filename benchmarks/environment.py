@@ -13,6 +13,7 @@ from benchmarks.plain_env import PlainMaze
 from benchmarks.results import Options, Result, Row
 from benchmarks.timing import interleave, rate, ratio
 from proposer_rl.mazes import Level, MazeEnv, generate_levels, successors
+from proposer_rl.mazes.level_env import LevelEnv
 from proposer_rl.mazes.levels import cell_index
 
 MAX_STEPS = 25
@@ -81,7 +82,7 @@ def _playing(
 
 
 @torch.no_grad()
-def through_torchrl(env: MazeEnv, actions: Tensor) -> Tensor:
+def through_torchrl(env: LevelEnv, actions: Tensor) -> Tensor:
     """Play actions [T, N]; returns the sum of all rewards."""
     state = env.reset()
     total = torch.zeros(env.batch_size.numel(), 1, device=actions.device)

@@ -190,11 +190,13 @@ class PoolSettings:
         capacity: levels of a buffer.
         candidates: levels that are scored to keep some of them.
         keep: of the candidates.
+        simplest: values of the space's axes with the easiest bins; None for all bins.
     """
 
     capacity: Annotated[int, Ge(1)]
     candidates: Annotated[int, Ge(1)]
     keep: Annotated[int, Ge(1)]
+    simplest: dict[str, list[float]] | None = None
 
 
 @settings

@@ -16,12 +16,20 @@ from PIL import Image
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
 from tests.gymnasium_task.toys import walk_task
-from tests.tiny import mountain_cars, tiny_task
+from tests.tiny import mountain_cars, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5
 
 
-@pytest.fixture(params=[tiny_task, mountain_cars, walk_task], ids=["mazes", "cars", "walk"])
+TASKS = {
+    "mazes": tiny_task,
+    "cars": mountain_cars,
+    "walk": walk_task,
+    "views": tiny_view_task,
+}
+
+
+@pytest.fixture(params=TASKS.values(), ids=TASKS)
 def task(request: pytest.FixtureRequest) -> Task:
     make: Callable[[], Task] = request.param
     return make()

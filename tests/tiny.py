@@ -23,6 +23,15 @@ from proposer_rl.mazes.settings import (
     SpaceSettings,
 )
 from proposer_rl.mazes.task import MazeTask
+from proposer_rl.mazes.view.settings import EvaluationSettings as ViewEvaluationSettings
+from proposer_rl.mazes.view.settings import (
+    PerfectSettings,
+    ScatteredSettings,
+    ViewMazeSettings,
+    ViewNetworkSettings,
+)
+from proposer_rl.mazes.view.settings import SpaceSettings as ViewSpaceSettings
+from proposer_rl.mazes.view.task import ViewMazeTask
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
@@ -60,6 +69,24 @@ def mountain_cars() -> Task:
         sys.path.remove(EXAMPLES)
     solver = SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2))
     return MountainCarTask(levels=8, solver=solver, place=Place())
+
+
+def tiny_view_task() -> ViewMazeTask:
+    """5x5 mazes that Solvers with memory see through a window, in four bins."""
+    kind = ScatteredSettings(fewest=5, most=5, solvable=True)
+    return ViewMazeTask(
+        maze=ViewMazeSettings(height=5, width=5, max_steps=8),
+        distributions={"id": kind, "ood": PerfectSettings()},
+        target="id",
+        space=ViewSpaceSettings(walls=[0, 5], path_lengths=[2, 4]),
+        network=ViewNetworkSettings(channels=4, memory=8, head=8),
+        encoder_channels=[8, 8],
+        evaluation=ViewEvaluationSettings(distributions=["id", "ood"], levels=8, named_episodes=6),
+        solver=SolverSettings(
+            batch_size=4, ppo=PPOSettings(horizon=8, epochs=2, learning_rate=3e-3)
+        ),
+        place=Place(),
+    )
 
 
 def learners(copies: int) -> PPO:

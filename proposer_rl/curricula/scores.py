@@ -247,6 +247,16 @@ def _exact_score(task: Task, name: str) -> Callable[[PPO, Levels, torch.Generato
             )
         norms = squared_gradients(cast(ExactTask, task))
         return lambda learner, levels, _: norms(learner, levels)
+    if name == "regret" and not isinstance(task, OptimalTask):
+        raise TypeError(
+            f"{type(task).__name__} does not know the largest return (optimal_return), which "
+            "score=regret from source=exact needs; source=episodes takes the best that was seen"
+        )
+    if not task.exact_performance:
+        raise ValueError(
+            f"source=exact: {type(task).__name__} tells performance by playing, which is not "
+            "exact; give source=episodes, as +score=sampled does"
+        )
     if name == "learnability":
 
         def learnability(learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
@@ -254,12 +264,7 @@ def _exact_score(task: Task, name: str) -> Callable[[PPO, Levels, torch.Generato
             return success * (1 - success)
 
         return learnability
-    if not isinstance(task, OptimalTask):
-        raise TypeError(
-            f"{type(task).__name__} does not know the largest return (optimal_return), which "
-            "score=regret from source=exact needs; source=episodes takes the best that was seen"
-        )
-    optimum = task.optimal_return
+    optimum = cast(OptimalTask, task).optimal_return
     return lambda learner, levels, generator: (
         optimum(levels) - task.performance(learner.agent, levels, generator)["return"]
     )

@@ -82,8 +82,9 @@ def recorded(task: T, recorder: Recorder | None = None) -> T:
     """A copy of a task whose learners and measurements are replayed.
 
     Of the learners that it makes, acting and training are recorded; of the task, ``probe`` and
-    ``measure`` for every agent, and ``performance`` where it is exact. Otherwise it draws random
-    numbers, which a graph would repeat, and is called as it is. All the rest is the task's own.
+    ``measure`` for every agent where measurements are exact, and ``performance`` where it is.
+    Otherwise they may draw random numbers, which a graph would repeat, or look whether all episodes
+    have ended, and are called as they are. All the rest is the task's own.
 
     Args:
         task: as :mod:`proposer_rl.task` describes it. It stays as it is.
@@ -115,8 +116,9 @@ def recorded(task: T, recorder: Recorder | None = None) -> T:
     # A copy, and no wrapper, so that it is of the task's class and of all its protocols.
     twin = copy.copy(original)
     twin.learner = learner
-    twin.probe = lambda agent, levels: see(TensorDict({"levels": levels}), agent)["probes"]
-    twin.measure = lambda agent: sum_up(TensorDict({}), agent)
+    if original.facts["exact"]:
+        twin.probe = lambda agent, levels: see(TensorDict({"levels": levels}), agent)["probes"]
+        twin.measure = lambda agent: sum_up(TensorDict({}), agent)
     if original.exact_performance:
         twin.performance = lambda agent, levels, _: rate(TensorDict({"levels": levels}), agent)
     return twin

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
+from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
@@ -161,7 +162,8 @@ class PPO:
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
         agent, copies = self.agent, self.agent.copies
-        steps = agent.decode(steps.copy(), agent.encode(level))
+        with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
+            steps = agent.decode(steps.copy(), agent.encode(level))
         losses = self._loss(steps)
         terms = loss_terms(losses, copies)
         self._adam.zero_grad()

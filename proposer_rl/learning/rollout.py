@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
+from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.models import ActorCritic, draw, uniform_noise
 
@@ -63,14 +64,19 @@ class RolloutCollector:
 def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase) -> None:
     """Write the present values of steps [*B, T] on a level [*B], before and after each step."""
     context = agent.encode(level)
-    now = agent.decode(steps.select(*agent.step_keys), context)
-    steps.set(agent.value_key, now.get(agent.value_key))
+    with set_recurrent_mode(True):
+        now = agent.decode(steps.select(*agent.step_keys), context)
+    for key in (agent.value_key, *agent.memory_keys):
+        steps.set(key, now.get(key))
     set_next_values(agent, steps, context)
 
 
 @torch.no_grad()
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
-    """Write the values after each of the steps [*B, T], whose level has this context [*B]."""
+    """Write the values after each of the steps [*B, T], whose level has this context [*B].
+
+    With the memory that is there after each step.
+    """
     after = agent.decode(steps.get("next").select(*agent.step_keys), context)
     steps.set(("next", agent.value_key), after.get(agent.value_key))
 
@@ -78,6 +84,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
 class RolloutPolicy(TensorDictModuleBase):
     """What a collector calls: reads the steps off the context and draws actions from noise.
 
+    It carries an agent's memory from step to step; the agent itself forgets where an episode ends.
     :meth:`begin` comes before every rollout.
 
     Args:
@@ -91,7 +98,13 @@ class RolloutPolicy(TensorDictModuleBase):
         # In a tuple, nn.Module does not register it.
         self._agent = (agent,)
         self.in_keys = agent.step_keys
-        self.out_keys = [agent.action_key, agent.log_prob_key, agent.value_key]
+        self.out_keys = [
+            agent.action_key,
+            agent.log_prob_key,
+            agent.value_key,
+            *agent.memory,
+            *agent.memory_keys,
+        ]
 
     def begin(self, noise: Tensor, level: _LevelAside | None = None) -> None:
         """Expect a rollout with this noise [T, ...].
@@ -109,11 +122,16 @@ class RolloutPolicy(TensorDictModuleBase):
         index, noise = next(self._steps)
         if index == 0:
             self.context = agent.encode(tensordict if level is None else level.entries)
+            self._memory = agent.no_memory(tensordict)
+        tensordict.update(self._memory)
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
         action = draw(distribution, noise)
         tensordict.set(agent.action_key, action)
         tensordict.set(agent.log_prob_key, distribution.log_prob(action))
+        for before, after in zip(agent.memory, agent.memory_keys, strict=True):
+            self._memory.set(before, step.get(after))
+            tensordict.set(after, step.get(after))
         return tensordict.set(agent.value_key, step.get(agent.value_key))
 
 

@@ -19,6 +19,7 @@ from proposer_rl.mazes.level_files import (
 )
 from proposer_rl.mazes.levels import FREE, GOAL, START, WALL, Level, cell_index, planes
 from proposer_rl.mazes.occupancy import expected_visits, success_from_cells
+from proposer_rl.mazes.records import recorded_drawing
 from proposer_rl.mazes.settings import MazeSettings
 from proposer_rl.models import ActorCritic, cell_maps
 from proposer_rl.task import CellKind
@@ -74,7 +75,7 @@ class MazeBoard:
 
     def drawing(self, record: Mapping[str, Any]) -> list[str]:
         """The drawing in a record, whose text has spaces, and dots where an episode went."""
-        return [line.replace(" ", "").replace("•", FREE) for line in record["text"]]
+        return recorded_drawing(record)
 
     def level_set(self, name: str) -> Mapping[str, Level]:
         """The levels of a set that comes along."""

@@ -5,29 +5,32 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from proposer_rl.mazes import Level, shortest_path_length
+from proposer_rl.mazes.records import recorded_drawing
 from proposer_rl.runs.folder import storage, write_atomically
 
 SUFFIXES = (".txt", ".json")
 RECORD = ".jsonl"  # of levels that a run trained on; read, not written
-EPISODE = "•"  # a free cell there that the Solver's episode went through
 LARGEST_FILE = 10**7  # bytes; files may come from anybody
 LONGEST_NAME = 80
+
+L = TypeVar("L", bound=Level)
 
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
 _RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
 
 
-def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
+def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
     """Reads a file of levels.
 
     Args:
         path: A file whose name ends in ``.txt`` or ``.json``, or a run's ``curriculum.jsonl``.
+        kind: Class of the levels, whose ``from_text`` reads their drawings.
 
     Returns:
         Levels of batch shape ``[]`` by their names, in the file's order.
@@ -38,19 +41,30 @@ def read_levels(path: str | os.PathLike[str]) -> dict[str, Level]:
     """
     path = Path(path)
     _check_suffix(path, (*SUFFIXES, RECORD))
+    content = read_content(path)
+    try:
+        text = content.decode()
+        if path.suffix == ".json":
+            return levels_from_json(text, kind)
+        if path.suffix == RECORD:
+            return levels_from_record(text, kind)
+        return levels_from_text(text, path.stem, kind)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_content(path: Path) -> bytes:
+    """All of a file that may come from anybody.
+
+    Raises:
+        ValueError: If it is larger than levels are.
+        StorageError: If it cannot be read.
+    """
     with storage(path, "read"), open(path, "rb") as file:
         content = file.read(LARGEST_FILE + 1)
     if len(content) > LARGEST_FILE:
         raise ValueError(f"{path}: is larger than {LARGEST_FILE:,} bytes")
-    try:
-        text = content.decode()
-        if path.suffix == ".json":
-            return levels_from_json(text)
-        if path.suffix == RECORD:
-            return levels_from_record(text)
-        return levels_from_text(text, path.stem)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return content
 
 
 def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> None:
@@ -86,7 +100,45 @@ def shipped_levels(name: str) -> dict[str, Level]:
     return read_levels(_HERE / f"{name}.txt")
 
 
-def levels_from_text(text: str, unnamed: str = "level") -> dict[str, Level]:
+def chosen_levels(
+    name: str,
+    distributions: Mapping[str, Callable[[], L]],
+    suffixes: Sequence[str],
+    read: Callable[[str], dict[str, L]],
+    shipped: Callable[[str], dict[str, L]],
+) -> tuple[dict[str, L], bool]:
+    """The levels that a user names, and whether they are those of a distribution.
+
+    Args:
+        name: Of a file, a distribution or a set that comes along.
+        distributions: What gives the levels of each, by its name.
+        suffixes: Of files.
+        read: Reads a file.
+        shipped: Reads a set that comes along.
+
+    Raises:
+        ValueError: If there is no such thing.
+        StorageError: If a file cannot be read.
+    """
+    if Path(name).suffix in suffixes:
+        if not Path(name).exists():
+            raise ValueError(f"--levels {name}: there is no such file")
+        return read(name), False
+    for distribution, sample in distributions.items():
+        if name.casefold() == distribution.casefold():
+            levels: Any = sample()
+            return {f"{distribution}_{i:03}": levels[i].cpu() for i in range(len(levels))}, True
+    if name in shipped_sets():
+        return shipped(name), False
+    known = ", ".join([*distributions, *shipped_sets()])
+    raise ValueError(
+        f"--levels {name}: must be a file that ends in {' or '.join(suffixes)}, or one of: {known}"
+    )
+
+
+def levels_from_text(
+    text: str, unnamed: str = "level", kind: type[Level] = Level
+) -> dict[str, Level]:
     """Reads levels drawn with one character per cell.
 
     Args:
@@ -94,6 +146,7 @@ def levels_from_text(text: str, unnamed: str = "level") -> dict[str, Level]:
             its drawing as :meth:`Level.from_text` reads them. Blank lines, and lines that begin
             with a semicolon, are ignored.
         unnamed: Name of a level drawn before the first name.
+        kind: As in :func:`read_levels`.
 
     Raises:
         ValueError: If a line or level is not like that, a name occurs twice, there is no level, or
@@ -111,15 +164,16 @@ def levels_from_text(text: str, unnamed: str = "level") -> dict[str, Level]:
             drawn[-1] = (name, rows, int(record[1]))
         elif not header:
             rows.append(line)
-    return _named(drawn)
+    return named_levels(drawn, kind)
 
 
-def levels_from_json(text: str) -> dict[str, Level]:
+def levels_from_json(text: str, kind: type[Level] = Level) -> dict[str, Level]:
     """Reads levels from JSON.
 
     Args:
         text: ``{"levels": [{"name": "hall", "level": ["S..", "..G"], "path_length": 3}]}``; the
             path length may be missing.
+        kind: As in :func:`read_levels`.
 
     Raises:
         ValueError: As :func:`levels_from_text`.
@@ -131,16 +185,17 @@ def levels_from_json(text: str) -> dict[str, Level]:
     items = content.get("levels") if isinstance(content, dict) else None
     if not isinstance(items, list):
         raise ValueError('must be an object with a list "levels"')
-    return _named([_from_item(number, item) for number, item in enumerate(items, 1)])
+    return named_levels([_from_item(number, item) for number, item in enumerate(items, 1)], kind)
 
 
-def levels_from_record(text: str) -> dict[str, Level]:
+def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]:
     """Reads the levels of a run's ``curriculum.jsonl``, those too whose goal is out of reach.
 
     Args:
         text: One JSON object per line: ``updates``, ``seed`` and ``levels``, each of which has its
             drawing as ``text``, with the Solver's episode in it. A last line without its newline
             was interrupted, and is left out.
+        kind: As in :func:`read_levels`.
 
     Returns:
         Levels by updates and place in the batch, as ``update_00010_1``, of several seeds by these,
@@ -155,8 +210,8 @@ def levels_from_record(text: str) -> dict[str, Level]:
             row = json.loads(line)
             seed, updates = int(row["seed"]), int(row["updates"])
             for nth, level in enumerate(row["levels"], 1):
-                drawn = "\n".join(level["text"]).replace(" ", "").replace(EPISODE, ".")
-                found[seed, f"update_{updates:05}_{nth}"] = Level.from_text(drawn)
+                drawn = "\n".join(recorded_drawing(level))
+                found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
         except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
     if not found:
@@ -198,13 +253,20 @@ def _from_item(number: int, item: Any) -> tuple[str, list[str], int | None]:
     return name, rows, length
 
 
-def _named(drawn: list[tuple[str, list[str], int | None]]) -> dict[str, Level]:
+def named_levels(
+    drawn: Sequence[tuple[str, Sequence[str], int | None]], kind: type[Level] = Level
+) -> dict[str, Level]:
+    """Levels of names, rows of a drawing and, where it is known, the length of the shortest path.
+
+    Raises:
+        ValueError: As :func:`levels_from_text`.
+    """
     levels: dict[str, Level] = {}
     for name, rows, recorded in drawn:
         if name in levels:
             raise ValueError(f"level {name!r:.80}: the name occurs twice")
         try:
-            levels[name] = Level.from_text("\n".join(rows))
+            levels[name] = kind.from_text("\n".join(rows))
         except ValueError as error:
             reason = str(error).partition(", got")[0]
             raise ValueError(f"level {name!r:.80}: {reason}") from error

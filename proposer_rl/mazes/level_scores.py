@@ -18,6 +18,7 @@ from proposer_rl.mazes.rendering import draw_level
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.task import Score
 
+SLACK = 2  # of a named level: steps allowed for each one of its shortest path
 AT_ONCE = 2**17  # cells that go through the network together
 
 

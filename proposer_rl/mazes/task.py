@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from proposer_rl.learning import PPO, first_episode_success
+from proposer_rl.learning import PPO
 from proposer_rl.mazes.board import MazeBoard
+from proposer_rl.mazes.checks import check_names, named
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.edits import edit_levels
@@ -24,16 +25,16 @@ from proposer_rl.mazes.evaluation import (
     worst_mean,
 )
 from proposer_rl.mazes.level_files import (
-    EPISODE,
     RECORD,
     SUFFIXES,
+    chosen_levels,
     read_levels,
     shipped_levels,
     shipped_sets,
 )
-from proposer_rl.mazes.level_scores import score_levels
+from proposer_rl.mazes.level_scores import SLACK, score_levels
 from proposer_rl.mazes.levels import Level, planes
-from proposer_rl.mazes.rendering import draw_level
+from proposer_rl.mazes.records import EPISODE, level_records, level_statistics
 from proposer_rl.mazes.settings import (
     Channels,
     DistributionSettings,
@@ -50,7 +51,6 @@ from proposer_rl.models import (
     cell_logits,
     map_actor_critic,
 )
-from proposer_rl.runs.pictures import png
 from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Place, Score
@@ -60,7 +60,6 @@ PLANES = 3
 LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
-SLACK = 2  # of a named level: steps allowed for each move of its shortest path
 TEXT_KEY = f"S start, G goal, {EPISODE} the Solver's episode"
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
@@ -100,7 +99,7 @@ class MazeTask:
         place: Place,
         make_network: Any = None,
     ) -> None:
-        _check_names(distributions, target, evaluation.distributions)
+        check_names(distributions, target, evaluation.distributions)
         _check_network(maze, network)
         _check_target(maze, target, distributions[target])
         self.maze = maze
@@ -119,11 +118,11 @@ class MazeTask:
         }
         grid = (maze.height, maze.width, self.device)
         self.distributions = {
-            name: _named(f"distributions.{name}", LevelDistribution, *asdict(d).values(), *grid)
+            name: named(f"distributions.{name}", LevelDistribution, *asdict(d).values(), *grid)
             for name, d in distributions.items()
         }
         self.target = self.distributions[target]
-        self.space = _named("space", SpecificationSpace, *asdict(space).values(), *grid)
+        self.space = named("space", SpecificationSpace, *asdict(space).values(), *grid)
         rules = (maze.max_steps, maze.step_penalty)
         self._sampled = ExactEvaluator(*rules)
         self._greedy = ExactEvaluator(*rules, greedy=True)
@@ -256,44 +255,14 @@ class MazeTask:
         }
 
     def statistics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
-        """What the Solvers trained on and how they fared there, each [K] from [K, P].
-
-        - ``obstacle_fraction``: obstacles per cell;
-        - ``path_length``, ``path_length_sd``: mean and standard deviation of the moves on the
-          shortest path, over the levels that have a path; both 0 where none has;
-        - ``solvable``: share of the levels whose goal can be reached within the step limit;
-        - ``train_success``: share of the levels whose goal the first episode reached.
-        """
+        """What the Solvers trained on; see :func:`~proposer_rl.mazes.records.level_statistics`."""
         length = shortest_path_length(levels)
-        mean, deviation = _moments(length.float(), length >= 0)
         solvable = (length >= 0) & (length <= self.maze.max_steps)
-        return TensorDict(
-            {
-                "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
-                "path_length": mean,
-                "path_length_sd": deviation,
-                "solvable": solvable.float().mean(-1),
-                "train_success": first_episode_success(rollout).float().mean(-1),
-            },
-            levels.batch_size[:1],
-        )
+        return level_statistics(levels, rollout, solvable)
 
     def record(self, levels: Level, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
         """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
-        return list(self._records(levels.cpu(), rollout))
-
-    def _records(self, levels: Level, rollout: TensorDictBase | None) -> Iterator[dict[str, Any]]:
-        for i, text in enumerate(levels.to_text()):
-            path = None if rollout is None else _first_episode(rollout[i])
-            lines = [list(line) for line in text.splitlines()]
-            for row, column in path or []:
-                if lines[row][column] == ".":
-                    lines[row][column] = EPISODE
-            yield {
-                "picture": png(draw_level(levels[i], path).numpy()),
-                "text": [" ".join(line) for line in lines],
-                **({} if path is None else {"path": path}),
-            }
+        return list(level_records(levels, rollout))
 
     def scores(self, agent: ActorCritic, name: str, max_steps: int | None) -> list[Score]:
         """How Solvers do on a distribution's levels, a file's or those of a set that comes along.
@@ -301,9 +270,12 @@ class MazeTask:
         Without a step limit a distribution has that of the task, so that the means are those of its
         measurements; other levels at least twice the shortest path.
         """
-        levels, slack = self._named_levels(name)
-        for named in levels.items():
-            self._check_size(*named)
+        drawn = {d: partial(self.evaluation_levels, d) for d in self.distributions}
+        files = (*SUFFIXES, RECORD)
+        levels, of_distribution = chosen_levels(name, drawn, files, read_levels, shipped_levels)
+        slack = 0 if of_distribution else SLACK
+        for named_level in levels.items():
+            self._check_size(*named_level)
         return score_levels(
             agent,
             levels,
@@ -325,24 +297,6 @@ class MazeTask:
     def _limit(self, length: int, slack: int = SLACK) -> int:
         """The step limit of a level, given the length of its shortest path."""
         return max(self.maze.max_steps, slack * length)
-
-    def _named_levels(self, name: str) -> tuple[dict[str, Level], int]:
-        """Levels, and the steps that they allow for each move of the shortest path."""
-        if Path(name).suffix in (*SUFFIXES, RECORD):
-            if not Path(name).exists():
-                raise ValueError(f"--levels {name}: there is no such file")
-            return read_levels(name), SLACK
-        for distribution in self.distributions:
-            if name.casefold() == distribution.casefold():
-                levels = self.evaluation_levels(distribution).cpu()
-                return {f"{distribution}_{i:03}": levels[i] for i in range(len(levels))}, 0
-        if name in shipped_sets():
-            return shipped_levels(name), SLACK
-        known = ", ".join([*self.distributions, *shipped_sets()])
-        raise ValueError(
-            f"--levels {name}: must be a file that ends in {' or '.join(SUFFIXES)}, a run's "
-            f"curriculum{RECORD}, or one of: {known}"
-        )
 
     def _describe(self, name: str) -> str:
         distribution = self.distributions[name]
@@ -386,13 +340,6 @@ def _precision(place: Place, network: NetworkSettings) -> str:
     return place.precision
 
 
-def _check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
-
-
 def _check_target(maze: MazeSettings, name: str, target: DistributionSettings) -> None:
     longest = max(length for _, length in target.specifications)
     if longest > maze.max_steps:
@@ -428,30 +375,7 @@ def _check_network(maze: MazeSettings, network: NetworkSettings) -> None:
             )
 
 
-def _named(key: str, make: Any, *arguments: Any) -> Any:
-    """Make something, naming the key in whatever is wrong with its value."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error
-
-
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
     """Levels [E], the same for all K Solvers, or [K, E]; [K, E] with the logits of every cell."""
     copies = levels.expand(agent.copies, levels.batch_size[-1])
     return copies, cell_logits(agent, planes(copies))
-
-
-def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of some of the values [*B, P], 0 of none: float [*B] each."""
-    count = which.sum(-1).clamp_min(1)
-    mean = (values * which).sum(-1) / count
-    square = (values - mean.unsqueeze(-1)).square()
-    return mean, ((square * which).sum(-1) / count).sqrt()
-
-
-def _first_episode(steps: TensorDictBase) -> list[list[int]]:
-    """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
-    ended = steps["next", "done"].squeeze(-1).tolist()
-    count = ended.index(True) + 1 if True in ended else len(ended)
-    return steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()

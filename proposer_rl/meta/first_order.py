@@ -37,6 +37,7 @@ from contextlib import contextmanager
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import GAE
 
 from proposer_rl.learning import PPO
@@ -228,7 +229,8 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
         advantage: of every step, float [K, P, T].
     """
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
-    steps = agent.decode(rollout.select(*agent.step_keys), context)
+    with set_recurrent_mode(True):
+        steps = agent.decode(rollout.select(*agent.step_keys), context)
     log_prob = agent.distribution(steps).log_prob(rollout[agent.action_key])
     # An action of several parts has one log-probability for each of them.
     return (advantage * log_prob.reshape(*advantage.shape, -1).sum(-1)).mean(-1)

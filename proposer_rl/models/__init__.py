@@ -9,6 +9,7 @@ from proposer_rl.models.actor_critic import (
     uniform_noise,
 )
 from proposer_rl.models.maps import cell_logits, cell_maps, map_actor_critic, read_maps
+from proposer_rl.models.memory import MemoryNetwork, memory_actor_critic
 from proposer_rl.models.population import Population, available_cores
 from proposer_rl.models.proposer import (
     MapEncoder,
@@ -23,6 +24,7 @@ from proposer_rl.models.unet import UNet, orthogonal_
 __all__ = [
     "ActorCritic",
     "MapEncoder",
+    "MemoryNetwork",
     "MixtureHead",
     "Population",
     "ProblemHead",
@@ -36,6 +38,7 @@ __all__ = [
     "fourier_encoding",
     "joint_categorical",
     "map_actor_critic",
+    "memory_actor_critic",
     "normal",
     "orthogonal_",
     "proposer_actor_critic",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -33,6 +33,9 @@ class ActorCritic(TensorDictModuleBase):
         copies: K if parameters and data carry independent copies as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
         action_key, log_prob_key, logits_key, value_key: the entries' names.
+        memory: of a head that remembers, the widths of its memory by the entries' names: it reads
+            them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
+            ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class ActorCritic(TensorDictModuleBase):
         log_prob_key: str = "action_log_prob",
         logits_key: str = "logits",
         value_key: str = "state_value",
+        memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
         self.head = head
@@ -60,7 +64,9 @@ class ActorCritic(TensorDictModuleBase):
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
         self.in_keys = [*self.level_keys, *self.step_keys]
-        self.out_keys = [logits_key, value_key]
+        self.memory = dict(memory or {})
+        self.memory_keys = [("next", key) for key in self.memory]
+        self.out_keys = [logits_key, value_key, *self.memory_keys]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
@@ -89,6 +95,12 @@ class ActorCritic(TensorDictModuleBase):
         for key in self.out_keys:
             tensordict.set(key, outputs.get(key))
         return tensordict
+
+    def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
+        """The memory before the first step of a batch like this tensordict's, [*B]: zeros."""
+        batch, device = tensordict.batch_size, tensordict.device
+        zeros = {key: torch.zeros(*batch, n, device=device) for key, n in self.memory.items()}
+        return TensorDict(zeros, batch, device=device)
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
         """The action's distribution, given a tensordict with logits."""

@@ -132,6 +132,7 @@ class Mazes:
 
     def __init__(self, observe_agent: bool = False) -> None:
         self.observe_agent = observe_agent
+        self.facts = {"exact": True}
 
     def learner(self, streams: range) -> PPO:
         return learner(len(streams), observe_agent=self.observe_agent, batched=True)

@@ -1,0 +1,123 @@
+"""The actor-critic with memory: through time at once, step by step, and against torch's LSTM."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
+from proposer_rl.models.memory import MEMORY
+
+K, N, T, F, M, A = 3, 4, 9, 5, 6, 2
+
+
+def network() -> MemoryNetwork:
+    return MemoryNetwork(nn.Linear(F, F), F, A, memory=M, head=7)
+
+
+def agent(copies: int = K, **how: Any) -> ActorCritic:
+    torch.manual_seed(0)
+    return memory_actor_critic(Population(network, copies, **how), ["x"], M)
+
+
+def steps(seed: int = 0, begins: float = 0.3) -> TensorDict:
+    draw = torch.Generator().manual_seed(seed)
+    entries = {
+        "x": torch.randn(K, N, T, F, generator=draw),
+        "is_init": torch.rand(K, N, T, 1, generator=draw) < begins,
+        **{key: torch.randn(K, N, T, M, generator=draw) for key in MEMORY},
+    }
+    return TensorDict(entries, [K, N, T])
+
+
+def through_time(actor_critic: ActorCritic, batch: TensorDict) -> TensorDict:
+    with set_recurrent_mode(True):
+        return actor_critic(batch.clone())
+
+
+def step_by_step(actor_critic: ActorCritic, batch: TensorDict) -> TensorDict:
+    """One call for each step, the memory carried by hand."""
+    taken, memory = [], batch[:, :, 0].select(*MEMORY)
+    for t in range(T):
+        taken.append(actor_critic(batch[:, :, t].clone().update(memory)))
+        memory = taken[-1]["next"].select(*MEMORY)
+    return torch.stack(taken, 2)  # type: ignore[return-value]
+
+
+def test_without_episodes_it_is_torchs_lstm() -> None:
+    torch.manual_seed(1)
+    ours, lstm = network(), nn.LSTM(F, M, batch_first=True)
+    lstm.load_state_dict({f"{name}_l0": value for name, value in ours.cell.state_dict().items()})
+    x, memory = torch.randn(N, T, F), torch.randn(2, N, M)
+    begins = torch.zeros(N, T, 1, dtype=torch.bool)
+    logits, _, hidden, cell = ours(begins, *memory, x)
+    expected, last = lstm(ours.encoder(x), tuple(m.unsqueeze(0) for m in memory))
+    torch.testing.assert_close(hidden, expected)
+    torch.testing.assert_close(cell[:, -1], last[1][0])
+    torch.testing.assert_close(logits, ours.policy(expected))
+    weights = torch.randn(N, T, A)
+    (logits * weights).sum().backward()
+    (ours.policy(expected) * weights).sum().backward()
+    for name, parameter in lstm.named_parameters():
+        torch.testing.assert_close(
+            getattr(ours.cell, name.removesuffix("_l0")).grad, parameter.grad
+        )
+
+
+def test_gradients_through_time_and_resets_are_slopes() -> None:
+    torch.manual_seed(2)
+    small = network().double()
+    begins = torch.rand(N, 4, 1) < 0.4
+    assert begins.any() and not begins.all()
+
+    def worth(x: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        return small(begins, hidden, cell, x)[:2]
+
+    inputs = [torch.randn(s, dtype=torch.double, requires_grad=True) for s in ((N, 4, F), (N, M))]
+    assert torch.autograd.gradcheck(worth, (*inputs, inputs[1].detach().clone()))
+
+
+@pytest.mark.parametrize("how", [{}, {"batched": True}], ids=["one by one", "batched"])
+def test_through_time_is_step_by_step(how: dict[str, Any]) -> None:
+    actor_critic, batch = agent(**how), steps()
+    with torch.no_grad():
+        at_once, one_by_one = through_time(actor_critic, batch), step_by_step(actor_critic, batch)
+    for key in actor_critic.out_keys:
+        torch.testing.assert_close(at_once[key], one_by_one[key], rtol=1e-5, atol=1e-6)
+
+
+def test_an_episode_knows_nothing_of_the_one_before() -> None:
+    actor_critic, batch = agent(), steps(begins=0.0)
+    batch["is_init"][:, :, 5] = True
+    other = batch.clone()
+    other["x"][:, :, :5], other[MEMORY[0]][:, :, 0] = 0.0, 3.0
+    with torch.no_grad():
+        one, another = (through_time(actor_critic, b)["logits"] for b in (batch, other))
+    assert torch.equal(one[:, :, 5:], another[:, :, 5:])
+    assert not torch.equal(one[:, :, 4], another[:, :, 4])
+
+
+def test_each_copy_remembers_by_itself() -> None:
+    actor_critic, batch = agent(), steps()
+    together = through_time(actor_critic, batch)
+    torch.manual_seed(0)
+    for k in range(K):
+        alone = memory_actor_critic(Population(network, 1), ["x"], M)
+        with torch.no_grad():
+            one = through_time(alone, batch[k : k + 1])
+        torch.testing.assert_close(together["logits"][k], one["logits"][0])
+    together["logits"][0].sum().backward()
+    for parameter in actor_critic.parameters():
+        if parameter.grad is not None:
+            assert not parameter.grad[1:].any()
+
+
+def test_memory_begins_at_zero() -> None:
+    memory = agent().no_memory(steps()[:, :, 0])
+    assert list(memory.keys()) == list(MEMORY) and memory.batch_size == (K, N)
+    assert all(not memory[key].any() and memory[key].shape == (K, N, M) for key in MEMORY)
