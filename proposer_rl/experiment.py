@@ -17,6 +17,7 @@ from proposer_rl.learning import PPO, Update, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
+from proposer_rl.runs.status import Status
 from proposer_rl.settings import Schedule
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -24,6 +25,7 @@ from proposer_rl.task import Task
 Log = Callable[[str, Mapping[str, Any], int], None]
 
 RECORDED_LEVELS = 8
+MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
 
 
 class Experiment:
@@ -41,6 +43,8 @@ class Experiment:
         signals: which may ask the run to stop; None where nothing does. A curriculum whose
             improvement takes long lets them interrupt it: see :meth:`StopSignals.check`.
         scope: put before the address of every random draw; tells several lives of one seed apart.
+        status: which tells what the run is doing; a curriculum may tell it of the parts of an
+            improvement.
 
     Raises:
         ValueError: if the headline is none of the task's measurements.
@@ -59,6 +63,7 @@ class Experiment:
         progress: bool = True,
         signals: StopSignals | None = None,
         scope: Sequence[str | int] = (),
+        status: Status | None = None,
     ) -> None:
         check_headline(task, schedule)
         self.task = task
@@ -75,6 +80,7 @@ class Experiment:
         self._progress = progress
         self._signals = signals or StopSignals()
         self._scope = tuple(scope)
+        self._status = status or Status()
         self._headline: list[float] = []
         self._checkpoints = 0
         self._seconds_before = 0.0
@@ -117,8 +123,7 @@ class Experiment:
             Interrupted: if a signal asked the run to stop; all is saved then.
             StorageError: if the disk does not take a file.
         """
-        if not self._resume():
-            self._measure()
+        resumed = self._resume()
         bar = tqdm(
             total=self.schedule.updates,
             initial=self.updates,
@@ -129,18 +134,28 @@ class Experiment:
             mininterval=0.1 if sys.stderr.isatty() else 30,
             dynamic_ncols=True,
         )
-        with bar:
+
+        def show() -> None:
+            doing = self._status.activity().text()
+            text = ", ".join(filter(None, [self._headline_text(), doing]))
+            bar.set_postfix_str(text, refresh=sys.stderr.isatty())
+
+        with bar, self._status.of_run(self.folder.path, show):
+            self._plan()
+            if not resumed:
+                self._measure()
             while self.updates < self.schedule.updates:
                 before = self.updates
+                self._plan()
                 cycle = self.updates // self.schedule.cycle_length
                 with located(f"cycle {cycle}, after {self.updates} Solver updates"):
                     if self.updates >= self.cycles * self.schedule.cycle_length:
                         self._improve()
                     else:
                         self._update()
-                bar.set_postfix_str(self._headline_text(), refresh=False)
                 bar.update(self.updates - before)
-        self._measure_levels()
+            bar.set_postfix_str(self._headline_text())
+            self._measure_levels()
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
@@ -173,7 +188,8 @@ class Experiment:
         while True:
             before = deepcopy(self._state())  # improving may change a curriculum's state in place
             try:
-                outcome = self.curriculum.improve(self.learner, self.updates, streams)
+                with self._status.phase(IMPROVING):
+                    outcome = self.curriculum.improve(self.learner, self.updates, streams)
                 break
             except StopRequested:
                 self._save(before)
@@ -197,15 +213,18 @@ class Experiment:
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
-        levels, frames, evaluations = self.curriculum.propose(self.learner, self.updates, streams)
-        self.curriculum_frames += frames
-        self.evaluations += evaluations
-        self.learner.env.set_levels(levels)
-        device = self.learner.env.device
-        update = self.learner.update(
-            [stream.generator("actions", device=device) for stream in streams]
-        )
-        self.learner.check()
+        with self._status.phase(TRAINING):
+            levels, frames, evaluations = self.curriculum.propose(
+                self.learner, self.updates, streams
+            )
+            self.curriculum_frames += frames
+            self.evaluations += evaluations
+            self.learner.env.set_levels(levels)
+            device = self.learner.env.device
+            update = self.learner.update(
+                [stream.generator("actions", device=device) for stream in streams]
+            )
+            self.learner.check()
         self.curriculum.observe(self.learner, levels, update)
         self.updates += 1
         last = self.updates == self.schedule.updates
@@ -214,9 +233,22 @@ class Experiment:
             self._record(levels, update)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
+    def _plan(self) -> None:
+        """Say what is left of the schedule."""
+        updates, length = self.schedule.updates, self.schedule.cycle_length
+        left = updates - self.updates
+        self._status.plan(
+            {
+                TRAINING: left,
+                IMPROVING: -(-updates // length) - self.cycles,
+                MEASURING: -(-left // self.schedule.evaluate_every),
+            }
+        )
+
     def _measure(self) -> None:
         """Append a row of measurements for every copy."""
-        measured = self.task.measure(self.learner.agent)
+        with self._status.phase(MEASURING):
+            measured = self.task.measure(self.learner.agent)
         self._headline = measured[self.schedule.headline].tolist()
         for seed, values in self._per_copy(measured):
             self._append("metrics.csv", seed, {**self.costs, **values})
@@ -259,6 +291,8 @@ class Experiment:
         return [Streams(seed, *self._scope, *scope) for seed in self.seeds]
 
     def _headline_text(self) -> str:
+        if not self._headline:
+            return ""
         mean = sum(self._headline) / len(self._headline)
         return f"{self.schedule.headline} {mean:.3f}"
 

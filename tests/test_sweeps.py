@@ -14,7 +14,6 @@ from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import read_csv, read_jsonl
-from proposer_rl.runs.signals import StopSignals
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
@@ -159,7 +158,7 @@ def composed(train, monkeypatch: pytest.MonkeyPatch):
     def call(*arguments: str) -> set[tuple[str, str, str, int]]:
         made = []
 
-        def note(config: RunConfig, signals: StopSignals):
+        def note(config: RunConfig, *_):
             (seed,) = config.seeds
             path = Path(HydraConfig.get().runtime.output_dir)
             made.append((path.parent.name, config.method, config.ablation, seed))

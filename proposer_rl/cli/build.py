@@ -27,6 +27,7 @@ from proposer_rl.methods import Parts, Workers
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.status import Status
 from proposer_rl.settings import ComputeSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Place, Task
@@ -40,12 +41,13 @@ class Made(NamedTuple):
     curriculum: Curriculum
 
 
-def parts(config: RunConfig, signals: StopSignals) -> Made:
+def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
     """Task, Solvers and curriculum of an experiment; nothing is written yet.
 
     Args:
         config: the run's settings.
         signals: which may interrupt a curriculum's long work.
+        status: which is told of its parts.
 
     Raises:
         ConfigError: if settings that are each valid do not go together.
@@ -55,7 +57,7 @@ def parts(config: RunConfig, signals: StopSignals) -> Made:
         task = make_task(config)
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
         check_headline(task, config.schedule)
-        return Made(task, learner, _curriculum(config, task, signals))
+        return Made(task, learner, _curriculum(config, task, signals, status))
     except ConfigError:
         raise
     except ValueError as error:
@@ -72,6 +74,7 @@ def build(
     folder: RunFolder,
     signals: StopSignals | None = None,
     scope: tuple[str | int, ...] = (),
+    status: Status | None = None,
 ) -> Experiment:
     """Put an experiment together.
 
@@ -81,6 +84,7 @@ def build(
         folder: the run's.
         signals: which may ask the run to stop.
         scope: of its random draws; empty, or the lifetime.
+        status: which tells what the run is doing.
     """
     return Experiment(
         *made,
@@ -91,6 +95,7 @@ def build(
         progress=config.compute.progress,
         signals=signals,
         scope=scope,
+        status=status,
     )
 
 
@@ -156,11 +161,15 @@ class EpisodeBar:
             self._bar = None
 
 
-def _curriculum(config: RunConfig, task: Task, signals: StopSignals) -> Curriculum:
+def _curriculum(
+    config: RunConfig, task: Task, signals: StopSignals, status: Status | None
+) -> Curriculum:
     bar = EpisodeBar(config.proposer.meta_episode_length, config.compute.progress)
 
     def on_update() -> None:
         bar()
+        if status is not None:
+            status.tick("training the copies")
         signals.check()
 
     chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task))

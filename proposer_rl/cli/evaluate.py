@@ -221,7 +221,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE|NAME",
         help="a distribution of the run such as id or ood; where the task has files of levels also "
         "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
-        "small, or shapes, the default there",
+        "shapes, the default there, or small",
     )
     parser.add_argument(
         "--max-steps",

@@ -34,6 +34,7 @@ from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.status import Status
 from proposer_rl.streams import Streams
 
 
@@ -66,10 +67,11 @@ def _main(hydra_config: DictConfig) -> float:
         forget_failure(path)
         check_order(overrides())
         config = read_config(hydra_config)
-        made = parts(config, signals)  # whatever is wrong with the input is found here
+        status = Status(config.proposer.meta_episode_length)
+        made = parts(config, signals, status)  # whatever is wrong with the input is found here
         with locked(path), signals:
             try:
-                return live(config, made, path, signals)
+                return live(config, made, path, signals, status)
             finally:
                 made.curriculum.close()
     except Exception as error:
@@ -87,7 +89,9 @@ def _refuse_pickles(arguments: list[str]) -> None:
         raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
 
 
-def live(config: RunConfig, made: Made, path: Path, signals: StopSignals) -> float:
+def live(
+    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status | None = None
+) -> float:
     """Run all lifetimes: one Solver after another, on a curriculum that goes on learning.
 
     Args:
@@ -95,6 +99,7 @@ def live(config: RunConfig, made: Made, path: Path, signals: StopSignals) -> flo
         made: as :func:`parts` makes it; the Solvers are those of the first lifetime.
         path: the run's folder, which has one for each lifetime if there are several.
         signals: which may ask the run to stop.
+        status: which tells what the run is doing.
 
     Returns:
         The headline measurement at the end of the last lifetime.
@@ -115,7 +120,7 @@ def live(config: RunConfig, made: Made, path: Path, signals: StopSignals) -> flo
                 raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
             made.curriculum.load_state_dict(latest[1]["curriculum"])
             made.curriculum.begin()
-        value = run(build(config, made, folder, signals, scope), config)
+        value = run(build(config, made, folder, signals, scope, status), config)
         before = folder
     return value
 

@@ -7,10 +7,14 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from proposer_rl.report.records import LONGEST_TEXT, printable
+from pydantic import BaseModel, Field
+
+from proposer_rl.report.records import LARGEST, LONGEST_TEXT, Text, checked, printable
 from proposer_rl.report.runs import FAILURE as FAILURE
 from proposer_rl.report.runs import Run, UnreadableRun, begun, read_run
+from proposer_rl.runs.status import FILE, Activity
 
 
 @dataclass(frozen=True)
@@ -22,12 +26,14 @@ class Progress:
         runs: its seeds; empty if it has not measured anything yet, or failed before.
         failure: why it failed, in one line; empty if it did not.
         age: seconds since something was written.
+        activity: what it was doing then, and how long the rest takes; empty if it does not say.
     """
 
     folder: Path
     runs: tuple[Run, ...]
     failure: str
     age: float
+    activity: str = ""
 
     @property
     def state(self) -> str:
@@ -48,7 +54,7 @@ def read_progress(folder: Path) -> Progress:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
             failure = printable(str(error).removeprefix(f"{folder}: "))
-    return Progress(folder, runs, failure, _age(folder))
+    return Progress(folder, runs, failure, _age(folder), _activity(folder))
 
 
 def find_progress(folder: Path) -> list[Progress]:
@@ -71,6 +77,26 @@ def _failure(folder: Path) -> str:
         return printable(str(json.loads(path.read_text())["message"]))[:LONGEST_TEXT]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return f"{FAILURE} cannot be read"
+
+
+class _Recorded(BaseModel):
+    doing: Text
+    done: int
+    of: int
+    seconds_left: Annotated[float, Field(ge=0, lt=LARGEST, allow_inf_nan=False)] | None
+    at_least: bool
+
+
+def _activity(folder: Path) -> str:
+    """What a run tells of itself; empty where it is over, or that cannot be read."""
+    path = folder / FILE
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**12:
+        return ""
+    try:
+        found = checked(_Recorded, json.loads(path.read_text(encoding="utf-8")), FILE)
+    except (OSError, ValueError, RecursionError):
+        return ""
+    return Activity(**found.model_dump()).text()
 
 
 def _age(folder: Path) -> float:

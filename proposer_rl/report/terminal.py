@@ -26,6 +26,7 @@ from proposer_rl.report.records import (
     words,
 )
 from proposer_rl.report.runs import Run, share_map
+from proposer_rl.runs.status import duration
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"
@@ -39,6 +40,8 @@ WIDEST_MAP = 20
 def screen(progress: Progress) -> RenderableType:
     """One run: how far it is, its curves, its last cycle, and what it trains on."""
     head = Text.assemble((progress.state, COLOURS[progress.state]), f", {_age(progress)}")
+    if progress.activity and not progress.failure:
+        head.append(f": {progress.activity}")
     if not progress.runs:
         return Panel(Group(head, Text(progress.failure)), title=_name(progress), title_align="left")
     run = progress.runs[0]
@@ -73,9 +76,14 @@ def overview(found: Sequence[Progress]) -> RenderableType:
         for name, progress in zip(names, found, strict=True)
         if progress.failure
     ]
+    going = [
+        Text(f"{name}: {progress.activity}")
+        for name, progress in zip(names, found, strict=True)
+        if progress.activity and not progress.failure
+    ]
     states = [progress.state for progress in found]
     counts = ", ".join(f"{states.count(state)} {state}" for state in COLOURS if state in states)
-    return Group(table, *failures, Text(f"{len(found)} runs: {counts}"))
+    return Group(table, *going, *failures, Text(f"{len(found)} runs: {counts}"))
 
 
 def sparkline(values: Iterable[float], low: float, high: float) -> str:
@@ -186,8 +194,4 @@ def _headline(progress: Progress) -> str:
 
 
 def _age(progress: Progress) -> str:
-    seconds = progress.age
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit} ago"
-    return f"{seconds:.0f} s ago"
+    return f"{duration(progress.age)} ago"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import html
 import re
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -267,3 +269,12 @@ def test_pictures_that_cannot_be_shown_leave_their_place_empty(
     assert (page.parent / "figures" / "samples.png").is_file()
     with Image.open(draw_run(folder, "$\\bad{")) as image:
         assert image.width > 500
+
+
+def test_only_what_writes_a_page_loads_its_library() -> None:
+    """Help, and looking at runs, must come at once."""
+    asked = (
+        "import sys, proposer_rl.cli.report, proposer_rl.cli.watch; print('plotly' in sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert said.stdout == "False\n"

@@ -56,6 +56,26 @@ def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
     assert "4 runs: 1 finished, 1 failed, 1 unfinished, 1 starting" in text
 
 
+def test_a_run_says_what_it_is_doing(tmp_path: Path, capsys) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    said = {"doing": "training the copies", "done": 37, "of": 100, "seconds_left": 18000.0}
+    (folder / "progress.json").write_text(json.dumps({**said, "at_least": False}))
+    text = " ".join(watch(capsys, str(folder)).split())
+    assert "ago: training the copies 37/100, about 5 h left" in text
+    write_run(tmp_path / "other")
+    assert "about 5 h left" in watch(capsys, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["{", "[]", '{"doing": "x\\u001b", "done": 1}', "[" * 3000, "x" * 5000, '{"doing": NaN}'],
+)
+def test_what_a_run_says_may_be_anything(content: str, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    (folder / "progress.json").write_text(content)
+    assert read_progress(folder).activity == ""
+
+
 def test_an_unreadable_run_is_said_to_have_failed(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "metrics.csv").write_text("a,b\n1,x\n")

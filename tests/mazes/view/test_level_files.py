@@ -11,6 +11,7 @@ from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 
 from benchmarks.minigrid_env import MiniGridMaze
 from proposer_rl.mazes.level_files import shipped_levels
+from proposer_rl.mazes.records import level_records
 from proposer_rl.mazes.view.level_files import read_view_levels, shipped_view_levels
 from proposer_rl.mazes.view.levels import ViewLevel
 from tests.mazes.view.oracles import random_levels
