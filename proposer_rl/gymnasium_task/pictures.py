@@ -79,7 +79,7 @@ class Camera:
             if number in moments:
                 frames.append(self._frame())
         shares = np.ones(len(frames))
-        shares[0] = len(frames)
+        shares[0] = 2
         return np.average(frames, 0, shares).astype(np.uint8)
 
     def _frame(self) -> NDArray[np.uint8]:

@@ -189,6 +189,23 @@ def test_of_images_and_continuous_actions_it_learns(image: bool) -> None:
         assert task.probe(learner.agent, levels[0]).shape == (2, 4, 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "shape", "answers"),
+    [("cartpole", (4,), 2), ("lunar_lander", (8,), 4), ("minigrid", (7, 7, 3), 7)],
+)
+def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: int) -> None:
+    task: Any = make_task(composed(f"task={name}", "+method=target", *TINY))
+    learner = task.learner([Streams(0)])
+    levels = task.target.sample(4, Streams(1).generator())
+    learner.env.set_levels(levels.unsqueeze(0))
+    rollout = learner.collect([Streams(2).generator()])
+    assert rollout["observation"].shape == (1, 4, 12, *shape)
+    assert task.probe(learner.agent, levels).shape == (1, 4, answers)
+    start, later = task.record(levels[:1], None), task.record(levels[:1], rollout[0, :1])
+    assert picture(start[0]).std() > 1 and not np.array_equal(picture(start[0]), picture(later[0]))
+    assert task.target_shares.count_nonzero() == 1  # all three targets are a bin's
+
+
 METHODS = [
     "perf_gain", "target", "domain_randomization", "hand_made", "plr", "robust_plr", "alp_gmm",
     "learning_progress curriculum.source=episodes", "first_order_sampled", "currot", "paired",
