@@ -266,6 +266,9 @@ def _first_line(error: ValidationError, values: Any, prefix: str) -> str:
     *folder, last = loc or [""]
     key = prefix + ".".join(map(str, loc))
     message = details["msg"].removeprefix("Value error, ")
+    if not meant:  # of a kind that there is not: the members' kinds are what there is
+        kinds = {str(e["ctx"]["expected"]) for e in errors if e["loc"][-1:] == ("kind",)}
+        message = f"input should be one of {', '.join(sorted(kinds))}"
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         siblings: Any = values
         for part in folder:
