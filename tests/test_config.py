@@ -223,7 +223,7 @@ WRONG_COMMANDS = [
     (["+method=3"], "Config group override must be a string or a list. Got int"),
     (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
     (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: paper, quick, smoke"),
-    (["+method=target", "task=none"], "task/none: unknown; choose one of: maze"),
+    (["+method=target", "task=none"], "task/none: unknown; choose one of: cartpole, gymnasium, lunar_lander, maze"),
     (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: action_repeat"),
     (["+method=plr", "+as=none"], "as/none: unknown; choose one of: dcd, dcd_accel, jaxued"),
     (["+method=plr", "+score=none"], "score/none: unknown; choose one of: sampled"),
