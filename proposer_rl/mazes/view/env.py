@@ -98,7 +98,8 @@ class ViewMazeEnv(LevelEnv):
             indexing="ij",
         )
         seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
-        self._ahead, self._seen = cell_index(ahead, width), cell_index(seen, width).flatten(1)
+        self._moves, self._ahead = ahead, cell_index(ahead, width)
+        self._seen = cell_index(seen, width).flatten(1).int()  # half the memory to go through
         self._first_view = self._view(self._place(levels.start), levels.direction)
 
     def _first(self) -> dict[str, Tensor]:
@@ -115,12 +116,12 @@ class ViewMazeEnv(LevelEnv):
         turned = (direction + torch.where(action == LEFT, -1, 1)) & 3
         direction = torch.where(forward, direction, turned)
         place = self._place(tensordict.get("agent"))
-        ahead = place + self._ahead[direction]
-        there = self._objects[ahead]
-        place = torch.where(forward & (there != WALL), ahead, place)
+        ahead = place + self._ahead.take(direction)
+        there = self._objects.take(ahead)
+        moved = forward & (there != WALL)
+        place = torch.where(moved, ahead, place)
         terminated = (forward & (there == GOAL)).unsqueeze(-1)
-        inside = place - self._origin
-        self._agent = torch.stack([inside // self._width, inside % self._width], -1) - RIM
+        self._agent = tensordict.get("agent") + self._moves[direction] * moved.unsqueeze(-1)
         ends = self._after(terminated, tensordict)
         reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
         return TensorDict(
@@ -141,7 +142,7 @@ class ViewMazeEnv(LevelEnv):
 
     def _view(self, place: Tensor, direction: Tensor) -> Tensor:
         seen = self._seen.index_select(0, direction.flatten())  # [N, 25]
-        cells = (seen + place.reshape(-1, 1)).flatten()
+        cells = (seen + place.reshape(-1, 1).int()).flatten()
         view = self._objects.index_select(0, cells).view(*place.shape, VIEW, VIEW)
         view[..., AGENT[0], AGENT[1]] = EMPTY
         return view

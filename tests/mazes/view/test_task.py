@@ -1,4 +1,4 @@
-"""The field's maze as a task: what the contract's own tests do not ask, and its commands."""
+"""The field's maze as a task: beyond the contract's own tests, and from the command line."""
 
 from __future__ import annotations
 
