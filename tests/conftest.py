@@ -5,6 +5,7 @@ import os
 # Before anything imports pyplot: tests draw into files, also where there is no display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -65,6 +66,17 @@ def train(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
             main()
         except SystemExit as end:
             return int(end.code or 0)
+        finally:
+            _forget_loggers()
         return 0
 
     return call
+
+
+def _forget_loggers() -> None:
+    """Hydra's loggers write to what stood for the terminal in the test that called the command."""
+    for logger in (logging.getLogger(), logging.getLogger("hydra")):
+        for handler in logger.handlers[:]:
+            if type(handler) in (logging.StreamHandler, logging.FileHandler):
+                logger.removeHandler(handler)
+                handler.close()
