@@ -296,6 +296,16 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     assert list(Path().iterdir()) == []
 
 
+def test_a_file_of_ones_own_that_is_no_yaml_gets_one_line(train, capsys, tmp_path: Path) -> None:
+    (tmp_path.parent / f"{tmp_path.name}_conf" / "method").mkdir(parents=True)
+    file = tmp_path.parent / f"{tmp_path.name}_conf" / "method" / "own.yaml"
+    file.write_text("# @package _global_\nmethod: own\ncurriculum: {_target_: [\n")
+    assert train("--config-dir", str(file.parents[1]), "+method=own") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ") and f'"{file}", line 4' in line
+    assert list(Path().iterdir()) == []
+
+
 REFUSED = [
     ["sede=1"],
     ["+method=target", "seed=-1"],

@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
+from yaml import YAMLError
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import ConfigError, RunConfig, check_order, read_config
@@ -49,7 +50,7 @@ def _compose_and_run() -> None:
     _refuse_pickles(sys.argv)
     try:
         _main()
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
     except ValueError as error:
