@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import count
 from pathlib import Path
 from signal import SIGKILL
@@ -101,8 +102,24 @@ class Processes:
         self._server.wait()
 
 
+def python(
+    code: str, *arguments: str, path: Path, folder: Path
+) -> subprocess.CompletedProcess[str]:
+    """Run some code in a fresh interpreter, with this folder of packages, and read what it says."""
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
 def serve() -> None:
     from proposer_rl.cli import train
+
+    import_module("proposer_rl.cli.run")  # what takes seconds, before the first fork
 
     for line in sys.stdin:
         values = json.loads(line)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from proposer_rl.cli.help import GROUPS, help_text
 from proposer_rl.cli.places import CONFIG_FOLDER
+from tests.processes import python
 from tests.tiny import composed
 
 FILES = [
@@ -59,14 +57,20 @@ def test_help_imports_nothing_that_takes_time(arguments: list[str], tmp_path: Pa
         "import sys; from proposer_rl.cli.start import main; main(); "
         "assert not {'torch', 'hydra', 'pydantic'} & sys.modules.keys()"
     )
-    ended = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(CONFIG_FOLDER.parent)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ended = python(code, *arguments, path=CONFIG_FOLDER.parent, folder=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout == help_text([]) + "\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", ["sede=1", "solver.batchsize=1", "+method=magic"])
+def test_a_wrong_key_is_told_without_what_takes_seconds(wrong: str, tmp_path: Path) -> None:
+    code = (
+        "import atexit, sys; from proposer_rl.cli.start import main; "
+        "atexit.register(lambda: print(sorted({'torch', 'matplotlib'} & sys.modules.keys()))); "
+        "main()"
+    )
+    ended = python(code, "+method=target", wrong, path=CONFIG_FOLDER.parent, folder=tmp_path)
+    assert ended.returncode == 2 and ended.stderr.startswith("error: "), ended.stderr
+    assert ended.stdout == "[]\n"
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import pytest
 import yaml
 
+from tests.processes import python
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -136,13 +138,6 @@ def test_levels_and_the_gymnasium_environment_come_along(
     said = installed("proposer-eval", "--help", folder=tmp_path)
     assert "that comes along: shapes" in " ".join(said.split())
     code = "import gymnasium; print(gymnasium.make('proposer_rl.mazes:proposer_rl/Maze-v0'))"
-    process = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(installed.site)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = python(code, path=installed.site, folder=tmp_path)
     assert process.returncode == 0, process.stderr
     assert "proposer_rl/Maze-v0" in process.stdout

@@ -11,9 +11,11 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.evaluate import main as evaluate_main
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
+from tests.gymnasium_task.toys import TINY
 from tests.report.folders import write_run
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -51,10 +53,13 @@ def test_the_commands_run(
 ) -> None:
     """Each command at the smallest scale: it is the words that are tested here."""
     small = [re.sub(r"^\+scale=.*", "+scale=smoke", word) for word in arguments]
-    # Scales are of mazes; another task has a file of its own for each.
-    small = [re.sub(r"^task=(\w+?)(_quick)?$", r"task=\1_smoke", word) for word in small]
-    if not {"+scale=smoke", "task=view_maze_smoke"} & set(small):
-        small.append("+scale=smoke")
+    tasks = [word.removesuffix("_quick") for word in small if word.startswith("task=")]
+    if not tasks:  # scales are of mazes
+        small = [*small, "+scale=smoke"] if "+scale=smoke" not in small else small
+    elif (CONFIG_FOLDER / "task" / f"{tasks[0][5:]}_smoke.yaml").exists():
+        small = [f"{tasks[0]}_smoke" if word.startswith("task=") else word for word in small]
+    else:
+        small += TINY
     if any(word.startswith("+sweep=") for word in small):
         # Of a sweep one run, in this process: there may be no cluster here. An ablation is one of
         # the sweep's own method.

@@ -164,7 +164,7 @@ def composed(train, monkeypatch: pytest.MonkeyPatch):
             made.append((path.parent.name, config.method, config.ablation, seed))
             raise KeyError("enough")
 
-        monkeypatch.setattr("proposer_rl.cli.train.parts", note)
+        monkeypatch.setattr("proposer_rl.cli.run.parts", note)
         assert train(*arguments) == 1
         assert len(set(made)) == len(made)
         return set(made)

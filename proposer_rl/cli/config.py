@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -176,17 +177,23 @@ def stored_config(file: Path) -> Any:
         raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
 
 
-def check_order(overrides: Sequence[str]) -> None:
+def overrides() -> list[str]:
+    """As given on the command line: what they refer to is the run's, not Hydra's own."""
+    given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
+    return list(given)
+
+
+def check_order(given: Sequence[str]) -> None:
     """Refuse an order in which one group would undo another: later ones win.
 
     Args:
-        overrides: as given on the command line.
+        given: overrides as they stand on the command line.
 
     Raises:
         ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them.
     """
     changed_by = None
-    for override in overrides:
+    for override in given:
         group = override.partition("=")[0]
         if group in ("+ablation", "+as", "+score"):
             changed_by = changed_by or group

@@ -11,11 +11,10 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import OmegaConf
 from rich.console import Console
 from tqdm import tqdm
 
-from proposer_rl.cli.config import RunConfig
+from proposer_rl.cli.config import RunConfig, overrides
 from proposer_rl.cli.help import choices
 from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
@@ -29,12 +28,6 @@ def run_name(config: RunConfig) -> str:
     """The run's name, in pictures and loggers."""
     ablation = "" if config.ablation == "none" else f"_{config.ablation}"
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
-
-
-def overrides() -> list[str]:
-    """As given on the command line: what they refer to is the run's, not Hydra's own."""
-    given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
-    return list(given)
 
 
 def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:

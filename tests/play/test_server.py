@@ -108,7 +108,7 @@ def test_the_run_is_told(page: Page) -> None:
     assert [(row["updates"], row["seed"]) for row in told["curriculum"]] == [
         (updates, seed) for updates in (2, 4, 6) for seed in (3, 5)
     ]
-    assert told["board"]["size"] == [5, 5] and told["board"]["sets"] == ["shapes"]
+    assert told["board"]["size"] == [5, 5] and told["board"]["sets"] == ["shapes", "small"]
 
 
 @pytest.mark.parametrize("solver", [0, 1])
