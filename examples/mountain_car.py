@@ -29,6 +29,7 @@ from proposer_rl import PPO, ActorCritic, Place, Population, SolverSettings, Str
 from proposer_rl.learning import first_episode_success
 from proposer_rl.models import categorical
 from proposer_rl.runs.pictures import png
+from proposer_rl.streams import each_from
 
 GRAVITIES, POWERS = (0.25, 0.5, 0.75, 1.0), (0.35, 0.7, 1.05, 1.4, 1.75)
 KINDS = torch.cartesian_prod(torch.tensor(GRAVITIES), torch.tensor(POWERS))
@@ -126,12 +127,7 @@ class MountainCarTask:
         }
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
-        weights = iter(streams)
-
-        def make() -> nn.Module:
-            with next(weights).as_default("weights"):
-                return MLP(2, 4, 2, 32)
-
+        make = each_from(streams, lambda: MLP(2, 4, 2, 32))
         network = Population(make, len(streams), batched=True)
         split = TensorDictModule(lambda x: x.split([3, 1], -1), ["x"], ["logits", "state_value"])
         head = TensorDictSequential(TensorDictModule(network, ["observation"], ["x"]), split)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from proposer_rl.streams import Streams
+from proposer_rl.streams import Streams, each_from
 
 
 def numbers(generator: torch.Generator) -> list[float]:
@@ -33,3 +33,13 @@ def test_code_without_a_generator_draws_from_the_stream_inside_only() -> None:
     assert torch.equal(torch.rand(2), expected)
     with Streams(1).as_default("weights"):
         assert torch.equal(torch.rand(3), inside)
+
+
+def test_each_network_has_the_weights_of_its_own_stream() -> None:
+    def make() -> torch.Tensor:
+        return torch.rand(3)
+
+    one_by_one = each_from([Streams(1), Streams(2)], make)
+    found = [one_by_one(), one_by_one()]
+    for seed, weights in zip((1, 2), found, strict=True):
+        assert weights.tolist() == numbers(Streams(seed).generator("weights"))

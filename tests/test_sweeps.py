@@ -14,6 +14,7 @@ from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import read_csv, read_jsonl
+from proposer_rl.runs.lock import locked
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
@@ -134,6 +135,18 @@ def test_a_failed_run_is_listed_and_tried_again(
     assert train(*sweep) == 0
     assert "3 runs: 3 finished" in capsys.readouterr().out
     assert not list(Path("all").rglob("error.json"))
+
+
+def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> None:
+    sweep = ["-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    taken = Path("all", "1_target_seed_1")
+    taken.mkdir(parents=True)
+    with locked(taken):
+        assert train(*sweep) == 0
+    assert "1_target_seed_1 is in use by process" in capsys.readouterr().err
+    assert not list(Path("all").rglob("error.json"))
+    assert train(*sweep) == 0
+    assert "2 runs: 2 finished" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from rich.console import Console
 from proposer_rl.report.progress import FAILURE, find_progress
 from proposer_rl.report.terminal import overview
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.lock import InUseError
 
 
 class SweepSummary(Callback):
@@ -39,6 +40,8 @@ def forget_failure(folder: Path) -> None:
 def record_failure(folder: Path, error: Exception, message: str, exit_code: int) -> float:
     """Record in a run's folder that it failed, and say so.
 
+    Of a run that another process is working on nothing is recorded: the folder is not ours.
+
     Args:
         folder: of the run.
         error: what happened.
@@ -48,8 +51,9 @@ def record_failure(folder: Path, error: Exception, message: str, exit_code: int)
     Returns:
         NaN, for the run's value.
     """
-    content = {"message": message, "kind": type(error).__name__, "exit_code": exit_code}
-    write_atomically(folder / FAILURE, (json.dumps(content, indent=2) + "\n").encode())
+    if not isinstance(error, InUseError):
+        content = {"message": message, "kind": type(error).__name__, "exit_code": exit_code}
+        write_atomically(folder / FAILURE, (json.dumps(content, indent=2) + "\n").encode())
     if exit_code == 1:
         traceback.print_exception(error)
     print(f"error: {message}", file=sys.stderr)

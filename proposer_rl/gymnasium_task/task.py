@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any
 
 import gymnasium
@@ -40,7 +40,7 @@ from proposer_rl.learning import PPO, first_episode_return, first_episode_succes
 from proposer_rl.models import ActorCritic, Population, categorical, normal
 from proposer_rl.runs.pictures import png
 from proposer_rl.settings import SolverSettings
-from proposer_rl.streams import Streams
+from proposer_rl.streams import Streams, each_from
 from proposer_rl.task import Place
 
 SAMPLES = 6  # levels of each distribution that a reader is shown
@@ -165,15 +165,11 @@ class GymnasiumTask:
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
         """PPO of K fresh Solvers, whose weights are drawn from the streams."""
-        weights, copies = iter(streams), len(streams)
-
-        def make() -> nn.Module:
-            with next(weights).as_default("weights"):
-                return SolverNetwork(self._seen, self._acts, self._network)
-
+        copies = len(streams)
+        one = partial(SolverNetwork, self._seen, self._acts, self._network)
         # MLPs as small as these are faster all at once.
         batched = True if len(self._seen.shape) == 1 else None
-        network = Population(make, copies, self.precision, self._cores, batched)
+        network = Population(each_from(streams, one), copies, self.precision, self._cores, batched)
         agent = ActorCritic(
             TensorDictModule(network, ["observation"], ["logits", "state_value"]),
             distribution_class=categorical if isinstance(self._acts, spaces.Discrete) else normal,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -48,18 +48,41 @@ def score_levels(
         ``return`` of the sampled policy, and of the greedy one, which takes the most probable
         actions, ``greedy_success`` (1 or 0) and ``greedy_return``.
     """
-    groups: dict[tuple[int, int, int], list[str]] = {}
     lengths = {name: int(shortest_path_length(level)) for name, level in levels.items()}
+    limits = {name: max_steps(length) for name, length in lengths.items()}
+    scores: list[Score] = []
+    for names, limit in alike(levels, limits, lambda cells: AT_ONCE // cells):
+        batch: Any = torch.stack([levels[name] for name in names])
+        named = [(name, lengths[name]) for name in names]
+        scores += _scored(agent, batch.to(device), named, limit, step_penalty)
+    return in_order_of(levels, scores)
+
+
+def alike(
+    levels: Mapping[str, Level], limits: Mapping[str, int], most: Callable[[int], int]
+) -> Iterator[tuple[list[str], int]]:
+    """Levels of one size and one step limit, which can be looked at together.
+
+    Args:
+        levels: Levels of batch shape ``[]`` by their names.
+        limits: The step limit of each.
+        most: How many go together, given the number of their cells; at least one does.
+
+    Yields:
+        Their names, and their step limit.
+    """
+    groups: dict[tuple[int, int, int], list[str]] = {}
     for name, level in levels.items():
         height, width = level.walls.shape
-        groups.setdefault((height, width, max_steps(lengths[name])), []).append(name)
-    scores: list[Score] = []
+        groups.setdefault((height, width, limits[name]), []).append(name)
     for (height, width, limit), members in groups.items():
         remaining = iter(members)
-        while names := list(islice(remaining, max(AT_ONCE // (height * width), 1))):
-            batch: Any = torch.stack([levels[name] for name in names])
-            named = [(name, lengths[name]) for name in names]
-            scores += _scored(agent, batch.to(device), named, limit, step_penalty)
+        while names := list(islice(remaining, max(most(height * width), 1))):
+            yield names, limit
+
+
+def in_order_of(levels: Mapping[str, Level], scores: Iterable[Score]) -> list[Score]:
+    """Scores in the levels' order, those of one level in the Solvers'."""
     place = {name: number for number, name in enumerate(levels)}
     return sorted(scores, key=lambda score: (place[score.level], score.solver))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.board import MazeBoard
@@ -52,7 +52,7 @@ from proposer_rl.models import (
     map_actor_critic,
 )
 from proposer_rl.settings import SolverSettings
-from proposer_rl.streams import Streams
+from proposer_rl.streams import Streams, each_from
 from proposer_rl.task import Place, Score
 
 ACTIONS = 4
@@ -187,13 +187,8 @@ class MazeTask:
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
         """PPO of K fresh Solvers, whose weights are drawn from the streams."""
-        weights = iter(streams)
-
-        def make() -> nn.Module:
-            with next(weights).as_default("weights"):
-                return self._make_network()
-
         copies = len(streams)
+        make = each_from(streams, self._make_network)
         network = Population(make, copies, self.precision, self.cores).to(self.device)
         # Placeholders of the right shape; every update sets its own levels.
         level = next(iter(self._measured_on.values()))[:1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from scipy.stats import binomtest
 from tensordict import TensorDictBase
 
 from proposer_rl.learning import RolloutPolicy
+from proposer_rl.mazes.level_scores import alike, in_order_of
 from proposer_rl.mazes.records import first_path
 from proposer_rl.mazes.rendering import draw_level
 from proposer_rl.mazes.view.distance import fewest_actions
@@ -51,25 +51,20 @@ def score_view_levels(
         of episodes that reached the goal, with the bounds of its 95 % interval (Wilson 1927),
         ``success_low`` and ``success_high``, and ``return``, the mean.
     """
-    groups: dict[tuple[int, int, int], list[str]] = {}
     fewest = {name: int(fewest_actions(level)) for name, level in levels.items()}
-    for name, level in levels.items():
-        height, width = level.walls.shape
-        groups.setdefault((height, width, max_steps(fewest[name])), []).append(name)
+    limits = {name: max_steps(actions) for name, actions in fewest.items()}
     scores: list[Score] = []
-    for (height, width, limit), members in groups.items():
-        remaining = iter(members)
-        while names := list(islice(remaining, max(AT_ONCE // episodes, 1))):
-            batch: Any = torch.stack([levels[name] for name in names]).to(device)
-            generator = streams.generator(names[0], device=device)
-            found = play(agent, batch, limit, episodes, generator).cpu()
-            about = {"height": height, "width": width, "max_steps": limit}
-            for i, name in enumerate(names):
-                told = {**about, "fewest_actions": fewest[name]}
-                draw = partial(_picture, agent, level=batch[i], limit=limit, streams=streams)
-                scores += _scored(found[:, i], name, told, episodes, draw)
-    place = {name: number for number, name in enumerate(levels)}
-    return sorted(scores, key=lambda score: (place[score.level], score.solver))
+    for names, limit in alike(levels, limits, lambda _: AT_ONCE // episodes):
+        batch: Any = torch.stack([levels[name] for name in names]).to(device)
+        generator = streams.generator(names[0], device=device)
+        found = play(agent, batch, limit, episodes, generator).cpu()
+        height, width = batch.walls.shape[-2:]
+        about = {"height": height, "width": width, "max_steps": limit}
+        for i, name in enumerate(names):
+            told = {**about, "fewest_actions": fewest[name]}
+            draw = partial(_picture, agent, level=batch[i], limit=limit, streams=streams)
+            scores += _scored(found[:, i], name, told, episodes, draw)
+    return in_order_of(levels, scores)
 
 
 def _scored(

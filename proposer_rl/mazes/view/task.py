@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.checks import check_names, named
@@ -36,7 +36,7 @@ from proposer_rl.mazes.view.settings import (
 )
 from proposer_rl.models import ActorCritic, MapEncoder, Population, memory_actor_critic
 from proposer_rl.settings import SolverSettings
-from proposer_rl.streams import Streams
+from proposer_rl.streams import Streams, each_from
 from proposer_rl.task import Place, Score
 
 SAMPLES = 6  # levels of each distribution that a reader is shown
@@ -156,13 +156,8 @@ class ViewMazeTask:
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
         """PPO of K fresh Solvers, whose weights are drawn from the streams."""
-        weights = iter(streams)
-
-        def make() -> nn.Module:
-            with next(weights).as_default("weights"):
-                return view_network(self._network)
-
         copies = len(streams)
+        make = each_from(streams, partial(view_network, self._network))
         population = Population(make, copies, self.precision, self._cores).to(self.device)
         # A placeholder of the right shape; every update sets its own levels.
         level = next(iter(self._measured_on.values()))[:1]
