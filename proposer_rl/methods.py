@@ -267,33 +267,46 @@ def learnability(
     return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
 
 
-def first_order_proposer(parts: Parts, target_levels: int, **numbers: Any) -> FirstOrderProposer:
+def first_order_proposer(
+    parts: Parts, target_levels: int, batches: int, **numbers: Any
+) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
     Args:
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
             them the probes, the network and PPO's other numbers.
         target_levels: see :class:`FirstOrderProposer`.
+        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
-    probes = parts.proposer.probe_levels
     return FirstOrderProposer(
-        parts.task, agent, settings, probe_levels=probes, target_levels=target_levels
+        parts.task,
+        agent,
+        settings,
+        probe_levels=parts.proposer.probe_levels,
+        batches=batches,
+        target_levels=target_levels,
     )
 
 
-def paired(parts: Parts, **numbers: Any) -> PairedProposer:
+def paired(parts: Parts, batches: int, **numbers: Any) -> PairedProposer:
     """Train on the draws of a policy that is paid the regret against a second Solver.
 
     Args:
         parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
+        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
-    streams = Streams(parts.seeds[0], "antagonist")
-    probes = parts.proposer.probe_levels
-    return PairedProposer(parts.task, agent, settings, streams=streams, probe_levels=probes)
+    return PairedProposer(
+        parts.task,
+        agent,
+        settings,
+        probe_levels=parts.proposer.probe_levels,
+        batches=batches,
+        streams=Streams(parts.seeds[0], "antagonist"),
+    )
 
 
 def _problem_policy(
