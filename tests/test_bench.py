@@ -83,7 +83,7 @@ def test_a_benchmark_that_fails_does_not_stop_the_others(
     bench, capsys, monkeypatch, tmp_path: Path
 ) -> None:
     # In the worker's own process nothing but the arguments can be changed from here.
-    monkeypatch.setattr("benchmarks.__main__.selected", lambda *_: ["absent", "levels"])
+    monkeypatch.setattr("benchmarks.command.selected", lambda *_: ["absent", "levels"])
     monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
     assert bench("--tiny", "--repeats", "1", "--threads", "1") == 1
     assert "KeyError: 'absent'" in capsys.readouterr().err
