@@ -66,10 +66,12 @@ class Workers(NamedTuple):
     Attributes:
         settings: how many there are, and where.
         make_task: makes the task in one of them, given its device; can be pickled.
+        tell: called now and then with the number of updates that all copies have had of an episode.
     """
 
     settings: WorkerSettings
     make_task: Callable[[str], Task]
+    tell: Callable[[int], None] = lambda done: None
 
 
 class Parts(NamedTuple):
@@ -80,14 +82,15 @@ class Parts(NamedTuple):
         proposer: the Proposer's settings.
         seeds: of the Solvers that are trained side by side; the first is that of a Proposer's
             weights.
-        on_update: called after every update of the copies, where they are trained in this process.
+        on_update: called with the number of an episode's updates after every one of the copies that
+            are trained in this process.
         workers: where else they are trained; None for this process.
     """
 
     task: Task
     proposer: ProposerSettings
     seeds: Sequence[int]
-    on_update: Callable[[], None] | None = None
+    on_update: Callable[[int], None] | None = None
     workers: Workers | None = None
 
 
@@ -151,9 +154,9 @@ def proposer(
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
     copies = None
     if parts.workers is not None:
-        settings, make_task = parts.workers
+        settings, make_task, tell = parts.workers
         make_env = partial(_worker_env, make_task, chosen, streams, reward)
-        copies = CopiesInWorkers(learner, make_env, settings)
+        copies = CopiesInWorkers(learner, make_env, settings, tell)
     return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
 
 
@@ -322,7 +325,7 @@ def _meta_env(
     streams: Streams,
     reward: rewards.Reward,
     share: range,
-    on_update: Callable[[], None] | None = None,
+    on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
     """The environment of a share of the K copies."""

@@ -270,7 +270,7 @@ class CellKind(NamedTuple):
     Attributes:
         mark: its character.
         name: what it is called, one word.
-        once: whether a drawing has exactly one of it.
+        once: whether a drawing has exactly one of it, or of all kinds of its name.
     """
 
     mark: str
@@ -284,7 +284,7 @@ class Board(Protocol):
     Attributes:
         kinds: of cells, the empty one first.
         size: rows and columns of the run's own levels.
-        actions: what each action is called: up, down, left and right, in any order.
+        actions: the arrow key of each action, up, down, left or right, in any order.
         sets: names of the sets of levels that come along.
     """
 
@@ -328,16 +328,22 @@ class Board(Protocol):
     ) -> dict[str, Any]:
         """What one of K Solvers does on a level [] with H x W cells, for JSON.
 
+        A way is a list of places: row and column, and where an agent turns its direction, too: 0
+        right, 1 down, 2 left, 3 up.
+
         - ``results``: numbers by name, ``success`` and ``return`` of the sampled policy among them;
+        - ``episodes``: by how many they were found; absent where they are exact;
         - ``policy``: for every cell the probability of each action; None where there is none to
-          take: [H][W][A];
+          take: [H][W][A]; absent where a Solver does not act by the cell alone;
         - ``maps``: further numbers of every cell by what they are, [H][W], None where there is
           none;
-        - ``paths``: ``solver``, the cells (row, column) of the most probable actions, and
-          ``shortest``, or None where there is no path;
-        - ``next``: where each action leads from each cell, [A][H * W], cells counted row by row;
+        - ``paths``: ``solver``, the way of the most probable actions, ``shortest``, or None where
+          there is no path, and without a policy ``sampled``, ways of sampled episodes;
+        - ``next``: where each action leads from each place, [A][H * W], cells counted row by row,
+          or [A][H * W * 4], the directions of each cell one after another;
         - ``goal``: the cell (row, column) that ends an episode with success;
-        - ``max_steps``, ``step_penalty``: the rules.
+        - ``max_steps``, ``step_penalty`` (of an episode that reaches the goal), ``missed`` (the
+          return of one that does not): the rules.
 
         Args:
             agent: K Solvers.

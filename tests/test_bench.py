@@ -61,7 +61,7 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
     bench, capsys, monkeypatch, tmp_path: Path
 ) -> None:
     # In the worker's own process nothing but the arguments can be changed from here.
-    monkeypatch.setattr("benchmarks.__main__.selected", lambda *_: ["absent", "shortest_paths"])
+    monkeypatch.setattr("benchmarks.command.selected", lambda *_: ["absent", "shortest_paths"])
     monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
     arguments = ["--tiny", "--repeats", "1", "--threads", "1", "--precision", "fp32"]
     assert bench(*arguments, "--output", "b.json") == 1

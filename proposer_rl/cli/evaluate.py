@@ -1,4 +1,4 @@
-"""``bin/eval`` and ``proposer-eval``: a trained Solver on named levels, one by one."""
+"""A trained Solver on named levels, one by one."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from rich.text import Text
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import check_output, positive, read_checkpoint, restored, write_rows
+from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.pictures import pixels
@@ -32,7 +31,6 @@ from proposer_rl.task import Score, ScoringTask, Task
 SHOWN = 36  # levels in the table and on the sheet of pictures
 COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
 DRAWN = 128  # levels of a distribution, where the task has no named ones
-MOST_STEPS = 10**5
 
 
 @dataclass(frozen=True)
@@ -68,19 +66,9 @@ class Evaluation:
         ]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    options = _parser().parse_args(arguments)
-    command(partial(_run, options))
-
-
-def _run(options: argparse.Namespace) -> None:
-    check_output("--output", options.output, (".json", ".csv"))
-    check_output("--pictures", options.pictures, (".png",))
-    try:
-        found = evaluate(options.checkpoint, options.levels, options.max_steps)
-    except ValueError as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+def run(options: argparse.Namespace) -> None:
+    """Evaluate, print and write what ``bin/eval`` was asked."""
+    found = evaluate(options.checkpoint, options.levels, options.max_steps)
     _print(found)
     if options.output is not None and options.output.suffix == ".csv":
         write_atomically(options.output, _csv(found.rows()))
@@ -206,45 +194,3 @@ def _sheet(found: Evaluation) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     return file.getvalue()
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="bin/eval",
-        description="Evaluate a trained Solver on named levels, one by one: as exactly as its task "
-        "can, on levels of any size where it has files of them.",
-        epilog="docs/levels.md describes such files and the sets that come along.",
-    )
-    parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")
-    parser.add_argument(
-        "--levels",
-        metavar="FILE|NAME",
-        help="a distribution of the run such as id or ood; where the task has files of levels also "
-        "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
-        "shapes, the default there, or small",
-    )
-    parser.add_argument(
-        "--max-steps",
-        type=_steps,
-        metavar="N",
-        help="step limit of every level, where the task lets it be chosen (the run's, or on levels "
-        "that are none of a distribution 2 for each move of the shortest path if this is more)",
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"
-    )
-    parser.add_argument(
-        "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"
-    )
-    return parser
-
-
-def _steps(text: str) -> int:
-    number = positive(text)
-    if number > MOST_STEPS:
-        raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_STEPS:,}, got {number}")
-    return number
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,6 @@ from pathlib import Path
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import choices
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.report.build import write_report
 
 EPILOG = """\
 examples:
@@ -32,6 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
+    from proposer_rl.report.runs import find_runs
+
+    find_runs(options.folder)  # refuses what is none, before what takes seconds to import
+    from proposer_rl.report.build import write_report
+
     page = write_report(
         options.folder,
         options.output,
