@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.errors import command
-from proposer_rl.cli.help import choices
+from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.report.build import write_report
+from proposer_rl.report.pages import write_pages
 
 EPILOG = """\
 examples:
@@ -19,6 +20,7 @@ examples:
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
+  bin/report sweeps/medium --pages docs/findings   the two pages of the docs
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -32,6 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
+    if options.pages is not None:
+        asked = (options.threshold, options.baseline)
+        for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
+            print(f"Page: {page}")
+        return
     page = write_report(
         options.folder,
         options.output,
@@ -53,8 +60,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth"
     )
-    parser.add_argument(
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"
+    )
+    where.add_argument(
+        "--pages",
+        type=Path,
+        metavar="FOLDER",
+        help="write two pages of the docs there instead: which curriculum to use, and which claims "
+        "hold",
     )
     parser.add_argument(
         "--threshold",
