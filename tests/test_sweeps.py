@@ -112,6 +112,9 @@ def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
     assert len(after) == 4 and before.items() <= after.items()
     said = capsys.readouterr().out
     assert said.count("finished before, nothing to do") == 1 and "4 runs: 4 finished" in said
+    told = [line for line in said.splitlines() if line.startswith("sweep: ")]
+    left = [line.partition(",")[0] for line in told]
+    assert left == [f"sweep: {n} of 4 runs left" for n in (3, 2, 1, 0)]
 
 
 def test_a_failed_run_is_listed_and_tried_again(
