@@ -11,7 +11,7 @@ from pathlib import Path
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.report.build import write_report
+from proposer_rl.report.build import OutputError, write_report
 from proposer_rl.report.pages import write_pages
 
 EPILOG = """\
@@ -35,10 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     if options.pages is not None:
-        asked = (options.threshold, options.baseline)
+        asked = (options.threshold, options.baseline, options.scores)
         for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
             print(f"Page: {page}")
         return
+    if options.scores is not None:
+        raise OutputError("--scores: only the pages of the docs take them up; give --pages, too")
     page = write_report(
         options.folder,
         options.output,
@@ -81,6 +83,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="METHOD",
         help="what the others are measured against, as the report calls it (default: "
         "domain_randomization, else the first)",
+    )
+    parser.add_argument(
+        "--scores",
+        type=Path,
+        metavar="FILE",
+        help="of these runs on further levels, as bin/eval writes them: for --pages",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

@@ -21,13 +21,14 @@ from proposer_rl.report.decision import (
     usable,
 )
 from proposer_rl.report.findings import GAIN, TITLE, Evidence, finding_table, paper_findings
+from proposer_rl.report.generalisation import generalisation_table, read_scores
 from proposer_rl.report.own_findings import own_findings
 from proposer_rl.report.records import words
 from proposer_rl.report.runs import find_runs
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, in_few_colours, save
-from proposer_rl.report.tables import escape_markdown
+from proposer_rl.report.tables import Table, escape_markdown
 
 CHOICE, CLAIMS = "which_curriculum.md", "claims.md"
 SCARCE = ("updates of the Solver", "environment frames", "seconds")
@@ -47,6 +48,7 @@ def write_pages(
     needs: Needs,
     threshold: float | None = None,
     baseline: str | None = None,
+    scores: Path | None = None,
 ) -> list[Path]:
     """Write the pages.
 
@@ -56,6 +58,7 @@ def write_pages(
         needs: what methods need, for runs that do not tell.
         threshold: see :func:`~proposer_rl.report.build.write_report`.
         baseline: the same.
+        scores: of the runs on further levels, as ``bin/eval`` writes them.
 
     Returns:
         The pages.
@@ -71,9 +74,11 @@ def write_pages(
         raise OutputError(f"--pages: the runs were not measured alike ({titles}); give fewer")
     (study,) = studies
     asked = shlex.split(page.report_command(folders, threshold, baseline))
+    asked += [] if scores is None else ["--scores", str(scores)]
     command = shlex.join([*asked, "--pages", "docs/findings"])
+    others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
-    pages = {CHOICE: _choice(study, needs, files), CLAIMS: _claims(study, needs, files)}
+    pages = {CHOICE: _choice(study, needs, files), CLAIMS: _claims(study, needs, others, files)}
     for name, parts in pages.items():
         lines = [*parts, "## How this page is made", _origin(study, command, notes)]
         files[name] = ("\n\n".join(lines) + "\n").encode()
@@ -138,7 +143,7 @@ def _budgets(study: Study) -> str:
     )
 
 
-def _claims(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
+def _claims(study: Study, needs: Needs, others: Table, files: dict[str, bytes]) -> list[str]:
     """The page for who wants to know what is true."""
     drawn = [drawing for draw in DRAWINGS if (drawing := draw(study)) is not None]
     # Strips under each other would be twice as high as a screen.
@@ -167,6 +172,8 @@ def _claims(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
     for title, name in sections.items():
         if name in figures:
             parts += [f"## {title}", figures[name], told[name]]
+    if len(others.columns) > 1:
+        parts += [f"## {others.title}", others.to_markdown().strip(), others.note]
     return parts
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,8 +18,15 @@ from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.decision import budgets, choices
+from proposer_rl.report.generalisation import (
+    Score,
+    generalisation_table,
+    read_scores,
+    write_scores,
+)
 from proposer_rl.report.own_findings import own_findings
 from proposer_rl.report.pages import CHOICE, CLAIMS
+from proposer_rl.report.runs import UnreadableRun
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.tables import write
@@ -209,6 +217,27 @@ def test_the_pages_say_what_was_found(pages: Path) -> None:
     for page in (text, claims):
         for picture in re.findall(r"!\[[^]]+\]\((.*)\)", page):
             assert (pages / picture).is_file()
+
+
+def test_other_levels_are_told_by_method(runs: Path, tmp_path: Path) -> None:
+    """A mean over the seeds of each; a score of other updates is none of the end."""
+    scores = [
+        Score(folder.name, int(folder.name[-1]), updates, "big, new", 7, 0.1 * rank, math.nan)
+        for rank, folder in enumerate(sorted(runs.glob("ncc_*")), 1)
+        for updates in (50, 40)
+    ]
+    (tmp_path / "scores.csv").write_bytes(write_scores(scores))
+    for read, score in zip(read_scores(tmp_path / "scores.csv"), scores, strict=True):
+        assert read[:5] == score[:5] and read[5:] == pytest.approx(score[5:], nan_ok=True)
+    found = generalisation_table(study_of(runs), read_scores(tmp_path / "scores.csv"))
+    of = {row["method"]: row for row in found.rows}
+    assert of["ncc"]["big, new"].estimate == pytest.approx(0.3)  # type: ignore[union-attr]
+    assert of["target"]["big, new"] is None
+    worst = of["ncc"]["OOD success on the worst 10 %"].estimate  # type: ignore[union-attr]
+    assert worst == pytest.approx(0.45 * np.mean([1 - 0.01 * seed for seed in range(SEEDS)]))
+    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(UnreadableRun, match="holds no scores of runs"):
+        read_scores(tmp_path / "scores.csv")
 
 
 def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Path, capsys) -> None:
