@@ -1,4 +1,8 @@
-"""Methods: how a curriculum is put together from the task's parts. A method's config names one."""
+"""Methods: how a curriculum is put together from the task's parts. A method's config names one.
+
+Each is a factory of the :class:`Parts` and the config's numbers, which are mostly those of the
+curriculum that it makes.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from tensordict import TensorDict
 from torch import nn
@@ -53,6 +57,8 @@ from proposer_rl.settings import MixtureSettings, PPOSettings, ProblemSettings, 
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
+Made = TypeVar("Made", bound=Curriculum)
+
 
 class Workers(NamedTuple):
     """Other processes in which copies are trained.
@@ -60,10 +66,12 @@ class Workers(NamedTuple):
     Attributes:
         settings: how many there are, and where.
         make_task: makes the task in one of them, given its device; can be pickled.
+        tell: called now and then with the number of updates that all copies have had of an episode.
     """
 
     settings: WorkerSettings
     make_task: Callable[[str], Task]
+    tell: Callable[[int], None] = lambda done: None
 
 
 class Parts(NamedTuple):
@@ -74,14 +82,15 @@ class Parts(NamedTuple):
         proposer: the Proposer's settings.
         seeds: of the Solvers that are trained side by side; the first is that of a Proposer's
             weights.
-        on_update: called after every update of the copies, where they are trained in this process.
+        on_update: called with the number of an episode's updates after every one of the copies that
+            are trained in this process.
         workers: where else they are trained; None for this process.
     """
 
     task: Task
     proposer: ProposerSettings
     seeds: Sequence[int]
-    on_update: Callable[[], None] | None = None
+    on_update: Callable[[int], None] | None = None
     workers: Workers | None = None
 
 
@@ -145,9 +154,9 @@ def proposer(
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
     copies = None
     if parts.workers is not None:
-        settings, make_task = parts.workers
+        settings, make_task, tell = parts.workers
         make_env = partial(_worker_env, make_task, chosen, streams, reward)
-        copies = CopiesInWorkers(learner, make_env, settings)
+        copies = CopiesInWorkers(learner, make_env, settings, tell)
     return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
 
 
@@ -155,9 +164,6 @@ def task_difficulty(parts: Parts) -> ProposerCurriculum:
     """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
 
     The paper's ablation; no other reward can be put in its place.
-
-    Args:
-        parts: the task, and the Proposer's settings.
     """
     return proposer(parts, rewards.task_difficulty)
 
@@ -196,24 +202,20 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
     )
 
 
-def first_order_gain(parts: Parts, **numbers: Any) -> FirstOrderCurriculum:
-    """Train on the bins whose levels raise the target's performance most, to first order.
+def _of_task(make: Callable[..., Made]) -> Callable[..., Made]:
+    """Makes the factory of a curriculum that needs the task alone, and numbers of its own."""
 
-    Args:
-        parts: the task, whose performance must have gradients.
-        numbers: see :class:`FirstOrderCurriculum`.
-    """
-    return FirstOrderCurriculum(parts.task, **numbers)
+    def factory(parts: Parts, **numbers: Any) -> Made:
+        return make(parts.task, **numbers)
+
+    return factory
 
 
-def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurriculum:
-    """The same from episodes, for any task.
-
-    Args:
-        parts: the task.
-        numbers: see :class:`SampledFirstOrderCurriculum`.
-    """
-    return SampledFirstOrderCurriculum(parts.task, **numbers)
+first_order_gain = _of_task(FirstOrderCurriculum)
+first_order_sampled = _of_task(SampledFirstOrderCurriculum)
+learning_progress = _of_task(LearningProgressCurriculum)
+alp_gmm = _of_task(MixtureCurriculum)
+currot = _of_task(TransportCurriculum)
 
 
 def replay(
@@ -230,18 +232,10 @@ def replay(
 ) -> ReplayCurriculum:
     """Train on levels that are kept by their scores.
 
-    Args:
-        parts: the task.
-        score: of a level; see :class:`~proposer_rl.curricula.scores.Scorer`.
-        source: of the score.
-        rollouts: on each level that is only scored, from episodes.
-        prioritization: see :class:`~proposer_rl.curricula.buffer.ReplayRule`.
-        temperature: the same.
-        best: the same.
-        staleness: the same.
-        new_levels: the bins that they come from: for some of the space's axes, by name, the values
-            that count; None for the whole space.
-        numbers: see :class:`ReplayCurriculum`.
+    ``score``, ``source`` and ``rollouts`` are those of :class:`Scorer`, ``prioritization``,
+    ``temperature``, ``best`` and ``staleness`` those of :class:`ReplayRule`. ``new_levels`` says
+    what bins new levels come from, for some of the space's axes, by name, the values that count;
+    None for the whole space. Further numbers: see :class:`ReplayCurriculum`.
     """
     rule = ReplayRule(
         prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
@@ -257,43 +251,51 @@ def learnability(
 ) -> SelectionCurriculum:
     """Train on levels that stood out among many, and on new ones.
 
-    Args:
-        parts: the task.
-        score: of a level; see :class:`~proposer_rl.curricula.scores.Scorer`.
-        source: of the score.
-        rollouts: on each candidate, from episodes.
-        numbers: see :class:`SelectionCurriculum`.
+    The scorer as for :func:`replay`; further numbers: see :class:`SelectionCurriculum`.
     """
     return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
 
 
-def first_order_proposer(parts: Parts, target_levels: int, **numbers: Any) -> FirstOrderProposer:
+def first_order_proposer(
+    parts: Parts, target_levels: int, batches: int, **numbers: Any
+) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
     Args:
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
             them the probes, the network and PPO's other numbers.
         target_levels: see :class:`FirstOrderProposer`.
+        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
-    probes = parts.proposer.probe_levels
     return FirstOrderProposer(
-        parts.task, agent, settings, probe_levels=probes, target_levels=target_levels
+        parts.task,
+        agent,
+        settings,
+        probe_levels=parts.proposer.probe_levels,
+        batches=batches,
+        target_levels=target_levels,
     )
 
 
-def paired(parts: Parts, **numbers: Any) -> PairedProposer:
+def paired(parts: Parts, batches: int, **numbers: Any) -> PairedProposer:
     """Train on the draws of a policy that is paid the regret against a second Solver.
 
     Args:
         parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
+        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
-    streams = Streams(parts.seeds[0], "antagonist")
-    probes = parts.proposer.probe_levels
-    return PairedProposer(parts.task, agent, settings, streams=streams, probe_levels=probes)
+    return PairedProposer(
+        parts.task,
+        agent,
+        settings,
+        probe_levels=parts.proposer.probe_levels,
+        batches=batches,
+        streams=Streams(parts.seeds[0], "antagonist"),
+    )
 
 
 def _problem_policy(
@@ -317,43 +319,13 @@ def _problem_policy(
     return agent, PPOSettings(horizon=1, **asdict(numbers))
 
 
-def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculum:
-    """Train on the bins in which the Solver's success changes fastest.
-
-    Args:
-        parts: the task.
-        numbers: see :class:`LearningProgressCurriculum`.
-    """
-    return LearningProgressCurriculum(parts.task, **numbers)
-
-
-def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
-    """Train on levels from Gaussians in the space with much absolute learning progress.
-
-    Args:
-        parts: the task.
-        numbers: see :class:`MixtureCurriculum`.
-    """
-    return MixtureCurriculum(parts.task, **numbers)
-
-
-def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
-    """Train on a distribution over bins that moves to the target through what is mastered.
-
-    Args:
-        parts: the task, which must know where its target lies.
-        numbers: see :class:`TransportCurriculum`.
-    """
-    return TransportCurriculum(parts.task, **numbers)
-
-
 def _meta_env(
     task: Task,
     chosen: ProposerSettings,
     streams: Streams,
     reward: rewards.Reward,
     share: range,
-    on_update: Callable[[], None] | None = None,
+    on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
     """The environment of a share of the K copies."""

@@ -182,6 +182,36 @@ class OptimalTask(Protocol):
         """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
 
 
+class EpisodeLaw(NamedTuple):
+    """The law of a Solver's episodes on levels [*B], in two tables.
+
+    Attributes:
+        outcome: returns that an episode can have, float64 [*B, O].
+        probability: of each, float64 [*B, O].
+        weight: of every step that can be taken, a state with an action: the expectation of its
+            share of an episode's steps, float64 [*B, M]. So the sum of weight times any number is
+            the expectation of that number's mean over the steps of an episode.
+        reward: of the step, float64 [*B, M].
+        value: that the critic gives the state before it, float64 [*B, M].
+        next_value: the same of the state after it, 0 where the step terminates the episode.
+    """
+
+    outcome: Tensor
+    probability: Tensor
+    weight: Tensor
+    reward: Tensor
+    value: Tensor
+    next_value: Tensor
+
+
+@runtime_checkable
+class EnumerableTask(Protocol):
+    """A task all of whose episodes can be told: scores of spread and of the critic, exactly."""
+
+    def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
+        """The law of the episodes of K Solvers, each on its own levels [K, E]."""
+
+
 @runtime_checkable
 class EditableTask(Protocol):
     """A task whose levels can be changed a little."""
@@ -240,7 +270,7 @@ class CellKind(NamedTuple):
     Attributes:
         mark: its character.
         name: what it is called, one word.
-        once: whether a drawing has exactly one of it.
+        once: whether a drawing has exactly one of it, or of all kinds of its name.
     """
 
     mark: str
@@ -254,7 +284,7 @@ class Board(Protocol):
     Attributes:
         kinds: of cells, the empty one first.
         size: rows and columns of the run's own levels.
-        actions: what each action is called: up, down, left and right, in any order.
+        actions: the arrow key of each action, up, down, left or right, in any order.
         sets: names of the sets of levels that come along.
     """
 
@@ -298,16 +328,22 @@ class Board(Protocol):
     ) -> dict[str, Any]:
         """What one of K Solvers does on a level [] with H x W cells, for JSON.
 
+        A way is a list of places: row and column, and where an agent turns its direction, too: 0
+        right, 1 down, 2 left, 3 up.
+
         - ``results``: numbers by name, ``success`` and ``return`` of the sampled policy among them;
+        - ``episodes``: by how many they were found; absent where they are exact;
         - ``policy``: for every cell the probability of each action; None where there is none to
-          take: [H][W][A];
+          take: [H][W][A]; absent where a Solver does not act by the cell alone;
         - ``maps``: further numbers of every cell by what they are, [H][W], None where there is
           none;
-        - ``paths``: ``solver``, the cells (row, column) of the most probable actions, and
-          ``shortest``, or None where there is no path;
-        - ``next``: where each action leads from each cell, [A][H * W], cells counted row by row;
+        - ``paths``: ``solver``, the way of the most probable actions, ``shortest``, or None where
+          there is no path, and without a policy ``sampled``, ways of sampled episodes;
+        - ``next``: where each action leads from each place, [A][H * W], cells counted row by row,
+          or [A][H * W * 4], the directions of each cell one after another;
         - ``goal``: the cell (row, column) that ends an episode with success;
-        - ``max_steps``, ``step_penalty``: the rules.
+        - ``max_steps``, ``step_penalty`` (of an episode that reaches the goal), ``missed`` (the
+          return of one that does not): the rules.
 
         Args:
             agent: K Solvers.

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 BIN = Path(__file__).resolve().parents[1] / "bin"
-STARTED = re.compile(r'^exec "\$PYTHON" -m (\S+) "\$@"$', re.MULTILINE)
+STARTED = re.compile(r'^exec "\$PYTHON" -m (\S.*) "\$@"$', re.MULTILINE)
 MODULES = {
     file.name: started[1]
     for file in sorted(BIN.iterdir())
@@ -56,7 +56,7 @@ def test_they_start_their_modules_through_links(
             text=True,
             check=True,
         )
-        expected = [BIN.parent, tmp_path, "-m", MODULES[name], "--help", "two words"]
+        expected = [BIN.parent, tmp_path, "-m", *MODULES[name].split(), "--help", "two words"]
         assert ended.stdout.splitlines() == [str(part) for part in expected]
 
 

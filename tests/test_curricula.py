@@ -264,7 +264,7 @@ def test_an_interrupted_episode_is_played_again(advance: str) -> None:
     class Stop(Exception):
         """An interruption."""
 
-    def stop() -> None:
+    def stop(done: int) -> None:
         raise Stop
 
     whole, solver = proposer(advance, **HELD), learners(1)
@@ -276,7 +276,7 @@ def test_an_interrupted_episode_is_played_again(advance: str) -> None:
     with pytest.raises(Stop):
         broken_off.improve(again, 0, cycle(0))
     # In the same process, and in another one.
-    broken_off.trainer.env.on_update = lambda: None
+    broken_off.trainer.env.on_update = lambda done: None
     for resumed in (broken_off, proposer(advance, **HELD)):
         fresh = learners(1)
         resumed.load_state_dict(before)

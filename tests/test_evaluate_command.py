@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.cli.evaluate import SHOWN, main
+from proposer_rl.cli.evaluate import SHOWN
+from proposer_rl.cli.instruments import evaluate as main
 from proposer_rl.cli.train import main as train
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from proposer_rl.cli import foresight, train
+from proposer_rl.cli import train
 from proposer_rl.cli.foresight import agreement
+from proposer_rl.cli.instruments import foresight
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
@@ -50,13 +51,13 @@ def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     train.main()
     sizes = ["--ahead", "1", "2", "--proposals", "4", "--copies", "1", "--levels", "8"]
     monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes, "--output", str(output)])
-    foresight.main()
+    foresight()
     rows = json.loads(output.read_text())
     stages = len(list((run / "checkpoints").glob("*.pt")))
     assert [row["ahead"] for row in rows] == [1, 2] * stages
     assert all(-1 <= row["rank"] <= 1 for row in rows)
     monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes[:3], "--proposals", "3"])
     with pytest.raises(SystemExit) as stopped:
-        foresight.main()
+        foresight()
     assert stopped.value.code == 2
     assert "at least 4 proposals are needed, got 3" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,10 @@ import pytest
 from proposer_rl.cli.help import GROUPS, help_text
 from proposer_rl.cli.places import CONFIG_FOLDER
 from tests.processes import python
+from tests.test_bin import MODULES
 from tests.tiny import composed
 
+SLOW = {"torch", "matplotlib", "plotly", "scipy"}
 FILES = [
     file for group in GROUPS for file in sorted((CONFIG_FOLDER / group.strip("+=")).glob("*.yaml"))
 ]
@@ -61,6 +64,39 @@ def test_help_imports_nothing_that_takes_time(arguments: list[str], tmp_path: Pa
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout == help_text([]) + "\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def ends(command: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    """How a command of bin/ ends; the last line is what it imported that takes seconds."""
+    code = (
+        "import atexit, runpy, sys; "
+        f"atexit.register(lambda: print(sorted({SLOW} & sys.modules.keys()))); "
+        "runpy.run_module(sys.argv.pop(1), run_name='__main__')"
+    )
+    words = map(str, (*MODULES[command].split(), *arguments))
+    return python(code, *words, path=CONFIG_FOLDER.parent, folder=folder)
+
+
+@pytest.mark.parametrize("command", sorted(MODULES))
+def test_no_commands_help_imports_what_takes_seconds(command: str, tmp_path: Path) -> None:
+    ended = ends(command, "--help", folder=tmp_path)
+    assert ended.returncode == 0 and command in ended.stdout, ended.stderr
+    assert ended.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [("report", ["nowhere"]), ("play", ["nowhere"]), ("watch", ["nowhere"])]
+    + [(name, ["run", "run", "--output", "rows.txt"]) for name in ("foresight", "look", "snr")]
+    + [("eval", ["run", "--output", "rows.txt"])],
+)
+def test_a_refused_argument_imports_nothing_that_takes_seconds(
+    command: str, arguments: list[str], tmp_path: Path
+) -> None:
+    ended = ends(command, *arguments, folder=tmp_path)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 2 and line.startswith("error: ") and arguments[-1] in line
+    assert ended.stdout == "[]\n"
 
 
 @pytest.mark.parametrize("wrong", ["sede=1", "solver.batchsize=1", "+method=magic"])

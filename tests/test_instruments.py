@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.cli import look, snr, train
+from proposer_rl.cli.instruments import EXPLORATIONS, look, snr
+from proposer_rl.cli.train import main as train
 
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"]
 
@@ -18,7 +19,7 @@ def call(command, *arguments: str) -> int:
     before, sys.argv = sys.argv, ["command", *arguments]
     try:
         GlobalHydra.instance().clear()
-        command.main()
+        command()
     except SystemExit as end:
         return int(end.code or 0)
     finally:
@@ -40,7 +41,7 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
     rows = json.loads(output.read_text())
     stages = sorted({row["updates"] for row in rows})
     assert stages == [4, 6]
-    assert len(rows) == len(stages) * len(snr.EXPLORATIONS) * 2 * 2
+    assert len(rows) == len(stages) * len(EXPLORATIONS) * 2 * 2
     for row in rows:
         assert row["noise"] >= 0 and row["signal"] >= 0 and row["low"] <= row["high"]
     by_return, by_logarithm = (

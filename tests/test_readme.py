@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.cli.evaluate import main as evaluate_main
+from proposer_rl.cli.instruments import evaluate as evaluate_main
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main

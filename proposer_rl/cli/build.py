@@ -143,8 +143,8 @@ class EpisodeBar:
         self._enabled = enabled and sys.stderr.isatty()
         self._bar: tqdm | None = None
 
-    def __call__(self) -> None:
-        """Count one update."""
+    def __call__(self, done: int) -> None:
+        """Show that so many updates are done."""
         if not self._enabled:
             return
         if self._bar is None:
@@ -155,8 +155,8 @@ class EpisodeBar:
                 position=1,
                 dynamic_ncols=True,
             )
-        self._bar.update()
-        if self._bar.n >= self._updates:
+        self._bar.update(done - self._bar.n)
+        if done >= self._updates:
             self._bar.close()
             self._bar = None
 
@@ -166,13 +166,16 @@ def _curriculum(
 ) -> Curriculum:
     bar = EpisodeBar(config.proposer.meta_episode_length, config.compute.progress)
 
-    def on_update() -> None:
-        bar()
+    def tell(done: int) -> None:
+        bar(done)
         if status is not None:
-            status.tick("training the copies")
+            status.tick("training the copies", done)
+
+    def on_update(done: int) -> None:
+        tell(done)
         signals.check()
 
-    chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task))
+    chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task, tell))
     try:
         factory = instantiate(config.curriculum, _partial_=True)
         curriculum = factory(chosen)
@@ -200,7 +203,7 @@ def _check_cycle(config: RunConfig) -> None:
         )
 
 
-def _workers(config: RunConfig, task: Task) -> Workers | None:
+def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
     """Where the copies are trained; None for this process.
 
     Raises:
@@ -244,7 +247,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     make: Callable[[str], Any] = partial(
         _make_in_worker, task_maker(config.task), config.solver, place, compute.graphs
     )
-    return Workers(settings, make)
+    return Workers(settings, make, tell)
 
 
 def _devices(compute: ComputeSettings, device: torch.device) -> list[str]:

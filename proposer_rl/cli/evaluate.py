@@ -1,4 +1,4 @@
-"""``bin/eval`` and ``proposer-eval``: trained Solvers on named levels.
+"""Trained Solvers on named levels.
 
 One run's are told level by level, those of several by their means, as a table of methods.
 """
@@ -27,8 +27,7 @@ from tqdm import tqdm
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import check_output, positive, read_checkpoint, restored, write_rows
+from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
 from proposer_rl.report.generalisation import Score as RunScore
 from proposer_rl.report.generalisation import (
@@ -49,7 +48,6 @@ from proposer_rl.task import Score, ScoringTask, Task
 SHOWN = 36  # levels in the table and on the sheet of pictures
 COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
 DRAWN = 128  # levels of a distribution, where the task has no named ones
-MOST_STEPS = 10**5
 
 
 @dataclass(frozen=True)
@@ -85,22 +83,12 @@ class Evaluation:
         ]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    options = _parser().parse_args(arguments)
-    command(partial(_run, options))
-
-
-def _run(options: argparse.Namespace) -> None:
-    check_output("--output", options.output, (".json", ".csv"))
-    check_output("--pictures", options.pictures, (".png",))
-    try:
-        if len(options.checkpoint) > 1 or len(options.levels) > 1 or _holds_runs(options):
-            _compare(options)
-        else:
-            _one(options)
-    except ValueError as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+def run(options: argparse.Namespace) -> None:
+    """Evaluate, print and write what ``bin/eval`` was asked."""
+    if len(options.checkpoint) > 1 or len(options.levels) > 1 or _holds_runs(options):
+        _compare(options)
+    else:
+        _one(options)
 
 
 def _holds_runs(options: argparse.Namespace) -> bool:
@@ -328,58 +316,3 @@ def _sheet(found: Evaluation) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     return file.getvalue()
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="bin/eval",
-        description="Evaluate a trained Solver on named levels, one by one: as exactly as its task "
-        "can, on levels of any size where it has files of them.",
-        epilog="docs/levels.md describes such files and the sets that come along.",
-    )
-    parser.add_argument(
-        "checkpoint",
-        nargs="+",
-        type=Path,
-        help="a run's folder, or one of its checkpoints; several, or a folder with runs in it, for "
-        "a table of methods",
-    )
-    parser.add_argument(
-        "--levels",
-        metavar="FILE|NAME",
-        nargs="+",
-        default=[],
-        help="a distribution of the run such as id or ood; where the task has files of levels also "
-        "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
-        "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
-        "on another one; several for a table of methods",
-    )
-    parser.add_argument(
-        "--max-steps",
-        type=_steps,
-        metavar="N",
-        help="step limit of every level, where the task lets it be chosen (the run's, or on levels "
-        "that are none of a distribution 2 for each move of the shortest path if this is more)",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        help="a file for the rows that ends in .json or .csv; of several runs their means, and "
-        "those that are in it are not computed again",
-    )
-    parser.add_argument(
-        "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"
-    )
-    return parser
-
-
-def _steps(text: str) -> int:
-    number = positive(text)
-    if number > MOST_STEPS:
-        raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_STEPS:,}, got {number}")
-    return number
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,10 @@
-"""``bin/foresight`` and ``proposer-foresight``: how far ahead does first-order gain look?"""
+"""How far ahead does first-order gain look?"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from tqdm import tqdm
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import check_output, checkpoints, positive, write_rows
+from proposer_rl.cli.stored import checkpoints, write_rows
 from proposer_rl.curricula import require_gradients
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
@@ -38,20 +36,12 @@ CONCENTRATION = 0.15  # of the Dirichlet distribution of the mixtures that are t
 CANDIDATES = 32  # levels of each bin that are scored
 
 
-def main() -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    command(partial(_run, _parser().parse_args()))
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    check_output("--output", arguments.output, (".json",))
+def run(arguments: argparse.Namespace) -> None:
+    """Measure, print and write what ``bin/foresight`` was asked."""
     found = [(folder, file) for folder in arguments.folders for file in checkpoints(folder)]
     rows: list[dict[str, Any]] = []
-    try:
-        for folder, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
-            rows += _measure(folder, file, arguments)
-    except ValueError as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+    for folder, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
+        rows += _measure(folder, file, arguments)
     _print(rows)
     write_rows(rows, arguments.output)
 
@@ -171,28 +161,3 @@ def _print(rows: list[dict[str, Any]]) -> None:
                 f"{row['explained']:.0%}", f"{row['gain_sd']:.3f}",
             )  # fmt: skip
         Console().print(table)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="bin/foresight",
-        description="Compare first-order gain with what training brings: from every checkpoint, "
-        "copies of the Solver train on different mixtures, and their gains on the target after "
-        "some updates are held against those predicted without any training.",
-        epilog="A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
-    )
-    parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
-    parser.add_argument(
-        "--ahead", type=positive, nargs="+", default=[1, 5, 20, 50],
-        help="numbers of updates after which gains are measured (1 5 20 50)",
-    )  # fmt: skip
-    parser.add_argument("--proposals", type=positive, default=16, help="different mixtures (16)")
-    parser.add_argument("--copies", type=positive, default=2, help="copies of each (2)")
-    parser.add_argument("--levels", type=positive, default=512, help="of the target (512)")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
-    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
-    return parser
-
-
-if __name__ == "__main__":
-    main()

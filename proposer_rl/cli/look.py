@@ -1,9 +1,8 @@
-"""``bin/look`` and ``proposer-look``: does a Proposer look at the Solver?"""
+"""Does a Proposer look at the Solver?"""
 
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import check_output, checkpoints, write_rows
+from proposer_rl.cli.config import saved_config
+from proposer_rl.cli.stored import checkpoints, write_rows
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Parts, frozen_proposer
 from proposer_rl.models import draw, uniform_noise
@@ -34,19 +32,11 @@ class Stage(NamedTuple):
     seen: TensorDict
 
 
-def main() -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    command(partial(_run, _parser().parse_args()))
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    check_output("--output", arguments.output, (".json",))
-    try:
-        rows = look(arguments.proposer, arguments.solvers, arguments.seed)
-    except ValueError as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+def run(options: argparse.Namespace) -> None:
+    """Look, print and write what ``bin/look`` was asked."""
+    rows = look(options.proposer, options.solvers, options.seed)
     _print(rows)
-    write_rows(rows, arguments.output)
+    write_rows(rows, options.output)
 
 
 def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
@@ -136,22 +126,3 @@ def _print(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         table.add_row(str(row["updates"]), row["seen"], *(f"{row[key]:.3f}" for key in numbers))
     Console().print(table)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="bin/look",
-        description="Shows what a Proposer proposes to Solvers at several stages of training, and "
-        "what changes when it is shown the probes or the return of another Solver. If nothing "
-        "does, it does not look.",
-        epilog="A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
-    )
-    parser.add_argument("proposer", type=Path, help="folder of a run with a Proposer")
-    parser.add_argument("solvers", type=Path, help="folder of a run; all its checkpoints are shown")
-    parser.add_argument("--seed", type=int, default=0, help="of the levels it looks at (0)")
-    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
-    return parser
-
-
-if __name__ == "__main__":
-    main()

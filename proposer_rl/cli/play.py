@@ -12,16 +12,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.errors import command
-from proposer_rl.cli.outcome import run_name
-from proposer_rl.cli.stored import checkpoints, restored
 from proposer_rl.extras import install_command
-from proposer_rl.learning import PPO
-from proposer_rl.runs.checkpoint import load_checkpoint
 
 if TYPE_CHECKING:
+    from proposer_rl.learning import PPO
     from proposer_rl.play.session import Session
 
 EPILOG = """\
@@ -39,14 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
+    from proposer_rl.cli.config import ConfigError
+
     missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
     if missing:
         raise ConfigError(
             f"bin/play needs {' and '.join(missing)}; install with: {install_command('play')}"
         )
+    session = open_session(options.run)
     from proposer_rl.play.server import application, listen, server
 
-    session = open_session(options.run)
     token = secrets.token_urlsafe()
     try:
         listening = listen(options.port)
@@ -67,9 +64,15 @@ def open_session(folder: Path) -> Session:
     Raises:
         ConfigError: if it is no run's, or holds no checkpoints.
     """
-    from proposer_rl.play.session import Session
+    from proposer_rl.cli.config import saved_config
 
-    config = saved_config(folder)
+    config = saved_config(folder)  # before what takes seconds to import
+    from proposer_rl.cli.build import make_task
+    from proposer_rl.cli.outcome import run_name
+    from proposer_rl.cli.stored import checkpoints, restored
+    from proposer_rl.play.session import Session
+    from proposer_rl.runs.checkpoint import load_checkpoint
+
     checkpoints(folder)
     task = make_task(config)
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.report.build import OutputError, write_report
-from proposer_rl.report.pages import write_pages
 
 EPILOG = """\
 examples:
@@ -30,17 +28,26 @@ far as they got, and the report says so."""
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    command(partial(_run, _parser().parse_args(arguments)))
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.scores is not None and options.pages is None:
+        parser.error("--scores: only the pages of the docs take them up; give --pages, too")
+    command(partial(_run, options))
 
 
 def _run(options: argparse.Namespace) -> None:
+    from proposer_rl.report.runs import find_runs
+
+    find_runs(options.folder)  # refuses what is none, before what takes seconds to import
     if options.pages is not None:
+        from proposer_rl.report.pages import write_pages
+
         asked = (options.threshold, options.baseline, options.scores)
         for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
             print(f"Page: {page}")
         return
-    if options.scores is not None:
-        raise OutputError("--scores: only the pages of the docs take them up; give --pages, too")
+    from proposer_rl.report.build import write_report
+
     page = write_report(
         options.folder,
         options.output,

@@ -1,4 +1,4 @@
-"""``bin/snr`` and ``proposer-snr``: the signal-to-noise ratio of the Proposer's reward in a run."""
+"""The signal-to-noise ratio of the Proposer's reward in a run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,8 @@ from torch.distributions import Dirichlet
 from tqdm import tqdm
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import check_output, checkpoints, positive, write_rows
+from proposer_rl.cli.config import saved_config
+from proposer_rl.cli.stored import checkpoints, write_rows
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success, performance_gain
@@ -40,17 +38,9 @@ MEASURES: dict[str, Callable[[Any], Tensor]] = {
 }
 
 
-def main() -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    command(partial(_run, _parser().parse_args()))
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    check_output("--output", arguments.output, (".json",))
-    try:
-        rows = measure(arguments)
-    except ValueError as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+def run(arguments: argparse.Namespace) -> None:
+    """Measure, print and write what ``bin/snr`` was asked."""
+    rows = measure(arguments)
     _print(rows)
     write_rows(rows, arguments.output)
 
@@ -120,13 +110,11 @@ _Exploration = tuple[Actions, bool, Callable[[int, int, torch.Generator], Tensor
 
 
 def _even(task: Task) -> _Exploration:
-    """All proposals are the even mixture: there is nothing to learn, the ratio must be 0."""
     mixture = Mixture(task.space, torch.eye(task.space.size))
     return mixture, True, lambda steps, groups, _: torch.zeros(steps, groups, mixture.bins)
 
 
 def _problems(task: Task) -> _Exploration:
-    """Every level's bin is drawn from one even policy (the paper's Proposer at its start)."""
     choices = ProblemChoices(task.space)
 
     def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
@@ -137,7 +125,6 @@ def _problems(task: Task) -> _Exploration:
 
 
 def _mixture(task: Task) -> _Exploration:
-    """Mixtures as a Proposer draws them at first, held for the episode."""
     mixture = Mixture(task.space)
 
     def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
@@ -147,7 +134,6 @@ def _mixture(task: Task) -> _Exploration:
 
 
 def _uneven(task: Task) -> _Exploration:
-    """Very uneven mixtures, Dirichlet(0.15) over all bins, held for the episode."""
     mixture = Mixture(task.space, torch.eye(task.space.size))
 
     def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
@@ -160,6 +146,7 @@ def _uneven(task: Task) -> _Exploration:
     return mixture, True, draw
 
 
+# cli/instruments.py says what each is.
 EXPLORATIONS = {"even": _even, "problems": _problems, "mixture": _mixture, "uneven": _uneven}
 
 
@@ -180,40 +167,3 @@ def _print(rows: list[dict[str, Any]]) -> None:
                 f"{row['ratio']:.2f}", f"{row['low']:.2f} - {row['high']:.2f}",
             )  # fmt: skip
         Console().print(table)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="bin/snr",
-        description="Measures how much of the Proposer's reward is due to what was proposed. From "
-        "every checkpoint of the given runs, copies of the Solver follow different proposals, "
-        "several copies each; an analysis of variance splits their gains into signal and noise.",
-        epilog="Explorations: "
-        + " ".join(f"{name}: {(make.__doc__ or '').strip()}" for name, make in EXPLORATIONS.items())
-        + " A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
-    )
-    parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
-    parser.add_argument(
-        "--meta-episode-length", type=positive, help="updates of an episode; the run's"
-    )
-    parser.add_argument("--proposals", type=positive, default=8, help="different proposals (8)")
-    parser.add_argument("--copies", type=positive, default=3, help="copies of each (3)")
-    parser.add_argument(
-        "--levels", type=positive, nargs="+", default=[75, 256, 1024],
-        help="sizes of the validation batch (75 256 1024)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--explorations", nargs="+", default=list(EXPLORATIONS), choices=list(EXPLORATIONS),
-        help="ways in which proposals differ (all)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--measures", nargs="+", choices=list(MEASURES),
-        help="what gain is counted in (both, as far as the task tells them)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
-    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
-    return parser
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -73,29 +72,7 @@ def restored(task: Task, config: RunConfig, state: State) -> PPO:
     return learner
 
 
-def check_output(option: str, file: Path | None, suffixes: Sequence[str]) -> None:
-    """Refuse a file that could not be written in the end.
-
-    Raises:
-        ConfigError: naming the option.
-    """
-    if file is None:
-        return
-    if file.suffix not in suffixes:
-        raise ConfigError(f"{option} {file}: must end in {' or '.join(suffixes)}")
-    if not file.parent.is_dir():
-        raise ConfigError(f"{option} {file}: there is no folder {file.parent}")
-
-
 def write_rows(rows: Sequence[Any], file: Path | None) -> None:
     """Write rows as JSON, if a file is given."""
     if file is not None:
         write_atomically(file, (json.dumps(rows, indent=1) + "\n").encode())
-
-
-def positive(text: str) -> int:
-    """A whole number from 1 on, for an option."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
-    return number

@@ -10,7 +10,8 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 
 - ``level``: the levels;
 - ``filled`` bool: whether there is one; nothing else of an empty slot counts;
-- ``score`` float64, and ``best`` float32: the highest return that was ever seen on the level;
+- ``score`` float64; ``best`` float32, the highest return that was ever seen on the level, and
+  ``solved`` bool, whether an episode there ever was a success;
 - ``touched`` int64: the clock when it was drawn or scored last. A clock counts the levels that were
   drawn or scored; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
@@ -32,6 +33,8 @@ from torch import Tensor
 from proposer_rl.curricula.checks import one_of, part, real, whole
 
 Prioritization = Literal["rank", "proportional", "softmax"]
+
+SEEN = ("best", "solved")  # entries that never fall
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +82,7 @@ def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
             "filled": torch.zeros(shape, dtype=torch.bool),
             "score": torch.zeros(shape, dtype=torch.float64),
             "best": torch.full(shape, -torch.inf),
+            "solved": torch.zeros(shape, dtype=torch.bool),
             **{name: torch.zeros(shape, dtype=torch.int64) for name in numbers},
         },
         shape,
@@ -184,17 +188,18 @@ def insert(
 
     Args:
         buffer: [K, N].
-        new: [K, M] with ``level``, ``score`` and ``best``, and where it is not zero ``parent`` and
-            ``generation``. Scores that are not finite are those of levels not to be kept.
+        new: [K, M] with ``level``, ``score``, ``best`` and ``solved``, and where it is not zero
+            ``parent`` and ``generation``. Scores that are not finite are those of levels not to be
+            kept.
         rule: of the draws.
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
-    key, new_best = level_keys(new["level"]), new["best"]
-    score, new_best = _together(key, new["score"].double(), new_best)
-    none = torch.zeros_like(key)
+    key = level_keys(new["level"])
+    same, none = _alike(key), torch.zeros_like(key)
     told = {
-        "score": score,
-        "best": new_best,
+        "score": _means(same, new["score"]),
+        "best": new["best"].unsqueeze(-2).where(same, -torch.inf).amax(-1),
+        "solved": (new["solved"].unsqueeze(-2) & same).any(-1),
         "key": key,
         "parent": new.get("parent", none),
         "generation": new.get("generation", none),
@@ -211,7 +216,9 @@ def insert(
     return buffer
 
 
-def rescore(buffer: TensorDictBase, slots: Tensor, score: Tensor, best: Tensor) -> TensorDict:
+def rescore(
+    buffer: TensorDictBase, slots: Tensor, score: Tensor, best: Tensor, solved: Tensor
+) -> TensorDict:
     """New scores of levels that were drawn.
 
     Args:
@@ -219,13 +226,16 @@ def rescore(buffer: TensorDictBase, slots: Tensor, score: Tensor, best: Tensor) 
         slots: int64 [K, P]; of a slot that occurs several times the mean score counts.
         score: float [K, P]; one that is not finite leaves the level's old score.
         best: float [K, P], the highest returns, of which the highest ever is kept.
+        solved: bool [K, P], whether there was a success, of which one is enough for ever.
     """
-    known = score.isfinite()
-    mean, _ = _together(slots, score.double().where(known, torch.nan), best)
+    mean = _means(_alike(slots), score.where(score.isfinite(), torch.nan))
     old = buffer["score"].gather(1, slots)
     scores = buffer["score"].scatter(1, slots, mean.where(mean.isfinite(), old))
-    highest = buffer["best"].scatter_reduce(1, slots, best.to(buffer["best"]), "amax")
-    return _changed(buffer, score=scores, best=highest)
+    seen = {
+        name: buffer[name].scatter_reduce(1, slots, found.to(buffer[name]), "amax")
+        for name, found in zip(SEEN, (best, solved), strict=True)
+    }
+    return _changed(buffer, score=scores, **seen)
 
 
 def level_keys(levels: Any) -> Tensor:
@@ -258,7 +268,8 @@ def _insert_one(
     if bool(same.any()):
         slot = int(same.nonzero()[0])
         score[slot] = new["score"]
-        numbers["best"][slot] = torch.maximum(numbers["best"][slot], new["best"])
+        for name in SEEN:
+            numbers[name][slot] = torch.maximum(numbers[name][slot], new[name])
     else:
         free = (~filled).nonzero()
         if len(free):
@@ -274,12 +285,14 @@ def _insert_one(
     numbers["touched"][slot] = clock[slot]
 
 
-def _together(group: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of scores and maxima of ``best`` [K, M] over what has the same number in ``group``."""
-    same = group.unsqueeze(-1) == group.unsqueeze(-2)  # [K, M, M]
-    each = score.unsqueeze(-2).where(same, torch.nan)
-    highest = best.unsqueeze(-2).where(same, -torch.inf).amax(-1)
-    return each.nanmean(-1), highest
+def _alike(group: Tensor) -> Tensor:
+    """Which entries have the same number [K, M]: bool [K, M, M]."""
+    return group.unsqueeze(-1) == group.unsqueeze(-2)
+
+
+def _means(same: Tensor, score: Tensor) -> Tensor:
+    """Means of scores [K, M] over what is the same, bool [K, M, M]; those that are nan left out."""
+    return score.double().unsqueeze(-2).where(same, torch.nan).nanmean(-1)
 
 
 def _shares(weight: Tensor) -> Tensor:

@@ -80,10 +80,10 @@ class FirstOrderCurriculum(_AlignedBins):
         task: Task,
         *,
         every: int = 1,
-        target_levels: int = 256,
-        candidates: int = 16,
+        target_levels: int = 128,
+        candidates: int = 8,
         temperature: float = 0.1,
-        smoothing: float = 0.9,
+        smoothing: float = 0.95,
         measure: str = "log_success",
     ) -> None:
         exact = require_gradients(task)

@@ -20,6 +20,7 @@ class FirstOrderProposer(ProblemProposer):
         agent: see :class:`ProblemProposer`.
         settings: the same.
         probe_levels: probes C.
+        batches: see :class:`ProblemProposer`.
         target_levels: fresh levels E of the target that the direction is taken from.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
@@ -35,11 +36,12 @@ class FirstOrderProposer(ProblemProposer):
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
+        batches: int = 1,
         target_levels: int = 256,
         measure: str = "log_success",
     ) -> None:
         self._exact = require_gradients(task)
-        super().__init__(task, agent, settings, probe_levels=probe_levels)
+        super().__init__(task, agent, settings, probe_levels=probe_levels, batches=batches)
         self._target_levels, self._measure = target_levels, measure
 
     def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:

@@ -33,6 +33,7 @@ class PairedProposer(ProblemProposer):
         agent: see :class:`ProblemProposer`.
         settings: the same.
         probe_levels: probes C.
+        batches: see :class:`ProblemProposer`.
         streams: that the antagonist's weights are drawn from.
     """
 
@@ -44,8 +45,9 @@ class PairedProposer(ProblemProposer):
         *,
         streams: Streams,
         probe_levels: int = 16,
+        batches: int = 1,
     ) -> None:
-        super().__init__(task, agent, settings, probe_levels=probe_levels)
+        super().__init__(task, agent, settings, probe_levels=probe_levels, batches=batches)
         self.antagonist = task.learner([streams])
         self._newborn = self.antagonist.snapshot()
 

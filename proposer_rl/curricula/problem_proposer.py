@@ -23,8 +23,8 @@ class Worth(NamedTuple):
     """What problems are worth.
 
     Attributes:
-        paid: for each, float [P].
-        told: of the whole batch, by name.
+        paid: for each, float [E].
+        told: of all of them, by name.
         frames: environment steps that it cost.
         evaluations: of a policy on a level.
     """
@@ -39,8 +39,10 @@ class ProblemProposer(Curriculum):
     """Draws each of P problems from a policy over probes, and learns what each was worth.
 
     At every update the policy sees what the Solver would do on probe levels of the target, draws
-    the bin of each problem, and is paid for each, standardised over the batch. A few gradient steps
-    follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7), with no critic.
+    the bin of each problem, and is paid for each, standardised over all that it drew. A few
+    gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7),
+    with no critic. What problems are worth is known before anybody trains on them, so that one may
+    draw more batches than the Solver can train on, and learn from all.
 
     Args:
         task: whose target is seen, and whose space has the bins.
@@ -49,6 +51,10 @@ class ProblemProposer(Curriculum):
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
+        batches: drawn and paid B at every update; the Solver trains on the first.
+
+    Raises:
+        ValueError: if there is no batch.
     """
 
     def __init__(
@@ -58,9 +64,13 @@ class ProblemProposer(Curriculum):
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
+        batches: int = 1,
     ) -> None:
+        if batches < 1:
+            raise ValueError(f"batches must be at least 1, got {batches}")
         self.agent, self.task = agent, task
         self._settings = settings
+        self._batches = batches
         self._probe_levels = probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
@@ -81,7 +91,7 @@ class ProblemProposer(Curriculum):
 
     @abstractmethod
     def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:
-        """What each of the levels [1, P] is worth to the Solver, who has not trained on it yet."""
+        """What each of the levels [1, E] is worth to the Solver, who has not trained on it yet."""
 
     def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
         """Levels [1, P] of the policy's draws, from which it has learnt already.
@@ -97,23 +107,25 @@ class ProblemProposer(Curriculum):
         with torch.no_grad():
             seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [1])
             policy = agent.distribution(agent(seen.copy()))
-            noise = torch.rand(1, task.batch_size, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(task.device))  # [1, P]
+            shape = (self._batches, task.batch_size)
+            noise = torch.rand(shape, generator=stream.generator("choices"))
+            choices = draw(policy, noise.to(task.device))  # [B, P]
             log_prob = policy.log_prob(choices)
-        levels = task.space.generate(choices.cpu(), [stream.generator("levels")])
+        bins = choices.cpu()
+        levels = task.space.generate(bins.view(1, -1), [stream.generator("levels")])
         worth = self.worth(learner, levels, stream)
         played = TensorDict(
             {
-                agent.action_key: choices[0],
-                agent.log_prob_key: log_prob[0],
-                "advantage": worth.paid.unsqueeze(-1),
+                agent.action_key: choices,
+                agent.log_prob_key: log_prob,
+                "advantage": worth.paid.view(*shape, 1),
             },
-            [task.batch_size],
+            shape,
         )
         self._learn(seen, played)
-        self._proposed += choices[0].cpu().bincount(minlength=len(self._proposed))
+        self._proposed += bins[0].bincount(minlength=len(self._proposed))
         self._told |= worth.told
-        return Proposal(levels, worth.frames, worth.evaluations)
+        return Proposal(levels[:, : task.batch_size], worth.frames, worth.evaluations)
 
     def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
         """Tell of the last cycle."""
@@ -151,10 +163,11 @@ class ProblemProposer(Curriculum):
         self._told = dict(state["told"])
 
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
-        """A few steps on one batch: the clipped objective of each problem, with its advantage."""
+        """A few steps on all draws: the clipped objective of each problem, with its advantage."""
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key][0]  # [P, N]
-            losses = self._loss(played.copy().set(self.agent.logits_key, logits))
+            logits = self.agent(seen.copy())[self.agent.logits_key]  # [1, P, N]
+            everywhere = logits.expand(len(played), -1, -1)
+            losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
             (losses["loss_objective"] + losses["loss_entropy"]).backward()
             nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)

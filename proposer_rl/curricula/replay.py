@@ -31,6 +31,7 @@ from proposer_rl.curricula.batches import (
     restored_levels,
 )
 from proposer_rl.curricula.buffer import (
+    SEEN,
     ReplayRule,
     draw_slots,
     empty_buffer,
@@ -40,7 +41,7 @@ from proposer_rl.curricula.buffer import (
     rescore,
 )
 from proposer_rl.curricula.checks import one_of, part, real, whole
-from proposer_rl.curricula.scores import Scored, Scorer, episodes
+from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, EditableTask, Levels
@@ -172,9 +173,10 @@ class ReplayCurriculum(Curriculum):
         last = self._last
         assert last is not None  # propose comes before
         if self.scorer.from_episodes:
-            best = self.buffer["best"].gather(1, last["slot"])
+            best, solved = (self.buffer[name].gather(1, last["slot"]) for name in SEEN)
             best = best.where(last["replayed"], -torch.inf)
-            self._take(last, self.scorer.of_rollouts(learner, [update.rollout], best))
+            solved &= last["replayed"]
+            self._take(last, self.scorer.of_rollouts(learner, [update.rollout], best, solved))
         if self._edits and self._parents == "easy":
             last["easy"] = _easiness(self.scorer, learner, update)
 
@@ -223,7 +225,7 @@ class ReplayCurriculum(Curriculum):
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
         scored = self._score(learner, levels_at(self.buffer["level"], slots), streams, "all")
-        self.buffer = rescore(self.buffer, slots, scored.score, scored.best)
+        self.buffer = rescore(self.buffer, slots, *scored)
 
     def _finish(self, learner: PPO, streams: Sequence[Streams]) -> None:
         """Do what is left to be done of the last update: exact scores, and children."""
@@ -252,7 +254,7 @@ class ReplayCurriculum(Curriculum):
         replayed = last["replayed"][:, 0]
         slots, old = last["slot"], self.buffer
         if bool(replayed.any()):
-            after = rescore(old, slots, scored.score, scored.best)
+            after = rescore(old, slots, *scored)
             if self._co_learnability:
                 after = self._credit(old, after, slots)
             self.buffer = old.clone()
@@ -357,9 +359,8 @@ def _easiness(scorer: Scorer, learner: PPO, update: Update) -> Tensor:
     Of the published ones, those with the lowest return minus value loss (the authors' code, dcd).
     """
     found = episodes(update.rollout)
-    none = torch.full(found.ended.shape, -torch.inf)
     loss = Scorer(scorer.task, "l1_value_loss", "episodes")
-    lost = loss.of_rollouts(learner, [update.rollout], none).score
+    lost = loss.of_rollouts(learner, [update.rollout], *unseen(found.ended.shape)).score
     return lost - (found.total / found.ended.clamp(1)).cpu()
 
 

@@ -4,41 +4,47 @@ A score from episodes reads a rollout [K, P, T], of which only episodes count th
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
 none ends. A score from evaluation asks the task instead, and needs no episode.
 
-With A_t the generalised advantage, V the critic, p the probability of success, J the expected
-return, J* the largest that any policy reaches, R the highest return ever seen on the level:
+With A_t the generalised advantage, delta_t the error of one step, V the critic, p the probability
+of success, J the expected return, J* the largest that any policy reaches, and R the highest return
+ever seen on the level, or from evaluation the expected highest of as many episodes as ``rollouts``:
 
-=====================  =============================  ====================================
-score                  from episodes                  from evaluation
-=====================  =============================  ====================================
-positive_value_loss    mean of max(A_t, 0)
-l1_value_loss          mean of abs(A_t)
-max_mc                 mean of R - V(s_t)
-learnability           p (1 - p) of the share p       p (1 - p)
-regret                 R - mean return                J* - J
-gradient_norm          the same of a policy gradient  squared norm of the gradient of J
-=====================  =============================  ====================================
+=======================  =============================  ====================================
+score                    from episodes                  from evaluation
+=======================  =============================  ====================================
+positive_value_loss      mean of max(A_t, 0)
+l1_value_loss            mean of abs(A_t)
+mean_negative_advantage  mean of A_t's losses alone;
+                         0 if never solved
+one_step_td_error        mean of abs(delta_t)           its expectation
+max_mc                   mean of R - V(s_t)             its expectation
+learnability             p (1 - p) of the share p       p (1 - p)
+return_variance          that of the returns            that of the return
+regret                   R - mean return                J* - J
+gradient_norm            the same of a policy gradient  squared norm of the gradient of J
+=======================  =============================  ====================================
 
-Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
-MaxMC: the latter, appendix; learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4);
-regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm: PACE (arXiv 2605.01358). The critic is
-discounted and R is not, so that ``max_mc`` is biased even at the optimum.
+Sources: learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4), variance of a return
+that is 0 or 1; regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm: PACE (arXiv
+2605.01358); the first five: :mod:`~proposer_rl.curricula.stepwise`. The critic is discounted and R
+is not, so that ``max_mc`` is biased even at the optimum.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.checks import one_of, whole
+from proposer_rl.curricula.exact_scores import EXACT, exact_score
+from proposer_rl.curricula.stepwise import STEPWISE, advantages
 from proposer_rl.learning import PPO, succeeded
-from proposer_rl.learning.advantages import gae
-from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
+from proposer_rl.meta.gradient_norms import squared_policy_gradients
 from proposer_rl.streams import Streams
-from proposer_rl.task import DifferentiableTask, ExactTask, Levels, OptimalTask, Task
+from proposer_rl.task import Levels, Task
 
 Source = Literal["episodes", "exact"]
 
@@ -54,6 +60,7 @@ class Episodes(NamedTuple):
         ended: episodes of each level, int64 [K, P].
         successes: those of them that were a success, int64 [K, P].
         total: sum of their undiscounted returns, float64 [K, P].
+        squares: sum of the squares of these, float64 [K, P].
         best: the highest of these, float64 [K, P]; minus infinity without episodes.
     """
 
@@ -61,6 +68,7 @@ class Episodes(NamedTuple):
     ended: Tensor
     successes: Tensor
     total: Tensor
+    squares: Tensor
     best: Tensor
 
 
@@ -80,33 +88,28 @@ def episodes(rollout: TensorDictBase) -> Episodes:
         ended=count,
         successes=(succeeded(rollout) & done).sum(-1),
         total=returns.where(exists, 0.0).sum(-1),
+        squares=returns.square().where(exists, 0.0).sum(-1),
         best=returns.where(exists, -torch.inf).amax(-1),
     )
 
 
-def positive_value_loss(advantage: Tensor, value: Tensor, best: Tensor) -> Tensor:
-    """max(A, 0) of every step [K, P, T]: where the Solver does better than it thought."""
-    return advantage.clamp_min(0)
-
-
-def l1_value_loss(advantage: Tensor, value: Tensor, best: Tensor) -> Tensor:
-    """abs(A) of every step [K, P, T]."""
-    return advantage.abs()
-
-
-def max_mc(advantage: Tensor, value: Tensor, best: Tensor) -> Tensor:
-    """R - V of every step [K, P, T], with the highest return R [K, P] ever seen on the level."""
-    return best.unsqueeze(-1) - value
-
-
-STEPWISE = {f.__name__: f for f in (positive_value_loss, l1_value_loss, max_mc)}
-
-
 class Scored(NamedTuple):
-    """Levels' scores float64 [K, P], and the highest returns seen, float32 [K, P]."""
+    """Levels' scores, and what was ever seen there.
+
+    Attributes:
+        score: float64 [K, P].
+        best: the highest return, float32 [K, P]; minus infinity where no episode was seen.
+        solved: whether there was a success, bool [K, P].
+    """
 
     score: Tensor
     best: Tensor
+    solved: Tensor
+
+
+def unseen(shape: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """The highest return on levels that nobody has played yet, and whether one was solved."""
+    return torch.full(shape, -torch.inf), torch.zeros(shape, dtype=torch.bool)
 
 
 class Scorer:
@@ -116,7 +119,8 @@ class Scorer:
         task: whose levels are scored.
         name: of the score; see the table above.
         source: whether it is read off episodes or asked of the task.
-        rollouts: played on each level that is scored without training on it, from episodes.
+        rollouts: played on each level that is scored without training on it, from episodes;
+            from evaluation, the episodes of which ``max_mc`` takes the expected highest return.
 
     Attributes:
         from_episodes: whether :meth:`play` scores levels, else :meth:`ask`.
@@ -132,17 +136,19 @@ class Scorer:
         self.from_episodes = one_of("source", source, ("episodes", "exact")) == "episodes"
         self._name = name
         there_are = {
-            "episodes": [*STEPWISE, "learnability", "regret", "gradient_norm"],
-            "exact": ["learnability", "regret", "gradient_norm"],
+            "episodes": [*STEPWISE, "learnability", "return_variance", "regret", "gradient_norm"],
+            "exact": list(EXACT),
         }
         if name not in there_are[source]:
             raise ValueError(f"score={name!r}: from source={source} there are {there_are[source]}")
         if not self.from_episodes:
-            self._exact = _exact_score(task, name)
+            self._exact = exact_score(task, name, self.rollouts)
         elif name == "gradient_norm":
             self._policy_gradients = squared_policy_gradients(task)
 
-    def of_rollouts(self, learner: PPO, rollouts: Sequence[TensorDictBase], best: Tensor) -> Scored:
+    def of_rollouts(
+        self, learner: PPO, rollouts: Sequence[TensorDictBase], best: Tensor, solved: Tensor
+    ) -> Scored:
         """Score levels [K, P] by rollouts on them, [K, P, T] each.
 
         Args:
@@ -150,29 +156,39 @@ class Scorer:
             rollouts: with values, as :meth:`PPO.collect` returns them.
             best: the highest returns seen on these levels before, float [K, P]; minus infinity
                 where there was none.
+            solved: whether an episode was a success before, bool [K, P].
         """
         found = [episodes(rollout) for rollout in rollouts]
-        count = torch.stack([f.ended for f in found]).sum(0)
-        some = count.clamp(1)
-        best = torch.stack([best.to(count.device).double(), *(f.best for f in found)]).amax(0)
+        _, *numbers = zip(*found, strict=True)  # weights may be of several lengths
+        ended, successes, total, squares, highest = map(torch.stack, numbers)
+        count, some = ended.sum(0), ended.sum(0).clamp(1)
+        best = torch.maximum(best.to(count.device).double(), highest.amax(0))
+        solved = solved.to(count.device) | (successes.sum(0) > 0)
+        mean = total.sum(0) / some
         if self._name == "gradient_norm":
             lengths = [
-                self._policy_gradients(learner, rollout, _advantages(learner, rollout))
+                self._policy_gradients(learner, rollout, advantages(learner, rollout).float())
                 for rollout in rollouts
             ]
             score = torch.stack(lengths).mean(0)
         elif self._name in STEPWISE:
+            step_score = STEPWISE[self._name]
             each = [
-                (self._stepwise(learner, rollout, best) * f.weight).sum(-1)
+                (step_score(learner, rollout, best) * f.weight).sum(-1)
                 for rollout, f in zip(rollouts, found, strict=True)
             ]
             score = torch.stack(each).sum(0) / some
+            if self._name == "mean_negative_advantage":
+                score = score.where(solved, 0.0)
         elif self._name == "regret":
-            score = best - torch.stack([f.total for f in found]).sum(0) / some
+            score = best - mean
+        elif self._name == "return_variance":
+            score = (squares.sum(0) / some - mean.square()).clamp_min(0)
         else:
-            share = torch.stack([f.successes for f in found]).sum(0) / some
+            share = successes.sum(0) / some
             score = share * (1 - share)
-        return Scored(score.double().where(count > 0, -torch.inf).cpu(), best.float().cpu())
+        score = score.double().where(count > 0, -torch.inf)
+        return Scored(score.cpu(), best.float().cpu(), solved.cpu())
 
     def play(
         self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
@@ -198,9 +214,7 @@ class Scorer:
                 draws = [s.generator("score", *place, device=device) for s in streams]
                 played.append(learner.collect(draws))
                 frames += played[-1][0].numel()
-            scored.append(
-                self.of_rollouts(learner, played, torch.full(some.batch_size, -torch.inf))
-            )
+            scored.append(self.of_rollouts(learner, played, *unseen(some.batch_size)))
         return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True))), frames
 
     @torch.no_grad()
@@ -223,48 +237,4 @@ class Scorer:
             generator = streams[0].generator("score", *purpose, batch, device=self.task.device)
             found.append(self._exact(learner, some, generator).double().cpu())
         score = torch.cat(found, 1)
-        return Scored(score, torch.full(score.shape, -torch.inf)), score.shape[1]
-
-    def _stepwise(self, learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
-        values = rollout[learner.agent.value_key].squeeze(-1).double()
-        return STEPWISE[self._name](_advantages(learner, rollout).double(), values, best)
-
-
-def _advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
-    """GAE with the learner's numbers, not standardised: float [K, P, T]."""
-    settings = learner.settings
-    estimate = gae(settings.gamma, settings.lmbda, learner.agent.value_key)
-    return estimate(rollout.copy())["advantage"].squeeze(-1)
-
-
-def _exact_score(task: Task, name: str) -> Callable[[PPO, Levels, torch.Generator], Tensor]:
-    """Asks the task; gives float [K, n] for levels [K, n]."""
-    if name == "gradient_norm":
-        if not isinstance(task, DifferentiableTask):
-            raise TypeError(
-                f"score=gradient_norm needs gradients: {type(task).__name__} must define "
-                "differentiable_performance(agent, levels)"
-            )
-        norms = squared_gradients(cast(ExactTask, task))
-        return lambda learner, levels, _: norms(learner, levels)
-    if name == "regret" and not isinstance(task, OptimalTask):
-        raise TypeError(
-            f"{type(task).__name__} does not know the largest return (optimal_return), which "
-            "score=regret from source=exact needs; source=episodes takes the best that was seen"
-        )
-    if not task.exact_performance:
-        raise ValueError(
-            f"source=exact: {type(task).__name__} tells performance by playing, which is not "
-            "exact; give source=episodes, as +score=sampled does"
-        )
-    if name == "learnability":
-
-        def learnability(learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
-            success = task.performance(learner.agent, levels, generator)["success"]
-            return success * (1 - success)
-
-        return learnability
-    optimum = cast(OptimalTask, task).optimal_return
-    return lambda learner, levels, generator: (
-        optimum(levels) - task.performance(learner.agent, levels, generator)["return"]
-    )
+        return Scored(score, *unseen(score.shape)), score.shape[1]

@@ -27,8 +27,50 @@ from proposer_rl.task import CellKind
 DIGITS = 4  # of the numbers of a map: what can be seen
 
 
-class MazeBoard:
-    """Mazes as drawings; a :class:`~proposer_rl.task.Board`.
+class Drawings:
+    """Mazes as drawings: of a :class:`~proposer_rl.task.Board` all but what a Solver does.
+
+    Args:
+        size: rows and columns of the run's mazes.
+    """
+
+    level: type[Level] = Level
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.sets = shipped_sets()
+
+    def read(self, rows: Sequence[str]) -> Level:
+        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        # The message of a drawing shows it; here it was seen already.
+        try:
+            return self.level.from_text("\n".join(rows))
+        except ValueError as error:
+            raise ValueError(str(error).partition(", got")[0]) from error
+
+    def draw(self, level: Level) -> list[str]:
+        """The rows of a level's drawing."""
+        return str(level.to_text()).splitlines()
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """The drawing in a record, whose text has spaces, and dots where an episode went."""
+        return recorded_drawing(record)
+
+    def level_set(self, name: str) -> Mapping[str, Level]:
+        """The levels of a set that comes along."""
+        return shipped_levels(name)
+
+    def read_file(self, text: str) -> Mapping[str, Level]:
+        """The levels of a file's text; docs/levels.md has the format."""
+        return levels_from_text(text, kind=self.level)
+
+    def write_file(self, name: str, level: Level) -> str:
+        """A file's text; docs/levels.md has the format."""
+        return levels_to_text({name: level})
+
+
+class MazeBoard(Drawings):
+    """Mazes that are seen whole; a :class:`~proposer_rl.task.Board`.
 
     Args:
         maze: the inner environment.
@@ -52,8 +94,7 @@ class MazeBoard:
         max_steps: Callable[[int], int],
         device: torch.device,
     ) -> None:
-        self.size = (maze.height, maze.width)
-        self.sets = shipped_sets()
+        super().__init__((maze.height, maze.width))
         self._step_penalty = maze.step_penalty
         self._check = check
         self._max_steps = max_steps
@@ -61,33 +102,9 @@ class MazeBoard:
 
     def read(self, rows: Sequence[str]) -> Level:
         """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
-        # The message of a drawing shows it; here it was seen already.
-        try:
-            level = Level.from_text("\n".join(rows))
-        except ValueError as error:
-            raise ValueError(str(error).partition(", got")[0]) from error
+        level = super().read(rows)
         self._check("drawn", level)
         return level
-
-    def draw(self, level: Level) -> list[str]:
-        """The rows of a level's drawing."""
-        return str(level.to_text()).splitlines()
-
-    def drawing(self, record: Mapping[str, Any]) -> list[str]:
-        """The drawing in a record, whose text has spaces, and dots where an episode went."""
-        return recorded_drawing(record)
-
-    def level_set(self, name: str) -> Mapping[str, Level]:
-        """The levels of a set that comes along."""
-        return shipped_levels(name)
-
-    def read_file(self, text: str) -> Mapping[str, Level]:
-        """The levels of a file's text; docs/levels.md has the format."""
-        return levels_from_text(text)
-
-    def write_file(self, name: str, level: Level) -> str:
-        """A file's text; docs/levels.md has the format."""
-        return levels_to_text({name: level})
 
     @torch.no_grad()
     def examine(
@@ -130,6 +147,7 @@ class MazeBoard:
             "goal": level.goal.tolist(),
             "max_steps": limit,
             "step_penalty": self._step_penalty,
+            "missed": -self._step_penalty * limit,
         }
 
 

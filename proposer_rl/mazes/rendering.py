@@ -17,6 +17,7 @@ START_COLOUR = (0, 114, 178)  # blue
 GOAL_COLOUR = (230, 159, 0)  # orange
 PATH_COLOUR = (204, 121, 167)  # reddish purple
 AGENT_COLOUR = (0, 158, 115)  # bluish green
+DIRECTION_COLOUR = (255, 255, 255)
 
 Cells = Sequence[Sequence[int]] | Tensor
 
@@ -27,7 +28,8 @@ def draw_level(
     """Draws one level.
 
     Args:
-        level: A level of batch shape ``[]``.
+        level: A level of batch shape ``[]``; if it has a ``direction`` (0 right, 1 down, 2 left,
+            3 up), a white triangle in the start's cell points there.
         path: Cells (row, column) to connect by a line, ``[T, 2]``; successive cells are equal or
             share a side.
         agent: Row and column at which to draw a round agent.
@@ -60,10 +62,23 @@ def draw_level(
             top, left = (torch.minimum(here, there) - half).tolist()
             bottom, right = (torch.maximum(here, there) + half + 1).tolist()
             picture[top:bottom, left:right] = torch.tensor(PATH_COLOUR, dtype=torch.uint8)
+    offset = torch.arange(cell) - cell // 2
+    if hasattr(level, "direction"):
+        tip = (0.35 * cell - offset) / 2  # half of the triangle's height, by column
+        to_the_right = (offset.abs().unsqueeze(1) <= tip) & (offset >= -0.25 * cell)
+        triangle = to_the_right.rot90(-int(level.direction))
+        _paint(picture, level.start.tolist(), triangle, DIRECTION_COLOUR)
     if agent is not None:
-        top, left = (int(place) * cell for place in agent)
-        offset = torch.arange(cell) - cell // 2
-        inside = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
-        square = picture[top : top + cell, left : left + cell]
-        square[inside] = torch.tensor(AGENT_COLOUR, dtype=torch.uint8)
+        round_one = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
+        _paint(picture, agent, round_one, AGENT_COLOUR)
     return picture
+
+
+def _paint(
+    picture: Tensor, place: Sequence[int], shape: Tensor, colour: tuple[int, int, int]
+) -> None:
+    """Paint what a bool ``[cell, cell]`` covers of the cell at a row and column."""
+    cell = len(shape)
+    top, left = (int(number) * cell for number in place)
+    square = picture[top : top + cell, left : left + cell]
+    square[shape] = torch.tensor(colour, dtype=torch.uint8)

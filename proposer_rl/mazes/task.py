@@ -35,6 +35,7 @@ from proposer_rl.mazes.level_files import (
 )
 from proposer_rl.mazes.level_scores import SLACK, score_levels
 from proposer_rl.mazes.levels import Level, planes
+from proposer_rl.mazes.occupancy import episode_law
 from proposer_rl.mazes.records import EPISODE, level_records, level_statistics
 from proposer_rl.mazes.settings import (
     Channels,
@@ -50,11 +51,12 @@ from proposer_rl.models import (
     Population,
     UNet,
     cell_logits,
+    cell_maps,
     map_actor_critic,
 )
 from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams, each_from
-from proposer_rl.task import Place, Score
+from proposer_rl.task import EpisodeLaw, Place, Score
 
 ACTIONS = 4
 PLANES = 3
@@ -216,6 +218,13 @@ class MazeTask:
     def optimal_return(self, levels: Level) -> Tensor:
         """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
         return optimal_return(levels, self.maze.max_steps, self.maze.step_penalty)
+
+    def episode_law(self, agent: ActorCritic, levels: Level) -> EpisodeLaw:
+        """Exactly what K Solvers' episodes can be, each on its own levels [K, E]."""
+        logits, values = cell_maps(agent, planes(levels))
+        policy = logits.softmax(-3, dtype=torch.float64)
+        rules = (self.maze.max_steps, self.maze.step_penalty)
+        return episode_law(levels, policy, values.squeeze(-3), *rules)
 
     def edit(self, levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
         """Levels [K, n] after random edits; see :func:`~proposer_rl.mazes.edits.edit_levels`."""

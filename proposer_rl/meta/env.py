@@ -41,7 +41,8 @@ class SolverTrainingEnv(EnvBase):
         action_repeat: updates for which an action holds; divides L.
         first_copy: number of the first of these Solvers, where others are trained elsewhere: a
             copy's random numbers belong to its number.
-        on_update: called after every update, e.g. by a progress bar; what it raises ends the
+        on_update: called after every update with the number of those that the episode has had,
+            e.g. by a progress bar; what it raises ends the
             episode.
 
     Attributes:
@@ -61,7 +62,7 @@ class SolverTrainingEnv(EnvBase):
         meta_episode_length: int,
         action_repeat: int = 1,
         first_copy: int = 0,
-        on_update: Callable[[], None] | None = None,
+        on_update: Callable[[int], None] | None = None,
     ) -> None:
         if solvers.agent.copies is None:
             raise ValueError("the Solvers must be a population: their agent has no copies")
@@ -78,7 +79,7 @@ class SolverTrainingEnv(EnvBase):
         self.meta_episode_length = meta_episode_length
         self.action_repeat = action_repeat
         self._reward = reward
-        self.on_update = on_update or (lambda: None)
+        self.on_update = on_update or (lambda done: None)
         self.fork(solvers.snapshot()[0], Streams(0))
         self._make_specs()
 
@@ -125,7 +126,7 @@ class SolverTrainingEnv(EnvBase):
             reward, chosen = self._train(tensordict["action"], measure=last)
             rewards.append(reward)
             choices.append(chosen)
-            self.on_update()
+            self.on_update(self._updates)
         proposed = _count(torch.cat(choices, -1), self.actions.bins).to(self.device)
         state = self._observation(*self._seen, proposed)
         return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))

@@ -47,7 +47,9 @@ CHARTED = {
     curves.cost_curves,
     curves.worst_levels,
     single_levels.worst_curves,
+    single_levels.level_by_level,
     curves.difficulty,
+    proposals.gains,
     proposals.diagnostics,
 }
 # And of these, where levels of several stages can be shown.
@@ -179,6 +181,7 @@ def _section(
         "looks": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": staged is not None,
+        "single": bool(data["levels"]),
         "methods": methods,
         "claims": claims,
         "findings": found,

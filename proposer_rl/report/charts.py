@@ -8,12 +8,12 @@ from typing import Any
 
 from proposer_rl.report.comparisons import Outcome, outcomes, updates_needed, waiting_outcome
 from proposer_rl.report.curves import axis_text
-from proposer_rl.report.proposals import own_numbers
+from proposer_rl.report.proposals import gain_numbers, own_numbers
 from proposer_rl.report.records import Column, is_rate
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.series import COSTS, UPDATES, Series, band, over_cost, over_cycles
 from proposer_rl.report.series import over_updates as against_updates
-from proposer_rl.report.single_levels import told, worst_series
+from proposer_rl.report.single_levels import level_means, told, worst_series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 
@@ -31,8 +31,9 @@ def charts(study: Study) -> dict[str, Json]:
         ``places``: of every method's runs where they were evaluated, by axis. ``measures``: each
         by axis with mean and interval of every method, and with ``rows`` of its runs, at their
         places or, where they are another table's, at the means' own; null where there is none.
-        ``outcomes``: each with an estimate and the runs' values. ``headline``: its name, and
-        whether it is a rate.
+        ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
+        that two methods tell of single levels what each reaches there, null where it does not tell.
+        ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
     """
     return {
         "methods": [
@@ -48,6 +49,8 @@ def charts(study: Study) -> dict[str, Json]:
         "places": [[_places(run) for run in group.runs] for group in study.groups],
         "measures": [*_measured(study), *_trained(study), *_recorded(study), *_single(study)],
         "outcomes": _outcomes(study),
+        "levels": _levels(study),
+        "baseline": study.groups.index(study.baseline),
         "headline": {"name": axis_text(study.headline), "rate": is_rate(study.headline)},
     }
 
@@ -94,7 +97,8 @@ def _trained(study: Study) -> list[Json]:
 
 
 def _recorded(study: Study) -> list[Json]:
-    """The curricula's own numbers."""
+    """The curricula's own numbers, and the gains of the copies."""
+    values = {**gain_numbers(study), **own_numbers(study)}
     kind = "The curricula's own numbers"
     return [
         _on_one_axis(
@@ -104,7 +108,7 @@ def _recorded(study: Study) -> list[Json]:
             [over_cycles(group, value) if group.logs else None for group in study.groups],
             study,
         )
-        for name, value in list(own_numbers(study).items())[:MOST_MEASURES]
+        for name, value in list(values.items())[:MOST_MEASURES]
     ]
 
 
@@ -122,6 +126,22 @@ def _single(study: Study) -> list[Json]:
             log=True,
         )
         for name in told(study)
+    ]
+
+
+def _levels(study: Study) -> list[Json]:
+    """What the methods reach on every single level at the end, mean over seeds."""
+    every = {
+        name: [level_means(study, group, name) for group in study.groups] for name in told(study)
+    }
+    return [
+        {
+            "name": axis_text(name),
+            "rate": is_rate(name),
+            "methods": [None if one is None else plain(one) for one in means],
+        }
+        for name, means in every.items()
+        if sum(one is not None for one in means) > 1
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ DIAGNOSTICS = {
     "reward_sd": "sd of total reward over the copies",
     "reward_explained": "share of rewards explained by actions",
 }
+OF_COPIES: Mapping[str, Callable[[Column], float]] = {"maximum": np.max, "mean": np.mean}
 
 
 def recorded_gain(group: Group) -> str | None:
@@ -136,6 +137,18 @@ def own_numbers(study: Study) -> dict[str, Value]:
     return values
 
 
+def gain_numbers(study: Study) -> dict[str, Value]:
+    """Maximum and mean of the gains of a cycle's copies, by what they are called."""
+    names = dict.fromkeys(filter(None, map(recorded_gain, study.groups)))
+    return {
+        f"total gain in {GAINS[name]}, {text} of the copies": partial(
+            _of_gains, names=[name], reduce=reduce
+        )
+        for name in names
+        for text, reduce in OF_COPIES.items()
+    }
+
+
 def axis_means(run: Run, cycle: Record) -> list[float] | None:
     """Mean value of a cycle's proposals along each axis; None without a histogram."""
     shares = run.shares(cycle)
@@ -175,8 +188,7 @@ def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> N
     points = np.array([(updates, gain) for updates, c in _lists(group, name) for gain in c])
     # As pixels also in SVG, where thousands of dots would make the page heavy.
     axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
-    reductions: list[tuple[str, Any, str]] = [("maximum", np.max, "-"), ("mean", np.mean, "--")]
-    for text, reduce, dash in reductions:
+    for (text, reduce), dash in zip(OF_COPIES.items(), ("-", "--"), strict=True):
         x, rows, _ = over_cycles(group, partial(_of_gains, names=[name], reduce=reduce))
         mean = np.ma.masked_invalid(rows).mean(0)
         axes.plot(x, mean, dash, color=colour, label=f"{text} of the copies")

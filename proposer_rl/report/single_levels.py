@@ -85,12 +85,12 @@ def level_by_level(study: Study) -> Drawing | None:
     """Every method against the baseline on each level; None where there are no two."""
     names = told(study)
     name = study.headline if study.headline in names else next(iter(names), None)
-    if name is None or _means(study, study.baseline, name) is None:
+    if name is None or level_means(study, study.baseline, name) is None:
         return None
     known = [
         (float(means.mean()), group)
         for group in study.groups
-        if group is not study.baseline and (means := _means(study, group, name)) is not None
+        if group is not study.baseline and (means := level_means(study, group, name)) is not None
     ]
     if not known:
         return None
@@ -131,7 +131,7 @@ def level_table(study: Study) -> tuple[list[str], list[list[Cell]]]:
     """Every level's mean over seeds, a column for each method."""
     rows: list[list[Cell]] = []
     for name in told(study):
-        means = [_means(study, group, name) for group in study.groups]
+        means = [level_means(study, group, name) for group in study.groups]
         count = max(len(one) for one in means if one is not None)
         columns = [np.full(count, np.nan) if one is None else one for one in means]
         values = np.transpose(columns)
@@ -145,7 +145,8 @@ def told(study: Study) -> list[str]:
     return [n for n in study.measurements if any(study.scores(g, n) is not None for g in groups)]
 
 
-def _means(study: Study, group: Group, name: str) -> Column | None:
+def level_means(study: Study, group: Group, name: str) -> Column | None:
+    """What a group reaches on every level, mean over seeds, [levels]; None where no run tells."""
     scores = study.scores(group, name)
     return None if scores is None else scores.mean(0)
 
@@ -164,7 +165,7 @@ def _draw_worst(figure: FigureBase, study: Study, name: str) -> None:
 
 def _draw_scatter(figure: FigureBase, study: Study, group: Group, name: str) -> None:
     axes: Axes = axes_of(figure)
-    x, y = (_means(study, each, name) for each in (study.baseline, group))
+    x, y = (level_means(study, each, name) for each in (study.baseline, group))
     assert x is not None and y is not None  # or there would be no panel
     ends = (0.0, 1.0) if is_rate(name) else (min(x.min(), y.min()), max(x.max(), y.max()))
     axes.plot(ends, ends, color="0.4", linewidth=0.8)

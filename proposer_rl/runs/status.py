@@ -97,10 +97,10 @@ class Status:
         self._left[name] = max(self._left.get(name, 0) - 1, 0)
         self._phase = self._doing = ""
 
-    def tick(self, doing: str) -> None:
-        """Count a part of the present unit, in which the run did that."""
+    def tick(self, doing: str, done: int) -> None:
+        """Say how many parts of the present unit are done, in which the run does that."""
         self._doing = doing
-        self._ticks += 1
+        self._ticks = done
         self._tell()
 
     def activity(self) -> Activity:

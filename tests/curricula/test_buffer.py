@@ -141,7 +141,8 @@ def levels(*numbers: int) -> TensorDict:
 
 
 def new(numbers: list[int], score: list[float], **more: Any) -> TensorDict:
-    known = {"best": torch.tensor([score]), **{k: torch.tensor([v]) for k, v in more.items()}}
+    known = {"best": score, "solved": [number > 0.5 for number in score], **more}
+    known = {name: torch.tensor([entry]) for name, entry in known.items()}
     return TensorDict(
         {"level": levels(*numbers), "score": torch.tensor([score]), **known}, (1, len(numbers))
     )
@@ -233,7 +234,7 @@ def test_what_is_evicted_leaves_nothing_behind() -> None:
     assert after["level", "a"].tolist() == [[1, 3]]
     row = after[0, 1]
     assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
-    assert float(row["best"]) == pytest.approx(0.3)
+    assert float(row["best"]) == pytest.approx(0.3) and not bool(row["solved"])
     assert int(row["touched"]) == int(after["clock"][0, 1]) == 2 + 5 + 1  # age 0
     assert buffer["level", "a"].tolist() == [[1, 2]]  # what was given stays as it was
 
@@ -249,15 +250,20 @@ def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
     for numbers, score in (([7, 8, 7], [0.2, 0.9, 0.6]), ([7, 7, 8], [0.6, 0.2, 0.9])):
         buffer = filled(numbers, score, 5, RANK)
         assert int(buffer["filled"].sum()) == 2
-        assert float(buffer["score"][buffer["level", "a"] == 7]) == pytest.approx(0.4)
+        seven = buffer[buffer["level", "a"] == 7]
+        assert float(seven["score"]) == pytest.approx(0.4) and bool(seven["solved"])
 
 
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:
     buffer = filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)
     score = torch.tensor([[1.0, 2.0, -torch.inf]])
-    after = rescore(buffer, torch.tensor([[0, 0, 2]]), score, torch.tensor([[-9.0, 0.7, 0.0]]))
+    best, solved = torch.tensor([[-9.0, 0.7, 0.0]]), torch.tensor([[False, True, False]])
+    after = rescore(buffer, torch.tensor([[0, 0, 2]]), score, best, solved)
     assert after["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
     assert after["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
+    assert after["solved"].tolist() == [[True, False, False, False]]
+    again = rescore(after, torch.tensor([[0]]), score[:, :1], best[:, :1], solved[:, :1])
+    assert bool(again["solved"][0, 0])  # for ever
 
 
 def test_with_staleness_alone_every_level_comes_up() -> None:

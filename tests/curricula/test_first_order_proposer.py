@@ -42,10 +42,16 @@ def agent() -> ActorCritic:
     return proposer_actor_critic(network, categorical)
 
 
-def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
+def proposer(task: Seen, batches: int = 1, **settings: Any) -> FirstOrderProposer:
     chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
     return FirstOrderProposer(
-        task, agent(), PPOSettings(**chosen), probe_levels=2, target_levels=3, measure="return"
+        task,
+        agent(),
+        PPOSettings(**chosen),
+        probe_levels=2,
+        batches=batches,
+        target_levels=3,
+        measure="return",
     )
 
 
@@ -59,16 +65,21 @@ def test_it_learns_to_choose_what_the_target_needs() -> None:
     assert (proposal.levels == 2).float().mean() > 0.8
 
 
-def test_every_problem_is_credited_with_its_own_alignment() -> None:
+@pytest.mark.parametrize("batches", [1, 3])
+def test_every_problem_is_credited_with_its_own_alignment(batches: int) -> None:
+    """Also those of batches that the Solver does not train on."""
     task = Seen(1, WANTED)
-    curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
+    settings = {"epochs": 1, "entropy_coeff": 0.3, "max_grad_norm": 100.0}
+    curriculum = proposer(task, batches, **settings)
     expected = copy.deepcopy(curriculum.agent)
-    choices = curriculum.propose(task, 0, [Streams(0)]).levels[0]
+    proposal = curriculum.propose(task, 0, [Streams(0)])
+    assert proposal.evaluations == 3 + 2 * P * batches
 
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(1, P, generator=Streams(0).generator("choices"))
-    assert torch.equal(choices, draw(policy, noise[0]))
+    noise = torch.rand(batches, P, generator=Streams(0).generator("choices"))
+    choices = draw(policy, noise)
+    assert torch.equal(proposal.levels, choices[:1])
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
@@ -77,6 +88,11 @@ def test_every_problem_is_credited_with_its_own_alignment() -> None:
     by_hand.step()
     for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_no_batch_is_refused() -> None:
+    with pytest.raises(ValueError, match="batches must be at least 1, got 0"):
+        FirstOrderProposer(Seen(1, WANTED), agent(), PPOSettings(), batches=0)
 
 
 def test_a_resumed_proposer_goes_on_bit_by_bit() -> None:

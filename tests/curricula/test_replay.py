@@ -18,6 +18,7 @@ from proposer_rl.curricula.buffer import (
     score_weights,
 )
 from proposer_rl.curricula.replay import _lineage
+from proposer_rl.curricula.scores import unseen
 from proposer_rl.mazes import planes
 from proposer_rl.streams import Streams
 from tests.curricula.living import (
@@ -80,6 +81,8 @@ MADE = {
     "traced": traced,
     "gradients": lambda: replay("gradient_norm", "exact"),
     "policy gradients": lambda: replay("gradient_norm"),
+    "negative advantages": lambda: replay("mean_negative_advantage"),
+    "law": lambda: replay("max_mc", "exact"),
 }
 
 
@@ -212,7 +215,7 @@ def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     rollout, last = lived.updates[-1].rollout, curriculum._last
     assert last is not None
     loss = Scorer(TASK, "l1_value_loss", "episodes")
-    lost = loss.of_rollouts(learner, [rollout], torch.full((1, P), -torch.inf)).score[0]
+    lost = loss.of_rollouts(learner, [rollout], *unseen((1, P))).score[0]
     after = rollout["next"][0]
     for p in range(P):
         total, count, reached = 0.0, 0, 0.0

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.curricula.scores import Scorer, episodes
+from proposer_rl.curricula.scores import Scorer, episodes, unseen
+from proposer_rl.curricula.stepwise import STEPWISE
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
@@ -23,7 +24,7 @@ FIRST = ([-0.01, -0.01, 0.99], [0.7, 0.4, 0.9])
 SECOND = ([-0.01, -0.01, 0.99], [0.8, 0.9, 0.6])
 SHORT = ([0.99], [0.5])
 FAILED = ([-0.01] * 3, [0.2] * 3)
-NONE = torch.full((1, 1), -torch.inf)
+NONE, UNSOLVED = unseen((1, 1))
 
 Episode = tuple[list[float], list[float]]
 
@@ -55,8 +56,11 @@ def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int =
     return TensorDict({"state_value": column(value), "next": step}, (1, 1, length))
 
 
-def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
-    return float(Scorer(TASK, name, "episodes").of_rollouts(LEARNER, rollouts, best).score)
+def score(
+    name: str, *rollouts: TensorDict, best: Tensor = NONE, solved: Tensor = UNSOLVED
+) -> float:
+    scorer = Scorer(TASK, name, "episodes")
+    return float(scorer.of_rollouts(LEARNER, rollouts, best, solved).score)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +74,12 @@ def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
         ("positive_value_loss", played(FAILED, success=True), 0.0),  # nothing is bootstrapped
         ("positive_value_loss", played(FAILED, success=False, after=0.3), 0.02),
         ("max_mc", played(FAILED, success=False), -0.23),  # -0.20 if the maximum began at 0
+        ("one_step_td_error", played(FIRST), 0.28),  # 0.375 without the last step
+        ("mean_negative_advantage", played(FIRST), 0.058333),  # 0.175 as a sum
+        ("mean_negative_advantage", played(SECOND), 0.094008),
+        ("mean_negative_advantage", played(FAILED, success=False), 0.0),  # never solved
         ("learnability", played(FIRST, SHORT), 0.0),
+        ("return_variance", played(FIRST, SHORT), 0.0001),  # of 0.97 and 0.99
         ("regret", played(FIRST, SHORT), 0.01),  # 0.99 - (0.97 + 0.99) / 2
     ],
 )
@@ -82,13 +91,23 @@ def test_the_best_return_of_a_level_is_remembered() -> None:
     best = torch.tensor([[0.98]])
     assert score("max_mc", played(FIRST), best=best) == pytest.approx(0.313333, abs=1e-6)
     assert score("regret", played(FIRST), best=best) == pytest.approx(0.01, abs=1e-6)
-    found = Scorer(TASK, "max_mc", "episodes").of_rollouts(LEARNER, [played(FAILED)], best)
-    assert float(found.best) == pytest.approx(0.98)
+    scorer = Scorer(TASK, "max_mc", "episodes")
+    failed = played(FAILED, success=False)
+    found = scorer.of_rollouts(LEARNER, [failed], best, UNSOLVED)
+    assert float(found.best) == pytest.approx(0.98) and not bool(found.solved)
+
+
+def test_a_level_once_solved_is_worth_failing_on() -> None:
+    failed, name = played(FAILED, success=False), "mean_negative_advantage"
+    scorer = Scorer(TASK, name, "episodes")
+    solved = scorer.of_rollouts(LEARNER, [played(SHORT)], NONE, UNSOLVED).solved
+    assert bool(solved) and score(name, failed) == 0 < score(name, failed, solved=solved)
+    assert bool(scorer.of_rollouts(LEARNER, [failed], NONE, solved).solved)
 
 
 def test_only_episodes_that_end_count() -> None:
     whole, cut = played(FIRST), played(FIRST, SECOND, cut=1)
-    for name in ("positive_value_loss", "l1_value_loss", "max_mc", "regret"):
+    for name in (*STEPWISE, "return_variance", "regret"):
         assert score(name, cut) == pytest.approx(score(name, whole), abs=1e-6)
     assert score("l1_value_loss", played(FIRST, cut=1)) == -torch.inf
 
@@ -98,6 +117,43 @@ def test_rollouts_are_pooled_by_episodes() -> None:
     assert score("learnability", played(FIRST, SHORT), failed) == pytest.approx(2 / 9)
     together = score("positive_value_loss", played(FIRST, SHORT))
     assert score("positive_value_loss", played(FIRST), played(SHORT)) == pytest.approx(together)
+
+
+@pytest.mark.parametrize("name", [*STEPWISE, "learnability", "return_variance", "regret"])
+def test_the_same_episodes_again_leave_a_score_as_it_was(name: str) -> None:
+    parts = [FIRST, SHORT, SECOND]
+    assert score(name, played(*parts, *parts)) == pytest.approx(score(name, played(*parts)))
+
+
+numbers = st.floats(-1, 1, width=32)
+
+
+@given(
+    st.lists(st.tuples(numbers, numbers), min_size=1, max_size=6),
+    numbers,
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
+def test_negative_advantages_are_those_of_the_definition(
+    steps: list[tuple[float, float]], after: float, gamma: float, lmbda: float
+) -> None:
+    """The weighted sum of errors, one start at a time; truncated, as in an episode's last step."""
+    rewards, values = (list(column) for column in zip(*steps, strict=True))
+    following = [*values[1:], after]
+    delta = [r + gamma * n - v for r, v, n in zip(rewards, values, following, strict=True)]
+    lost = 0.0
+    for start in range(len(delta)):
+        behind, ahead = 0.0, delta[start:]
+        for i, error in enumerate(ahead):
+            behind = min(behind + gamma**i * error, 0)
+            lost -= (1 if i == len(ahead) - 1 else 1 - lmbda) * lmbda**i * behind
+    learner: Any = SimpleNamespace(
+        settings=SimpleNamespace(gamma=gamma, lmbda=lmbda), agent=LEARNER.agent
+    )
+    rollout = played((rewards, values), success=False, after=after)
+    scorer = Scorer(TASK, "mean_negative_advantage", "episodes")
+    found = scorer.of_rollouts(learner, [rollout], NONE, ~UNSOLVED).score
+    assert float(found) == pytest.approx(lost / len(delta), abs=1e-5)
 
 
 lists = st.lists(st.tuples(st.integers(1, 5), st.booleans()), min_size=1, max_size=4)
@@ -124,6 +180,7 @@ def test_episodes_are_those_of_a_plain_loop(
     assert int(found.ended) == len(ends)
     assert int(found.successes) == sum(success for _, success in ends)
     assert float(found.total) == pytest.approx(sum(returns), abs=1e-5)
+    assert float(found.squares) == pytest.approx(sum(r * r for r in returns), abs=1e-5)
     assert float(found.best) == pytest.approx(max(returns), abs=1e-6)
     torch.testing.assert_close(found.weight.flatten().float(), weight)
 
@@ -131,7 +188,7 @@ def test_episodes_are_those_of_a_plain_loop(
 def test_a_perfect_critic_leaves_nothing_to_learn() -> None:
     rewards = torch.tensor([-0.01, -0.01, 0.99])
     values = [float((rewards[t:] * 0.9 ** torch.arange(3 - t)).sum()) for t in range(3)]
-    for name in ("positive_value_loss", "l1_value_loss"):
+    for name in STEPWISE.keys() - {"max_mc"}:
         assert score(name, played((rewards.tolist(), values))) == pytest.approx(0, abs=1e-6)
 
 
@@ -183,3 +240,5 @@ def test_what_cannot_be_scored_is_refused_in_one_line() -> None:
     blind: Any = SimpleNamespace()
     with pytest.raises(TypeError, match="SimpleNamespace does not know the largest return"):
         Scorer(blind, "regret", "exact")
+    with pytest.raises(TypeError, match=r"score=max_mc .* SimpleNamespace must define episode_law"):
+        Scorer(blind, "max_mc", "exact")

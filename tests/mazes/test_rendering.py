@@ -6,6 +6,7 @@ import torch
 from proposer_rl.mazes import Level, draw_level
 from proposer_rl.mazes.rendering import (
     AGENT_COLOUR,
+    DIRECTION_COLOUR,
     FREE_COLOUR,
     GOAL_COLOUR,
     LINE_COLOUR,
@@ -13,6 +14,7 @@ from proposer_rl.mazes.rendering import (
     START_COLOUR,
     WALL_COLOUR,
 )
+from proposer_rl.mazes.view.levels import ViewLevel
 
 LEVEL = Level.from_text("S.#\n..G")
 COLOURS = {"S": START_COLOUR, "G": GOAL_COLOUR, "#": WALL_COLOUR, ".": FREE_COLOUR}
@@ -49,6 +51,19 @@ def test_agent_lies_within_its_cell() -> None:
     changed = (plain != picture).any(-1).nonzero()
     assert colour(picture, 1, 1, 12) == AGENT_COLOUR
     assert changed.amin(0).tolist() > [12, 12] and changed.amax(0).tolist() < [24, 24]
+
+
+@pytest.mark.parametrize(
+    ("mark", "axis", "sign"), [(">", 1, 1), ("v", 0, 1), ("<", 1, -1), ("^", 0, -1)]
+)
+def test_a_triangle_points_where_the_agent_looks(mark: str, axis: int, sign: int) -> None:
+    """It is widest behind, and narrowest in front."""
+    picture = draw_level(ViewLevel.from_text(f"#{mark}\nG."), cell=17)[:17, 17:34]
+    white = (picture == torch.tensor(DIRECTION_COLOUR)).all(-1)
+    widths = white.sum(1 - axis)
+    widths = widths[widths > 0]
+    assert len(widths) > 6 and (sign * widths.diff() <= 0).all() and white.sum() < 100
+    assert widths.amax() > 4 * widths.amin()
 
 
 def test_wrong_shapes_are_refused() -> None:

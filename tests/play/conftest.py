@@ -1,4 +1,4 @@
-"""Two runs of seconds, mazes and cars, and the page of each."""
+"""Runs of seconds: mazes, mazes seen through a window, and cars; and the page of each."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.play.pages import CARS, MAZES, Page, served, trained
+from tests.play.pages import CARS, MAZES, VIEWS, Page, served, trained
 from tests.tiny import EXAMPLES
 
 
@@ -22,6 +22,13 @@ def car_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
         yield trained(tmp_path_factory.mktemp("runs") / "cars", *CARS)
+
+
+@pytest.fixture(scope="session")
+def view_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """Mazes seen through a window, two checkpoints."""
+    with served(trained(tmp_path_factory.mktemp("runs") / "views", *VIEWS)) as page:
+        yield page
 
 
 @pytest.fixture(scope="session")

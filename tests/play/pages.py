@@ -23,6 +23,10 @@ MAZES = [
     *("+method=target", "+scale=smoke", "compute.progress=false"),
     *("schedule.keep_checkpoints=100", "schedule.checkpoint_every=2"),
 ]
+VIEWS = [
+    *("task=view_maze_smoke", "+method=target", "compute.progress=false"),
+    *("schedule.updates=4", "schedule.keep_checkpoints=100"),
+]
 CARS = [
     *("--config-dir", f"{EXAMPLES}/conf", "task=mountain_car", "+method=target"),
     *("compute.progress=false", "schedule.updates=4", "schedule.checkpoint_every=2"),

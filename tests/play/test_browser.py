@@ -70,6 +70,11 @@ def tab(context: BrowserContext, page: Page) -> Iterator[Tab]:
 
 
 @pytest.fixture
+def view_tab(context: BrowserContext, view_page: Page) -> Iterator[Tab]:
+    yield from opened(context, view_page.address)
+
+
+@pytest.fixture
 def car_tab(context: BrowserContext, car_page: Page) -> Iterator[Tab]:
     yield from opened(context, car_page.address)
 
@@ -322,3 +327,34 @@ def test_another_page_gets_nothing_even_with_the_token(context: BrowserContext, 
     tab.set_content(f'<iframe src="{page.address}"></iframe><script src="{page.address}play.js">')
     tab.wait_for_timeout(500)
     assert all("gallery" not in frame.content() for frame in tab.frames[1:])
+
+
+def test_a_maze_seen_through_a_window_is_drawn_watched_and_played(view_tab: Tab) -> None:
+    tab, status = view_tab, view_tab.locator("#status")
+    table = tab.locator("#results tbody")
+    expect(table.locator("tr").first).to_contain_text("Solver, 5 episodes")
+    assert tab.locator("#policy").is_hidden() and tab.locator("#colour").is_hidden()
+    # The empty level: start and goal in opposite corners, and the agent looks to the right.
+    tab.get_by_role("button", name="Play it yourself").click()
+    for key in [*["ArrowUp"] * 4, "ArrowRight", *["ArrowUp"] * 4]:
+        tab.locator("#board").press(key)
+    expect(status).to_have_text("You reach the goal in 9 moves; 9 are the least.")
+    tab.get_by_role("button", name="Stop playing").click()
+    # Turned upwards, it has to turn first.
+    tab.get_by_role("radio", name="start ^").click()
+    drag(tab, (0, 0))
+    drag(tab, (0, 0), (1, 0))
+    tab.get_by_role("radio", name="wall").click()
+    drag(tab, (2, 0), (2, 3))
+    expect(status).to_contain_text("success")
+    with tab.expect_download() as download:
+        tab.get_by_role("button", name="Save", exact=True).click()
+    rows = download.value.path().read_text().split()[-5:]
+    assert rows == [".....", "^....", "####.", ".....", "....G"]
+    expect(table.locator("tr").nth(2)).to_contain_text("9")  # two turns and seven moves
+    for kind in ("greedy", "sampled"):
+        tab.locator("#episode").select_option(kind)
+        tab.get_by_role("button", name="Watch the Solver").click()
+        expect(status).to_contain_text("The Solver")
+    tab.locator("#checkpoint").fill("0")
+    expect(tab.locator("#updates")).to_contain_text("1 of 2 · update 2")

@@ -8,6 +8,7 @@ import shutil
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +128,34 @@ def test_every_checkpoint_is_examined_as_the_command_does(
             assert told["results"][name] == pytest.approx(results[name], abs=1e-5)
         successes.add(told["results"]["success"])
     assert len(successes) == 3
+
+
+def test_a_solver_with_memory_is_examined_as_the_command_does(
+    view_page: Page, tmp_path: Path
+) -> None:
+    rows = ["v....", ".##..", "..#.G", ".....", "#...."]
+    (tmp_path / "drawn.txt").write_text("\n".join(rows) + "\n")
+    for number, file in enumerate(checkpoints(view_page.run), 1):
+        question = {"checkpoint": number, "solver": 0, "rows": rows}
+        told = asked(view_page, "examine", question)
+        assert told == asked(view_page, "examine", question)
+        (score,) = evaluate(file, str(tmp_path / "drawn.txt")).scores
+        for name in ("success", "return"):
+            assert told["results"][name] == pytest.approx(score.results[name], abs=1e-5)
+        paths = told["paths"]
+        assert len(paths["shortest"]) - 1 == score.about["fewest_actions"]
+        assert "policy" not in told and told["maps"] == {}
+        # Every way is one that actions lead along, to the goal or as far as there are steps.
+        for way in (paths["solver"], paths["shortest"], *paths["sampled"]):
+            assert way[0] == [0, 0, 1]
+            places = [4 * (5 * row + column) + direction for row, column, direction in way]
+            for one, other in pairwise(places):
+                assert other in {leads[one] for leads in told["next"]}
+            assert way[-1][:2] == [2, 4] or len(way) - 1 == told["max_steps"]
+            assert [2, 4] not in [place[:2] for place in way[:-1]]
+        assert len(paths["sampled"]) == told["episodes"] == 5
+        reached = [way[-1][:2] == [2, 4] for way in paths["sampled"]]
+        assert sum(reached) == pytest.approx(5 * told["results"]["success"])
 
 
 def test_draws_are_a_seeds_own_and_as_good_as_is_told(page: Page) -> None:

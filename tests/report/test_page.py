@@ -25,9 +25,9 @@ OPTIONS = [
     "--disable-background-networking",
     "--disable-component-update",
 ]
-# Where a point of the curves lies on the screen.
-PIXEL = """([x, y]) => {
-    const chart = document.querySelector(".curves"), { left, top } = chart.getBoundingClientRect();
+# Where a point of a chart lies on the screen.
+PIXEL = """([place, x, y]) => {
+    const chart = document.querySelector(place), { left, top } = chart.getBoundingClientRect();
     const { xaxis, yaxis } = chart._fullLayout;
     return [left + xaxis._offset + xaxis.l2p(x), top + yaxis._offset + yaxis.l2p(y)];
 }"""
@@ -54,7 +54,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_jsonl(folder / "curriculum.jsonl", lines)
         for number, method in enumerate((HOSTILE, "target")):
             curve = [0.0, 0.1, 0.2, 0.1 * number + 0.3 + seed / 100]
-            write_run(runs / f"{number}{seed}", method, [seed], curve)
+            reached = [0.1 * number, 0.5, 0.9 - 0.2 * number + seed / 100]
+            write_run(runs / f"{number}{seed}", method, [seed], curve, levels=reached)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "DRAWINGS", [cost_curves])
         return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
@@ -140,13 +141,39 @@ def test_values_are_told_where_the_pointer_is(seen: Seen) -> None:
     seen.page.locator(".methods button", has_text="none").click()
     seen.tick(".methods", "perf_gain")
     seen.page.locator(".curves").scroll_into_view_if_needed()
-    left, top = seen.page.evaluate(PIXEL, [30, 0.825])
+    left, top = seen.page.evaluate(PIXEL, [".curves", 30, 0.825])
     for steps in range(3):
         seen.page.mouse.move(left - 5 + steps, top)
     seen.page.wait_for_selector(".curves .hoverlayer .hovertext")
     text = seen.page.locator(".curves .hoverlayer").text_content()
     assert "perf_gain" in text and "0.825 [0.8054, 0.8446]" in text
     seen.page.locator(".methods button", has_text="all").click()
+
+
+def test_two_methods_are_compared_level_by_level(seen: Seen) -> None:
+    page = seen.page
+    options = page.locator(".up option").all_text_contents()
+    assert sorted(options) == sorted([HOSTILE, "target"])  # perf_gain does not tell
+    page.select_option(".up", label="target")
+    page.select_option(".across", label=HOSTILE)
+    (dots,) = seen.traces(".single", "levels")
+    assert dots["x"] == pytest.approx([0, 0.5, 0.925])
+    assert dots["y"] == pytest.approx([0.1, 0.5, 0.725])
+    assert page.locator(".shares").inner_text() == "better on 33 %, worse on 33 %"
+    page.locator(".single").scroll_into_view_if_needed()
+    left, top = page.evaluate(PIXEL, [".single", 0.925, 0.725])
+    for steps in range(3):
+        page.mouse.move(left - 5 + steps, top)
+    page.wait_for_selector(".single .hoverlayer .hovertext")
+    text = page.locator(".single .hoverlayer").text_content()
+    assert "number 2" in text and "target: 0.725" in text and "0.925" in text
+
+
+def test_the_gains_of_the_copies_are_told(seen: Seen) -> None:
+    seen.page.select_option(".measure", label="total gain in log success, maximum of the copies")
+    means = {trace["name"]: trace["y"] for trace in seen.traces(".curves", "mean")}
+    assert means == {"perf_gain": [0.2, 0.2]}
+    seen.page.select_option(".measure", label="ID success rate")
 
 
 def test_the_slider_moves_map_levels_and_success_together(seen: Seen) -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import group_table
 from proposer_rl.report.single_levels import (
     level_by_level,
@@ -102,6 +103,20 @@ def test_methods_are_drawn_against_the_baseline(tmp_path: Path) -> None:
     drawing = level_by_level(study_of(tmp_path))
     assert drawing is not None and len(drawing.panels) == 1
     assert "of target against that of domain_randomization" in drawing.panels[0].description
+
+
+def test_the_page_has_what_every_method_reaches_on_each_level(tmp_path: Path) -> None:
+    drawn = charts(study_of(tmp_path))
+    labels = [method["label"] for method in drawn["methods"]]
+    assert labels[drawn["baseline"]] == "domain_randomization"
+    assert [measure["name"] for measure in drawn["levels"]] == [
+        "ID success rate",
+        "OOD success rate",
+    ]
+    means = dict(zip(labels, drawn["levels"][0]["methods"], strict=True))
+    assert means["hand_made"] is None  # the older folder tells of none
+    for method, levels in LEVELS.items():
+        assert means[method] == pytest.approx([value + 0.02 for value in levels])
 
 
 def test_levels_of_runs_that_are_not_at_the_horizon_do_not_count(tmp_path: Path) -> None:

@@ -29,9 +29,9 @@ def test_the_rest_is_what_is_left_times_what_it_took(tmp_path: Path) -> None:
         for cycle in range(3):
             status.plan(left)
             with status.phase("improve"):
-                for _ in range(12):
+                for part in range(12):
                     clock.pass_(7)
-                    status.tick("training the copies")
+                    status.tick("training the copies", part + 1)
                     seconds, all_known = status.remaining()
                     # In the first cycle nothing is known of updates: it takes at least the rest.
                     updates = 30 if cycle == 0 else 0
@@ -49,12 +49,12 @@ def test_the_file_says_what_is_going_on_and_is_gone_at_the_end(tmp_path: Path) -
     clock, shown = Clock(), []
     status = Status(parts=4, clock=clock)
     status.plan({"improve": 2, "update": 1})
-    status.tick("before there is a folder")
+    status.tick("before there is a folder", 1)
     with status.of_run(tmp_path, lambda: shown.append(status.activity().text())):
         with status.phase("improve"):
-            for _ in range(3):
+            for part in range(3):
                 clock.pass_(10)
-                status.tick("training the copies")
+                status.tick("training the copies", part + 1)
             written = Activity(**json.loads((tmp_path / FILE).read_text()))
             assert written == Activity("training the copies", 3, 4, 50.0, True)
         with status.phase("update"):  # at once: nothing is written more often than once a second

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -58,12 +58,8 @@ def play(
     each = levels.expand(agent.copies, count)
     every: ViewLevel = torch.cat([each] * episodes, 1)  # type: ignore[assignment]
     noise = torch.rand(max_steps, every.batch_size[1], generator=generator, device=device)
-
-    def sample(state: TensorDictBase, step: int, place: Tensor) -> Tensor:
-        return draw(agent.distribution(state), noise[step, place].expand(state.batch_size))
-
     returns, success = torch.zeros(2, *every.batch_size, device=device)
-    for place, state, counts in _episodes(agent, every, max_steps, sample):
+    for place, state, counts in _episodes(agent, every, max_steps, noise):
         returns[:, place] += state["reward"].squeeze(-1) * counts
         success[:, place] += (state["terminated"].squeeze(-1) & counts).float()
     means = {
@@ -71,6 +67,33 @@ def play(
         for name, total in (("return", returns), ("success", success))
     }
     return TensorDict(means, each.batch_size)
+
+
+@torch.no_grad()
+def walks(
+    agent: ActorCritic, levels: ViewLevel, max_steps: int, noise: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Where K Solvers go on levels, one episode on each.
+
+    Args:
+        agent: K Solvers.
+        levels: Levels ``[N]``.
+        max_steps: Step limit T of an episode.
+        noise: Of the actions, float ``[T, N]``, 0 to 1; None for the most probable ones.
+
+    Returns:
+        Row, column and direction before every step and at the end, int64 ``[K, N, T + 1, 3]``, and
+        the number of steps, int64 ``[K, N]``; what comes after them means nothing.
+    """
+    every = levels.expand(agent.copies, *levels.batch_size)
+    first = torch.cat([every.start, every.direction.unsqueeze(-1)], -1)  # [K, N, 3]
+    went = first.unsqueeze(2).repeat(1, 1, max_steps + 1, 1)
+    steps = torch.zeros(every.batch_size, dtype=torch.int64, device=first.device)
+    for step, (place, state, counts) in enumerate(_episodes(agent, every, max_steps, noise), 1):
+        now = torch.cat([state["agent"], state["direction"].unsqueeze(-1)], -1)
+        went[:, place, step] = now
+        steps[:, place] += counts
+    return went, steps
 
 
 @torch.no_grad()
@@ -85,10 +108,7 @@ def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
     grid = levels.walls.shape[-2:]
     seen = torch.zeros(*every.batch_size, *grid, device=levels.walls.device)
 
-    def best(state: TensorDictBase, step: int, place: Tensor) -> Tensor:
-        return state[agent.logits_key].argmax(-1)
-
-    for place, state, counts in _episodes(agent, every, max_steps, best):
+    for place, state, counts in _episodes(agent, every, max_steps, None):
         seen[:, place] += cell_plane(state["agent"], grid) * counts[..., None, None]
     return seen / seen.sum((-2, -1), keepdim=True).clamp(min=1)
 
@@ -97,7 +117,7 @@ def _episodes(
     agent: ActorCritic,
     levels: ViewLevel,
     max_steps: int,
-    act: Callable[[TensorDictBase, int, Tensor], Tensor],
+    noise: Tensor | None,
 ) -> Iterator[Played]:
     """Play one episode of each Solver on each of its levels [K, N], all at once.
 
@@ -105,8 +125,7 @@ def _episodes(
         agent: K Solvers.
         levels: of each.
         max_steps: step limit.
-        act: the actions, int64 [K, m], given a state with logits [K, m], the number of the step and
-            the places of the m levels.
+        noise: of the actions, as for :func:`walks`.
     """
     if not levels.batch_size[1]:
         return
@@ -122,7 +141,12 @@ def _episodes(
                 return
             place, over, state = place[left], over[:, left], state[:, left]
             env = ViewMazeEnv(levels[:, place], max_steps=max_steps)
-        action = act(agent(state), step, place)
+        state = agent(state)
+        if noise is None:
+            action = state[agent.logits_key].argmax(-1)
+        else:
+            given = noise[step, place].expand(state.batch_size)
+            action = draw(agent.distribution(state), given)
         state = env.step(state.set(agent.action_key, action))["next"]
         yield Played(place, state, ~over)
         over = over | state["done"].squeeze(-1)

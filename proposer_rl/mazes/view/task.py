@@ -19,6 +19,7 @@ from proposer_rl.mazes.level_scores import SLACK
 from proposer_rl.mazes.levels import planes
 from proposer_rl.mazes.records import level_records, level_statistics
 from proposer_rl.mazes.settings import Channels
+from proposer_rl.mazes.view.board import ViewBoard
 from proposer_rl.mazes.view.distance import fewest_actions, optimal_return
 from proposer_rl.mazes.view.distributions import ViewDistribution, ViewSpace
 from proposer_rl.mazes.view.env import ViewMazeEnv
@@ -106,6 +107,8 @@ class ViewMazeTask:
             f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
             f"or a distribution: {', '.join(distributions)}"
         )
+        scoring = Streams(evaluation.seed, "scores")
+        self.board = ViewBoard(maze, evaluation.named_episodes, scoring, self.device)
         self._measured_on = {
             name: self.evaluation_levels(name) for name in evaluation.distributions
         }

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from itertools import cycle
+from threading import Event
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from proposer_rl.learning import PPO, DivergedError, Update
@@ -28,6 +32,7 @@ from proposer_rl.meta.workers.remote import MakeEnv, Report, WorkerPolicy, make_
 from proposer_rl.streams import Streams
 
 ATTEMPTS = 3
+EVERY = 0.5  # seconds between two looks at how far the workers are
 
 
 class CopiesInWorkers:
@@ -40,16 +45,25 @@ class CopiesInWorkers:
             copies; it is used for all but the copies' training.
         make_env: makes a worker's environment.
         settings: how many workers there are, and where.
+        tell: called now and then, in another thread, with the number of updates that all copies
+            have had of the present episode; not of Ray's workers, which share no memory.
 
     Raises:
         ValueError: for more workers than copies.
     """
 
-    def __init__(self, proposer: PPO, make_env: MakeEnv, settings: WorkerSettings) -> None:
+    def __init__(
+        self,
+        proposer: PPO,
+        make_env: MakeEnv,
+        settings: WorkerSettings,
+        tell: Callable[[int], None] = lambda done: None,
+    ) -> None:
         self._proposer = proposer
         self._env: SolverTrainingEnv = proposer.env
         self._make_env = make_env
         self._settings = settings
+        self._tell = tell
         self._shares = shares(self._env.batch_size[0], settings.workers)
         # Of each copy its place, [K], among those of all workers: in the first that has it.
         every = [copy for share in self._shares for copy in share]
@@ -79,7 +93,7 @@ class CopiesInWorkers:
                         "same command goes on from the last checkpoint"
                     ) from error
                 # It may have been the signal that ends this run, too.
-                self._env.on_update()
+                self._env.on_update(0)
                 warnings.warn(
                     f"a worker was lost ({reason}); it is replaced and the episode repeated",
                     RuntimeWarning,
@@ -123,9 +137,13 @@ class CopiesInWorkers:
         origin = solver.cpu().consolidate()
         named = self._proposer.agent.named_parameters()
         weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
-        collector.map_fn("env.fork", [(origin, streams)] * every)
+        counts = torch.zeros(every, dtype=torch.int64).share_memory_()
+        orders = [(origin, streams, count) for count in counts]
+        collector.map_fn("env.fork", orders)
         collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
-        return collect(collector), collector.get_distant_attr("env.diverged")
+        with _told(counts, self._tell):
+            rollouts = collect(collector)
+        return rollouts, collector.get_distant_attr("env.diverged")
 
     def _start(self) -> BaseCollector:
         """Workers with an environment and a policy each."""
@@ -166,6 +184,29 @@ def shares(copies: int, workers: int) -> list[range]:
     each = -(-copies // workers)
     starts = [min(worker * each, copies - each) for worker in range(workers)]
     return [range(start, start + each) for start in starts]
+
+
+@contextmanager
+def _told(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
+    """While workers count their updates, [W]: tell what the slowest has counted."""
+    over = Event()
+
+    def watch() -> None:
+        told, last = 0, False
+        while not last:
+            last = over.wait(EVERY)
+            done = int(counts.min())
+            if done > told:
+                tell(done)
+                told = done
+
+    with ThreadPoolExecutor(1) as pool:
+        watched = pool.submit(watch)
+        try:
+            yield
+        finally:
+            over.set()
+        watched.result()  # raises what telling has raised
 
 
 def _last_line(error: Exception) -> str:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
 from proposer_rl.learning.cuda_graphs import use
@@ -39,9 +40,21 @@ class WorkerEnv(SolverTrainingEnv):
 
     diverged: str | None = None
 
-    def fork(self, solver: TensorDictBase, streams: Streams) -> None:
-        """See :meth:`SolverTrainingEnv.fork`."""
+    def fork(self, solver: TensorDictBase, streams: Streams, count: Tensor | None = None) -> None:
+        """See :meth:`SolverTrainingEnv.fork`.
+
+        Args:
+            solver: as there.
+            streams: as there.
+            count: int64 [], to be filled with the number of updates that the episode has had.
+        """
         self.diverged = None
+        if count is not None:
+
+            def tell(done: int) -> None:
+                count.fill_(done)
+
+            self.on_update = tell
         super().fork(solver, streams)
 
     def report(self, copy: int) -> Report:

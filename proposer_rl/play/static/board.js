@@ -1,6 +1,7 @@
 // The canvas: a level, what is shown of a Solver on it, and where the pointer is.
 
-const STEPS = { up: [-1, 0], down: [1, 0], left: [0, -1], right: [0, 1] };
+export const STEPS = { up: [-1, 0], down: [1, 0], left: [0, -1], right: [0, 1] };
+const WAYS = [STEPS.right, STEPS.down, STEPS.left, STEPS.up]; // in which an agent looks
 const LEAST = 0.03; // an action less probable than this has no arrow
 const LETTERS = 16; // pixels of a cell from which on it has room for a letter
 
@@ -144,10 +145,8 @@ export class Board {
   drawMarks() {
     const { level } = this.scene;
     const { context, cell, colours } = this;
-    for (const kind of level.kinds.filter((one) => one.once)) {
-      const place = level.find(kind);
-      if (!place) continue;
-      const [row, column] = place;
+    for (const [row, column] of level.marked()) {
+      const kind = level.kind(row, column);
       context.fillStyle = colours[kind.name];
       context.beginPath();
       context.roundRect((column + 0.2) * cell, (row + 0.2) * cell, cell * 0.6, cell * 0.6, cell * 0.12);
@@ -179,7 +178,7 @@ export class Board {
     context.setLineDash([]);
   }
 
-  drawAgent({ cell: [row, column], colour }) {
+  drawAgent({ cell: [row, column, way], colour }) {
     const { context, cell } = this;
     context.beginPath();
     context.arc((column + 0.5) * cell, (row + 0.5) * cell, cell * 0.26, 0, 2 * Math.PI);
@@ -187,6 +186,12 @@ export class Board {
     context.strokeStyle = this.colours.free;
     context.lineWidth = Math.max(1.5, cell * 0.05);
     context.fill();
+    context.stroke();
+    if (way === undefined) return;
+    const [down, right] = WAYS[way];
+    context.beginPath();
+    context.moveTo((column + 0.5) * cell, (row + 0.5) * cell);
+    context.lineTo((column + 0.5 + right * 0.24) * cell, (row + 0.5 + down * 0.24) * cell);
     context.stroke();
   }
 

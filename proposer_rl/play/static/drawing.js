@@ -1,5 +1,6 @@
 // Changing the level: by pointer, by keys, as a whole; and back again.
 
+import { STEPS } from "./board.js";
 import { Level } from "./level.js";
 import { $, forget, state, tell } from "./page.js";
 import { endGame, move, moveTowards, startGame } from "./playing.js";
@@ -21,7 +22,8 @@ export function makeTools() {
     button.title = `Key ${index + 1}`;
     swatch.className = "swatch";
     swatch.style.background = `var(--cell-${kind.name})`;
-    button.append(swatch, kind.name);
+    const alone = kinds.filter((one) => one.name === kind.name).length < 2;
+    button.append(swatch, alone ? kind.name : `${kind.name} ${kind.mark}`);
     button.addEventListener("click", () => choose(kind));
     return button;
   }));
@@ -55,7 +57,7 @@ export function pointed(row, column, what, event) {
     moveTowards(row, column);
   } else if (what === "down") {
     const there = level.kind(row, column);
-    const kind = there.once ? there : event.button === 2 ? level.kinds[0] : tool;
+    const kind = there.once && there.name !== tool.name ? there : event.button === 2 ? level.kinds[0] : tool;
     // Painting over what it would paint takes it away again.
     stroke = { kind: !kind.once && kind === there ? level.kinds[0] : kind, at: [row, column] };
     remember();
@@ -80,7 +82,7 @@ export function key(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const arrow = event.key.startsWith("Arrow") ? event.key.slice(5).toLowerCase() : "";
   const action = state.about.board.actions.indexOf(arrow);
-  if (state.playing ? playKey(event.key, action) : drawKey(event.key, action)) {
+  if (state.playing ? playKey(event.key, action) : drawKey(event.key, STEPS[arrow])) {
     event.preventDefault();
   }
 }
@@ -95,11 +97,11 @@ function playKey(name, action) {
   return true;
 }
 
-function drawKey(name, action) {
+function drawKey(name, step) {
   const { cursor, level } = state;
   const kind = level.kinds[Number(name) - 1];
-  if (action >= 0) {
-    const [down, right] = state.board.steps[action];
+  if (step) {
+    const [down, right] = step;
     const next = cursor
       ? [cursor[0] + down, cursor[1] + right]
       : level.find(level.kinds.find((one) => one.once));
@@ -132,7 +134,7 @@ export function resize() {
     const side = Math.round(Number($(id).value));
     return Math.min(Math.max(side || 1, 1), about.board.largest);
   });
-  if (sides[0] * sides[1] < level.kinds.filter((kind) => kind.once).length) sides[1] = 2;
+  if (sides[0] * sides[1] < level.marked().length) sides[1] = 2;
   replace(level.resized(...sides));
 }
 

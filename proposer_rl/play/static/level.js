@@ -25,16 +25,24 @@ export class Level {
     return row >= 0 && column >= 0 && row < this.height && column < this.width;
   }
 
-  /** Where a kind stands for the first time, or null. */
+  /** Where a kind stands, or another of its name, for the first time; or null. */
   find(kind) {
-    const row = this.rows.findIndex((line) => line.includes(kind.mark));
-    return row < 0 ? null : [row, this.rows[row].indexOf(kind.mark)];
+    return this.cells().find((cell) => this.kind(...cell).name === kind.name) ?? null;
+  }
+
+  /** Where those stand that a level has once. */
+  marked() {
+    return this.cells().filter((cell) => this.kind(...cell).once);
+  }
+
+  cells() {
+    return this.rows.flatMap((line, row) => [...line].map((_, column) => [row, column]));
   }
 
   /** The level with one cell of another kind; null where that cannot be. */
   painted(row, column, kind) {
     const there = this.kind(row, column);
-    if (!there || there === kind || there.once) return null;
+    if (!there || there === kind || (there.once && there.name !== kind.name)) return null;
     const changed = new Level(this.kinds, this.rows);
     if (kind.once) changed.put(...this.find(kind), this.kinds[0]);
     changed.put(row, column, kind);
@@ -60,11 +68,10 @@ export class Level {
 
   /** With what is missing of the kinds that must be there: from either end of the grid. */
   completed() {
-    const cells = this.rows.flatMap((line, row) => [...line].map((_, column) => [row, column]));
-    for (const kind of this.kinds.filter((one) => one.once && !this.find(one))) {
-      const others = this.kinds.filter((one) => one.once && this.find(one));
-      const free = cells.filter((cell) => !this.kind(...cell).once);
-      const place = others.length ? free.at(-1) : free[0];
+    for (const kind of this.kinds.filter((one) => one.once)) {
+      if (this.find(kind)) continue;
+      const free = this.cells().filter((cell) => !this.kind(...cell).once);
+      const place = this.marked().length ? free.at(-1) : free[0];
       if (place) this.put(...place, kind);
     }
     return this;

@@ -1,7 +1,7 @@
 // Your own episode.
 
 import { $, state, tell } from "./page.js";
-import { after, arrives, over } from "./rules.js";
+import { after, arrives, over, ways } from "./rules.js";
 import { show } from "./showing.js";
 
 export function startGame() {
@@ -10,7 +10,8 @@ export function startGame() {
   state.playing = [state.found.paths.solver[0]];
   showButton(true);
   $("board").focus();
-  tell("Your turn: the arrow keys move you, or a touch beside you. R begins again.");
+  tell(ways() > 1 ? "Your turn: the arrows turn you left and right, up moves you forward. R begins again."
+    : "Your turn: the arrow keys move you, or a touch beside you. R begins again.");
   show();
 }
 
@@ -35,6 +36,7 @@ export function move(action) {
 
 /** The move that leads most towards a cell that was touched. */
 export function moveTowards(row, column) {
+  if (ways() > 1) return; // an agent that turns is led by keys
   const { steps } = state.board;
   const [fromRow, fromColumn] = state.playing.at(-1);
   const along = ([down, right]) => down * (row - fromRow) + right * (column - fromColumn);

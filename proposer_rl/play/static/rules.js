@@ -4,11 +4,15 @@ import { state } from "./page.js";
 
 const same = ([row, column], [otherRow, otherColumn]) => row === otherRow && column === otherColumn;
 
-/** The cell that an action leads to. */
-export function after([row, column], action) {
+/** How many places a cell has: one, or one for each direction in which an agent looks. */
+export const ways = () => state.found.next[0].length / (state.level.width * state.level.height);
+
+/** The place that an action leads to. */
+export function after([row, column, way = 0], action) {
   const { width } = state.level;
-  const cell = state.found.next[action][row * width + column];
-  return [Math.floor(cell / width), cell % width];
+  const there = state.found.next[action][(row * width + column) * ways() + way];
+  const cell = Math.floor(there / ways());
+  return [Math.floor(cell / width), cell % width, ...(ways() > 1 ? [there % ways()] : [])];
 }
 
 /** Whether a way ends at the goal within the step limit. */
@@ -18,8 +22,10 @@ export const arrives = (cells) =>
 /** Whether an episode has come to its end. */
 export const over = (cells) => arrives(cells) || cells.length - 1 >= state.found.max_steps;
 
-/** An episode whose moves are drawn from the policy. */
+/** An episode whose moves are drawn from the policy, or one of those that were played. */
 export function sampled() {
+  const { sampled: played } = state.found.paths;
+  if (played) return played[Math.floor(Math.random() * played.length)];
   const cells = [state.found.paths.solver[0]];
   while (!over(cells)) {
     const [row, column] = cells.at(-1);

@@ -24,7 +24,11 @@ export function show() {
     [$("scale-low").textContent, $("scale-high").textContent] = ends;
   }
   for (const id of ["watch", "play"]) $(id).disabled = !found;
-  if (found) nameMaps();
+  if (found) {
+    nameMaps();
+    $("policy").hidden = !found.policy;
+    $("colour").hidden = !Object.keys(found.maps).length;
+  }
   showResults();
 }
 
@@ -70,14 +74,14 @@ function showResults() {
     body.replaceChildren();
     return;
   }
-  const { results, paths, max_steps: limit, step_penalty: cost } = found;
+  const { results, paths, max_steps: limit, step_penalty: cost, missed } = found;
   const way = (cells) => {
     const there = cells && arrives(cells);
     const count = there ? cells.length - 1 : limit;
-    return [there ? "yes" : "no", there ? count : "–", short((there ? 1 : 0) - cost * count)];
+    return [there ? "yes" : "no", there ? count : "–", short(there ? 1 - cost * count : missed)];
   };
   const rows = [
-    ["Solver, sampled", "", percent(results.success), short(results.steps), short(results.return)],
+    [`Solver, ${found.episodes ? `${found.episodes} episodes` : "sampled"}`, "", percent(results.success), short(results.steps), short(results.return)],
     ["Solver, greedy", "solver", ...way(paths.solver)],
     ["Shortest path", "best", ...way(paths.shortest)],
   ];

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
-from proposer_rl.cli.evaluate import main as evaluate
+from proposer_rl.cli.instruments import evaluate
 from proposer_rl.cli.train import main as train
 from proposer_rl.mazes.view.env import ViewMazeEnv
 from proposer_rl.mazes.view.levels import ViewLevel, validate_view_levels

@@ -54,7 +54,10 @@ def workers(engine: Any, count: int = 2) -> WorkerSettings:
 
 
 def make(
-    elsewhere: WorkerSettings | None, reward: Reward = performance_gain, *overrides: str
+    elsewhere: WorkerSettings | None,
+    reward: Reward = performance_gain,
+    *overrides: str,
+    tell: Callable[[int], None] = lambda done: None,
 ) -> tuple[Task, ProposerCurriculum]:
     settings = config(*overrides)
     maker, solver = task_maker(settings.task), settings.solver
@@ -63,7 +66,7 @@ def make(
         return make_in_place(maker, solver, Place(torch.device(device)))
 
     task = make_task(settings)
-    found = None if elsewhere is None else Workers(elsewhere, make_in_worker)
+    found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)
     parts = Parts(task, settings.proposer, seeds=[0], workers=found)
     return task, proposer(parts, reward)
 

@@ -1,0 +1,127 @@
+"""Measure what ``bin/bench`` was asked, print tables, write a JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+
+from benchmarks.registry import BENCHMARKS, selected
+from benchmarks.report import describe, machine, summary, versions
+from benchmarks.results import Options, Result, Size
+from benchmarks.worker import BenchmarkFailed, run_apart
+from proposer_rl.runs.folder import write_atomically
+
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
+TERMINATED = 143
+
+
+def answer(arguments: argparse.Namespace) -> None:
+    """Ends with 0 if all was measured, 1 if a benchmark failed, 2 for bad input."""
+    if arguments.list:
+        _list()
+        return
+    unknown = [name for name in arguments.names if name not in BENCHMARKS]
+    if unknown:
+        _refuse(f"unknown benchmark {unknown[0]!r}; choose among: {', '.join(BENCHMARKS)}")
+    if not arguments.output.parent.is_dir():
+        _refuse(f"--output: there is no folder {arguments.output.parent}")
+    # Told to end, it ends the benchmark's process too.
+    before = signal.signal(signal.SIGTERM, _terminated)
+    try:
+        sys.exit(run(arguments.names, _options(arguments), arguments.threads, arguments.output))
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def run(names: list[str], options: Options, threads: int | None, output: Path) -> int:
+    """Run benchmarks one after another, each in a process of its own.
+
+    Args:
+        names: of the benchmarks; empty for the default ones.
+        options: for each of them.
+        threads: of torch; None leaves torch's choice.
+        output: the JSON file to write.
+
+    Returns:
+        The exit code.
+    """
+    chosen = selected(names, options.size == "full", options.device.startswith("cuda"))
+    content: dict[str, Any] = {
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "machine": machine(options.device),
+        "versions": versions(),
+        "options": asdict(options),
+        "benchmarks": {},
+    }
+    results, start = [], time.perf_counter()
+    for number, name in enumerate(chosen, 1):
+        place = f"[{number}/{len(chosen)}] {name}"
+        _say(f"{place}: {BENCHMARKS[name].about} ...")
+        try:
+            measured = run_apart(name, options, threads)
+        except BenchmarkFailed as failure:
+            content["benchmarks"][name] = {"error": str(failure)}
+            _say(f"{place}: failed\n{failure}")
+            continue
+        content["benchmarks"][name] = measured
+        results.append(Result.from_json(measured["result"]))
+        memory = f"{measured['peak_memory'] / 2**20:,.0f} MiB at most"
+        _say(f"{place}: {measured['seconds']:.1f} s, {memory}")
+    content["seconds"] = time.perf_counter() - start
+    write_atomically(output, json.dumps(content, indent=1).encode())
+    details = [text for result in results if (text := describe(result))]
+    rows = [summary(results)] if any(result.rows for result in results) else []
+    print("\n\n".join([*details, *rows]))
+    if options.tiny:
+        _say("At this size nothing is a measurement: it is to see that everything runs.")
+    _say(f"{content['seconds']:.0f} s. File: {output}")
+    return FAILED if len(results) < len(chosen) else 0
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    device = arguments.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        _refuse(f"--device {device}: {str(error).splitlines()[0]}")
+    size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
+    return Options(arguments.repeats, arguments.precision, device, size)
+
+
+def _list() -> None:
+    remarks = {
+        "default": "",
+        "full": " [with --full or by name]",
+        "cuda": " [on a GPU]",
+        "request": " [by name]",
+    }
+    for name, benchmark in BENCHMARKS.items():
+        print(f"{name:<15} {benchmark.about}{remarks[benchmark.on]}")
+
+
+def _terminated(*_: object) -> NoReturn:
+    sys.exit(TERMINATED)
+
+
+def _refuse(message: str) -> NoReturn:
+    _say(f"error: {message}")
+    sys.exit(BAD_INPUT)
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)

@@ -1,0 +1,93 @@
+"""Scores of levels that are read off every single step of a rollout.
+
+With the critic V, discount gamma and trace decay lambda of the learner, and the error of one step
+
+    delta_t = r_t + gamma V(s_(t+1)) - V(s_t),    V = 0 where the episode terminated,
+
+A_t is the generalised advantage, the sum of (gamma lambda)^i delta_(t+i). Every function gives one
+number for each step, float64 [K, P, T]; a level's score is the mean over an episode's steps, then
+over its episodes.
+
+Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
+MaxMC: the latter, appendix; negative advantage: DEGen (arXiv 2601.14957).
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.learning import PPO
+from proposer_rl.learning.advantages import gae
+
+
+def advantages(learner: PPO, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
+    """A_t with the learner's numbers, not standardised: float64 [K, P, T].
+
+    Args:
+        learner: whose critic and discount count.
+        rollout: with values, [K, P, T].
+        lmbda: in place of the learner's lambda; 0 for delta_t.
+    """
+    settings = learner.settings
+    decay = settings.lmbda if lmbda is None else lmbda
+    estimate = gae(settings.gamma, decay, learner.agent.value_key)
+    return estimate(rollout.copy())["advantage"].squeeze(-1).double()
+
+
+def positive_value_loss(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """max(A_t, 0): where the Solver does better than it thought."""
+    return advantages(learner, rollout).clamp_min(0)
+
+
+def l1_value_loss(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """abs(A_t): where it does otherwise than it thought."""
+    return advantages(learner, rollout).abs()
+
+
+def one_step_td_error(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """abs(delta_t)."""
+    return advantages(learner, rollout, lmbda=0.0).abs()
+
+
+def max_mc(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """R - V(s_t), with the highest return R [K, P] ever seen on the level."""
+    return best.unsqueeze(-1) - rollout[learner.agent.value_key].squeeze(-1).double()
+
+
+def mean_negative_advantage(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """How far the Solver falls behind what it thought, whatever it gains before or afterwards.
+
+    In the sum of lambda-weighted i-step errors that A_t is, each error is cut off at zero at every
+    step that is added to it:
+
+        x_(t,0) = min(delta_t, 0),    x_(t,i) = min(x_(t,i-1) + gamma^i delta_(t+i), 0),
+        -(sum over i of (1 - lambda) lambda^i x_(t,i)),
+
+    where the last step of the episode has the weight lambda^i.
+    """
+    gamma, lmbda = learner.settings.gamma, learner.settings.lmbda
+    delta = advantages(learner, rollout, lmbda=0.0)
+    goes_on = 1 - rollout["next", "done"].squeeze(-1).double()
+    lost, behind, playing = torch.zeros_like(delta), torch.zeros_like(delta), torch.ones_like(delta)
+    steps = delta.shape[-1]
+    for i in range(steps):  # of all steps at once the i-th after them, as far as there is one
+        early, late = (..., slice(steps - i)), (..., slice(i, None))
+        behind[early] = (behind[early] + gamma**i * delta[late]).clamp_max(0)
+        share = lmbda**i * (1 - lmbda * goes_on[late])
+        lost[early] -= share * behind[early] * playing[early]
+        playing[early] *= goes_on[late]
+    return lost
+
+
+STEPWISE = {
+    score.__name__: score
+    for score in (
+        positive_value_loss,
+        l1_value_loss,
+        one_step_td_error,
+        max_mc,
+        mean_negative_advantage,
+    )
+}
