@@ -170,3 +170,54 @@ def test_checkpoints_that_do_not_fit_are_refused(run: Path, tmp_path: Path, eval
     shutil.copy(sorted((run / "checkpoints").glob("*.pt"))[0], tmp_path / "alone.pt")
     code, said = evaluate(tmp_path / "alone.pt")
     assert code == 2 and "is no run's folder: it has no config.json" in said
+
+
+def test_several_runs_are_compared_by_their_means(
+    evaluate, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each on each set once, however often the command is given."""
+    rows: dict[str, list[dict]] = {}
+    for name in ("small", "id@7x9"):
+        assert evaluate(run, "--levels", name, "-o", tmp_path / "rows.json")[0] == 0
+        rows[name] = json.loads((tmp_path / "rows.json").read_text())
+    grids = {(row["height"], row["width"], row["path_length"]) for row in rows["id@7x9"]}
+    assert grids == {(7, 9, 4)} and len(rows["id@7x9"]) == 2 * 40  # the target's specification
+    output = tmp_path / "scores.csv"
+    shutil.copytree(run, tmp_path / "runs" / "one")
+    shutil.copytree(run, tmp_path / "runs" / "unreadable")
+    settings = json.loads((run / "config.json").read_text())
+    settings |= {"method": "of_older_code", "pool": None}
+    (tmp_path / "runs" / "unreadable" / "config.json").write_text(json.dumps(settings))
+    code, said = evaluate(tmp_path / "runs", "--levels", "small", "-o", output)
+    assert code == 0 and "target" in said and "of_older_code" in said
+    before = output.read_text()
+    both = [tmp_path / "runs", "--levels", "small", "id@7x9", "-o", output]
+    assert evaluate(*both)[0] == 0 and output.read_text().startswith(before)
+    with output.open() as file:
+        scores = list(csv.DictReader(file))
+    assert {row["run"] for row in scores} == {"one"} and len(scores) == 4
+    for score in scores:
+        own = [row for row in rows[score["levels"]] if row["seed"] == int(score["seed"])]
+        assert int(score["size"]) == len(own)
+        for key, name in (("success", "success"), ("returns", "return")):
+            mean = sum(row[name] for row in own) / len(own)
+            assert float(score[key]) == pytest.approx(mean, rel=1e-5)
+    shutil.rmtree(tmp_path / "runs" / "unreadable")
+    monkeypatch.setattr("proposer_rl.cli.evaluate.load", None)  # nothing is left to be done
+    assert evaluate(*both)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{run}", "{run}"], "--levels: name the sets"),
+        (["{run}", "--levels", "small", "shapes", "--pictures", "x.png"], "--pictures: give one"),
+        (["{run}", "--levels", "small", "shapes", "-o", "x.json"], "are written as .csv"),
+        (["{run}", "{run}", "--levels", "nothing"], "must be a file that ends in"),
+        (["{run}", "--levels", "id@1x2"], "--levels id@1x2: "),
+    ],
+)
+def test_wrong_comparisons_get_one_line(arguments, message, run: Path, evaluate) -> None:
+    code, said = evaluate(*(word.format(run=run) for word in arguments))
+    assert code == 2 and said.startswith("error: ") and message in said
+    assert len(said.splitlines()) == 1

@@ -112,6 +112,9 @@ def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
     assert len(after) == 4 and before.items() <= after.items()
     said = capsys.readouterr().out
     assert said.count("finished before, nothing to do") == 1 and "4 runs: 4 finished" in said
+    told = [line for line in said.splitlines() if line.startswith("sweep: ")]
+    left = [line.partition(",")[0] for line in told]
+    assert left == [f"sweep: {n} of 4 runs left" for n in (3, 2, 1, 0)]
 
 
 def test_a_failed_run_is_listed_and_tried_again(
@@ -191,6 +194,29 @@ def test_the_experiment_is_one_command(name: str, composed) -> None:
     found = {method for _, method, _, _ in made}
     assert {"perf_gain", "task_difficulty", "target", "domain_randomization"} <= found
     assert made == {(name, method, "none", seed) for method in found for seed in (0, 3)}
+
+
+def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
+    train, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The literal Proposer and the frozen one lie beside the methods at medium scale."""
+    made = []
+
+    def note(config: RunConfig, *_):
+        path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
+        made.append((str(path), config.checkpoint, config.seed, config.lifetimes, config.ablation))
+        raise KeyError("enough")
+
+    monkeypatch.setattr("proposer_rl.cli.run.parts", note)
+    assert train("+sweep=medium_lives", "seed=7") == 1
+    assert train("+sweep=medium_frozen", "seed=107") == 1
+    assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
+    frozen, learnt = "sweeps/medium/frozen_proposer-none-seed_107", "sweeps/medium_lives/107"
+    assert made == [
+        (learnt, None, 7, 3, "none"),
+        (frozen, f"{learnt}/lifetime_2", 107, 1, "none"),
+        ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, 1, "paper_literal"),
+    ]
 
 
 def test_a_family_of_ablations_is_one_command(composed) -> None:

@@ -1,15 +1,20 @@
-"""A trained Solver on named levels, one by one."""
+"""Trained Solvers on named levels.
+
+One run's are told level by level, those of several by their means, as a table of methods.
+"""
 
 from __future__ import annotations
 
 import argparse
 import csv
 import io
+import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,11 +23,23 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from tqdm import tqdm
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
+from proposer_rl.report.generalisation import Score as RunScore
+from proposer_rl.report.generalisation import (
+    generalisation_table,
+    read_scores,
+    scored,
+    whole,
+    write_scores,
+)
+from proposer_rl.report.runs import Run, begun, find_runs
+from proposer_rl.report.studies import read_studies
+from proposer_rl.runs.checkpoint import CheckpointError
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.pictures import pixels
 from proposer_rl.streams import Streams
@@ -68,7 +85,23 @@ class Evaluation:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print and write what ``bin/eval`` was asked."""
-    found = evaluate(options.checkpoint, options.levels, options.max_steps)
+    if len(options.checkpoint) > 1 or len(options.levels) > 1 or _holds_runs(options):
+        _compare(options)
+    else:
+        _one(options)
+
+
+def _holds_runs(options: argparse.Namespace) -> bool:
+    (path,) = options.checkpoint
+    if not path.is_dir() or (path / "config.json").exists():
+        return False
+    return next(begun(path), None) is not None
+
+
+def _one(options: argparse.Namespace) -> None:
+    """One run, level by level."""
+    (checkpoint,), name = options.checkpoint, next(iter(options.levels), None)
+    found = evaluate(load(checkpoint), name, options.max_steps)
     _print(found)
     if options.output is not None and options.output.suffix == ".csv":
         write_atomically(options.output, _csv(found.rows()))
@@ -78,30 +111,119 @@ def run(options: argparse.Namespace) -> None:
         write_atomically(options.pictures, _sheet(found))
 
 
-def evaluate(checkpoint: Path, name: str | None, max_steps: int | None = None) -> Evaluation:
-    """Evaluate the Solvers of a checkpoint.
+def _compare(options: argparse.Namespace) -> None:
+    """Several runs on sets of levels: a table of methods; what the output has is not done again."""
+    output, names = options.output, options.levels
+    if options.pictures is not None:
+        raise ConfigError("--pictures: give one run and one set of levels")
+    if not names:
+        raise ConfigError("--levels: name the sets of levels on which several runs are compared")
+    if output is not None and output.suffix != ".csv":
+        raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
+    if options.max_steps is not None and output is not None and output.exists():
+        raise ConfigError(
+            f"--output {output}: holds scores with a step limit that it does not tell"
+        )
+    studies, notes = read_studies(find_runs(options.checkpoint), None)
+    scores = read_scores(output) if output is not None and output.exists() else []
+    for run in tqdm(
+        whole(group for study in studies for group in study.groups), leave=False, disable=None
+    ):
+        try:
+            scores += _missing(run, names, scores, options.max_steps)
+        except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
+            notes.append(f"left out: {error}")
+        if output is not None:
+            write_atomically(output, write_scores(scores))
+    for note in notes:
+        print(note, file=sys.stderr)
+    for study in studies:
+        found = generalisation_table(study, [score for score in scores if score.levels in names])
+        table = Table(box=SIMPLE_HEAD, title=Text(study.title), caption=found.note)
+        for column in found.columns:
+            table.add_column(Text(column), justify="left" if column == "method" else "right")
+        for row in found.texts():
+            table.add_row(*map(Text, row))
+        Console().print(table)
+
+
+def _missing(
+    run: Run, names: Sequence[str], scores: Sequence[RunScore], max_steps: int | None
+) -> list[RunScore]:
+    """A run's scores on the sets on which there are none yet."""
+    todo = [name for name in names if scored(run, scores, name) is None]
+    if not todo:
+        return []
+    loaded = load(run.folder)
+    return [score for name in todo for score in _summed(evaluate(loaded, name, max_steps), name)]
+
+
+def _summed(found: Evaluation, name: str) -> list[RunScore]:
+    """The mean of each Solver."""
+    summed = []
+    for solver, seed in enumerate(found.seeds):
+        own = [score.results for score in found.scores if score.solver == solver]
+        means = {key: float(np.mean([results[key] for results in own])) for key in own[0]}
+        success = means.get("success", math.nan)
+        place = (found.run.name, seed, found.updates, name, len(own))
+        summed.append(RunScore(*place, success, means["return"]))
+    return summed
+
+
+class Loaded(NamedTuple):
+    """A run's Solvers as a checkpoint has them.
+
+    Attributes:
+        run: the run's folder.
+        updates: of the Solvers.
+        seeds: of them, in their order.
+        task: of the run.
+        agent: the Solvers.
+    """
+
+    run: Path
+    updates: int
+    seeds: list[int]
+    task: Task
+    agent: ActorCritic
+
+
+def load(checkpoint: Path) -> Loaded:
+    """Load the Solvers of a checkpoint.
 
     Args:
         checkpoint: a run's folder, for its newest checkpoint, or a checkpoint in it.
-        name: of levels that the run's task knows; None for what it takes by default.
-        max_steps: step limit of every level; None for the task's choice.
 
     Raises:
         ConfigError, CheckpointError: if there is no such run, or its checkpoint cannot be used.
-        ValueError: if there are no such levels, or they are none for this Solver.
-        OSError: if a file cannot be read.
     """
     run, state = read_checkpoint(checkpoint)
     config = saved_config(run)
     task = make_task(config)
     agent = restored(task, config, state).agent
+    return Loaded(run, int(state["updates"]), config.seeds, task, agent)
+
+
+def evaluate(loaded: Loaded, name: str | None, max_steps: int | None = None) -> Evaluation:
+    """Evaluate Solvers on a set of levels.
+
+    Args:
+        loaded: the Solvers.
+        name: of levels that the run's task knows; None for what it takes by default.
+        max_steps: step limit of every level; None for the task's choice.
+
+    Raises:
+        ValueError: if there are no such levels, or they are none for this Solver.
+        OSError: if a file cannot be read.
+    """
+    run, updates, seeds, task, agent = loaded
     if isinstance(task, ScoringTask):
         name = name or task.levels_help.split(",")[0]
         scores: Sequence[Score] = task.scores(agent, name, max_steps)
     else:
         name = name or next(iter(task.distributions))
         scores = _on_distribution(task, agent, name, max_steps)
-    return Evaluation(run, int(state["updates"]), config.seeds, name, scores)
+    return Evaluation(run, updates, seeds, name, scores)
 
 
 def _on_distribution(

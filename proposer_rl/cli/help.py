@@ -30,6 +30,7 @@ Examples:
 
 -m runs every combination; --hydra-help lists the other options, all of them Hydra's."""
 PACKAGE_LINE = "# @package"
+NEEDS, NOTHING = "Needs: ", "nothing."
 
 
 def asks_for_help(arguments: Sequence[str]) -> bool:
@@ -68,10 +69,31 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
+    """What methods need, by name, where their files have a line ``# Needs:``.
+
+    Args:
+        folders: as of :func:`choices`.
+    """
+    found: dict[str, list[str]] = {}
+    for folder in folders:
+        for name in names(folder, "method"):
+            lines = _comments(folder / "method" / f"{name}.yaml")
+            said = (line.removeprefix(NEEDS) for line in lines if line.startswith(NEEDS))
+            for text in map(str.strip, said):
+                needed = [] if text == NOTHING else [n.strip(" .") for n in text.split(",")]
+                found.setdefault(name, needed)
+    return found
+
+
 def _first_comment(file: Path) -> str:
-    lines = file.read_text(encoding="utf-8").splitlines()
-    said = (line for line in lines if line.startswith("#") and not line.startswith(PACKAGE_LINE))
-    return next(said, "").lstrip("# ")
+    return next(_comments(file), "")
+
+
+def _comments(file: Path) -> Iterator[str]:
+    for line in file.read_text(encoding="utf-8").splitlines():
+        if line.startswith("#") and not line.startswith(PACKAGE_LINE):
+            yield line.lstrip("# ")
 
 
 def _own_folders(arguments: Sequence[str]) -> Iterator[Path]:

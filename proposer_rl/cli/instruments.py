@@ -27,7 +27,7 @@ MEASURES = ("return", "log_success")
 
 
 def evaluate(arguments: Sequence[str] | None = None) -> None:
-    """``bin/eval``: a trained Solver on named levels, one by one."""
+    """``bin/eval``: trained Solvers on named levels."""
     _answer("evaluate", _evaluate_parser().parse_args(arguments))
 
 
@@ -74,13 +74,22 @@ def _evaluate_parser() -> argparse.ArgumentParser:
         "can, on levels of any size where it has files of them.",
         epilog="docs/levels.md describes such files and the sets that come along.",
     )
-    parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")
+    parser.add_argument(
+        "checkpoint",
+        nargs="+",
+        type=Path,
+        help="a run's folder, or one of its checkpoints; several, or a folder with runs in it, for "
+        "a table of methods",
+    )
     parser.add_argument(
         "--levels",
         metavar="FILE|NAME",
+        nargs="+",
+        default=[],
         help="a distribution of the run such as id or ood; where the task has files of levels also "
         "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
-        "shapes, the default there, or small",
+        "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
+        "on another one; several for a table of methods",
     )
     parser.add_argument(
         "--max-steps",
@@ -90,7 +99,11 @@ def _evaluate_parser() -> argparse.ArgumentParser:
         "that are none of a distribution 2 for each move of the shortest path if this is more)",
     )
     parser.add_argument(
-        "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"
+        "-o",
+        "--output",
+        type=Path,
+        help="a file for the rows that ends in .json or .csv; of several runs their means, and "
+        "those that are in it are not computed again",
     )
     parser.add_argument(
         "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"

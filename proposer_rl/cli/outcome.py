@@ -15,7 +15,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from proposer_rl.cli.config import RunConfig, overrides
-from proposer_rl.cli.help import choices
+from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
@@ -60,7 +60,9 @@ def _about(config: RunConfig) -> dict[str, str]:
     own = _config_folder()
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
-    return {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
+    said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
+    needed = needs(folders).get(config.method)
+    return said if needed is None else {**said, "needs": ", ".join(needed)}
 
 
 def _config_folder() -> str | None:

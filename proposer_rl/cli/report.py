@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.errors import command
-from proposer_rl.cli.help import choices
+from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 
 EPILOG = """\
@@ -18,6 +18,7 @@ examples:
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
+  bin/report sweeps/medium --pages docs/findings   the two pages of the docs
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -27,13 +28,24 @@ far as they got, and the report says so."""
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    command(partial(_run, _parser().parse_args(arguments)))
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.scores is not None and options.pages is None:
+        parser.error("--scores: only the pages of the docs take them up; give --pages, too")
+    command(partial(_run, options))
 
 
 def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.runs import find_runs
 
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
+    if options.pages is not None:
+        from proposer_rl.report.pages import write_pages
+
+        asked = (options.threshold, options.baseline, options.scores)
+        for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
+            print(f"Page: {page}")
+        return
     from proposer_rl.report.build import write_report
 
     page = write_report(
@@ -57,8 +69,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth"
     )
-    parser.add_argument(
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"
+    )
+    where.add_argument(
+        "--pages",
+        type=Path,
+        metavar="FOLDER",
+        help="write two pages of the docs there instead: which curriculum to use, and which claims "
+        "hold",
     )
     parser.add_argument(
         "--threshold",
@@ -70,6 +90,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="METHOD",
         help="what the others are measured against, as the report calls it (default: "
         "domain_randomization, else the first)",
+    )
+    parser.add_argument(
+        "--scores",
+        type=Path,
+        metavar="FILE",
+        help="of these runs on further levels, as bin/eval writes them: for --pages",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

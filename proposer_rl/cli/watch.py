@@ -9,11 +9,14 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.text import Text
 
 from proposer_rl.cli.errors import command
+from proposer_rl.cli.sweep import planned
 from proposer_rl.report.progress import find_progress
+from proposer_rl.report.sweeps import left
 from proposer_rl.report.terminal import overview, screen
 
 EPILOG = """\
@@ -48,7 +51,9 @@ def draw(folder: Path) -> RenderableType:
         UnreadableRun: if there is nothing to look at.
     """
     found = find_progress(folder)
-    return screen(found[0]) if len(found) == 1 else overview(found)
+    rest = left(folder, planned(folder))
+    shown = screen(found[0]) if len(found) == 1 else overview(found)
+    return shown if rest is None else Group(shown, Text(rest.text()))
 
 
 def _parser() -> argparse.ArgumentParser:

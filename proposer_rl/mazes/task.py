@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -63,6 +64,7 @@ LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 TEXT_KEY = f"S start, G goal, {EPISODE} the Solver's episode"
+_ON_A_GRID = re.compile(r"(\w+)@(\d{1,3})x(\d{1,3})")
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
@@ -135,7 +137,8 @@ class MazeTask:
         )
         self.levels_help = (
             f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
-            f"a run's curriculum{RECORD}, or a distribution: {', '.join(distributions)}"
+            f"a run's curriculum{RECORD}, or a distribution: {', '.join(distributions)}, as it is "
+            f"or on another grid as in {target}@13x13"
         )
         self.board = MazeBoard(maze, self._check_size, self._limit, self.device)
         self.exact_performance = evaluation.evaluator == "exact"
@@ -184,8 +187,11 @@ class MazeTask:
 
     def evaluation_levels(self, name: str) -> Level:
         """The fixed levels of a distribution on which Solvers are measured, [E]."""
+        return self._fixed(name, self.distributions[name])
+
+    def _fixed(self, name: str, distribution: LevelDistribution) -> Level:
         generator = Streams(self._evaluation.seed, "evaluation", name).generator()
-        return self.distributions[name].sample(self._evaluation.levels, generator)
+        return distribution.sample(self._evaluation.levels, generator)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
         """PPO of K fresh Solvers, whose weights are drawn from the streams."""
@@ -272,9 +278,15 @@ class MazeTask:
         """How Solvers do on a distribution's levels, a file's or those of a set that comes along.
 
         Without a step limit a distribution has that of the task, so that the means are those of its
-        measurements; other levels at least twice the shortest path.
+        measurements, also on another grid (``id@13x13``); other levels at least twice the shortest
+        path.
         """
         drawn = {d: partial(self.evaluation_levels, d) for d in self.distributions}
+        asked = _ON_A_GRID.fullmatch(name)
+        if asked and asked[1] in self.distributions:
+            size = map(int, asked.group(2, 3))
+            grid = named(f"--levels {name}", self.distributions[asked[1]].on_grid, *size)
+            drawn[name] = partial(self._fixed, name, grid)
         files = (*SUFFIXES, RECORD)
         levels, of_distribution = chosen_levels(name, drawn, files, read_levels, shipped_levels)
         slack = 0 if of_distribution else SLACK

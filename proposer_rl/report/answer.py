@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from proposer_rl.report.comparisons import TOO_FEW, Decision, decisions, primary
+from proposer_rl.report.comparisons import TOO_FEW, Decision, between, decisions, primary
 from proposer_rl.report.records import LONGEST_TEXT, is_rate, printable, words
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
@@ -32,7 +32,7 @@ def answer(study: Study) -> tuple[str, str]:
     found = decisions(study)
     first = (
         f"Of {len(ranked)} methods, {best.label} has the highest {reached}; "
-        f"{_shown(best, [_between(found, best, other) for other in others])}."
+        f"{_shown(best, [between(found, best, other) for other in others])}."
     )
     return first, _against(baseline, [group for group in ranked if group is not baseline], found)
 
@@ -87,12 +87,6 @@ def meaning(group: Group, meanings: Meanings) -> str:
     return f"{text} ({group.setting})" if group.setting else text
 
 
-def _between(
-    found: Mapping[tuple[str, str], Decision], one: Group, other: Group
-) -> tuple[Group, Decision]:
-    return other, found.get((one.label, other.label)) or found[other.label, one.label]
-
-
 def _shown(best: Group, pairs: Sequence[tuple[Group, Decision]]) -> str:
     """Whether the best is shown to be better, and than how many."""
     beaten = [decision.winner == best.label for _, decision in pairs]
@@ -113,7 +107,7 @@ def _against(
     baseline: Group, others: Sequence[Group], found: Mapping[tuple[str, str], Decision]
 ) -> str:
     """How the others stand to the baseline."""
-    pairs = [_between(found, baseline, other) for other in others]
+    pairs = [between(found, baseline, other) for other in others]
     if all(decision.verdict == TOO_FEW for _, decision in pairs):
         return f"How they stand to the baseline, {baseline.label}, is not decided either."
     better = [group.label for group, decision in pairs if decision.winner == group.label]

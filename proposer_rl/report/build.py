@@ -98,7 +98,7 @@ def write_report(
         OutputError: if the output folder holds something that is no report, or there is no such
             threshold or baseline.
     """
-    _check_output(output)
+    check_output(output)
     studies, notes = read_studies(find_runs(folders), threshold, baseline)
     labels = sorted({group.label for study in studies for group in study.groups})
     if baseline not in (None, *labels):
@@ -122,18 +122,23 @@ def write_report(
             section["figures"] = [one for one in section["figures"] if not one["drawn"]]
         html = page.render(title=title, command=command, sections=sections, notes=notes)
     files["report.md"] = _markdown(title, command, sections).encode()
-    _write(output, files)
+    write_files(output, files, (FIGURES, TABLES))
     write_atomically(output / PAGE, html.encode())
     return output / PAGE
 
 
-def _check_output(output: Path) -> None:
+def check_output(output: Path, page: str = PAGE) -> None:
+    """Refuse a folder with files of somebody else.
+
+    Raises:
+        OutputError: if it is none, or has files but not that page.
+    """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the report")
     occupied = output.is_dir() and any(output.iterdir())
-    if occupied and not (output / PAGE).is_file():
+    if occupied and not (output / page).is_file():
         raise OutputError(
-            f"{output}: has files in it but no {PAGE}; give a new folder or one of a report"
+            f"{output}: has files in it but no {page}; give a new folder or one of a report"
         )
 
 
@@ -162,7 +167,7 @@ def _section(
             figures.append(page.figure(drawing, draw in charted))
             files |= {f"{path}.{suffix}": content for suffix, content in save(drawing).items()}
             animations = [panel.animation for panel in drawing.panels if panel.animation]
-            files |= {f"{path}_{_slug(name)}.gif": content for name, content in animations}
+            files |= {f"{path}_{_slug(name)}.gif": make() for name, make in animations}
         bar.update()
     data = {**charts(study), "stages": staged}
     return {
@@ -188,9 +193,9 @@ def _section(
     }
 
 
-def _write(output: Path, files: dict[str, bytes]) -> None:
-    """Replace the report's files; those of a former report that are no more are removed."""
-    for folder in (FIGURES, TABLES):
+def write_files(output: Path, files: Mapping[str, bytes], folders: Sequence[str]) -> None:
+    """Replace a report's files; those of a former one in these folders are removed."""
+    for folder in folders:
         path = output / folder
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import combinations
 from typing import NamedTuple
@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """Which of two methods is better, by the primary outcome.
+    """Which of two methods is better, by an outcome.
 
     Attributes:
         winner: its label; None where neither is said to be better.
@@ -97,7 +97,7 @@ def primary(study: Study) -> Outcome:
     not; it sees the way and the end; and as a mean over many measurements it varies little.
     """
     name, horizon = study.headline, study.horizon
-    value = partial(Run.mean_until, measurement=name, updates=horizon)
+    value = partial(Run.mean_until, measurement=name, budget=horizon)
     return Outcome(f"{words(name)}, mean over {horizon} updates", value)
 
 
@@ -155,26 +155,35 @@ def learnt(group: Group, name: str, updates: float) -> bool:
     return low > (ALIKE if is_rate(name) else 0)
 
 
-def decisions(study: Study) -> dict[tuple[str, str], Decision]:
-    """Of every pair of groups which is better by the primary outcome, by their labels.
+def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, str], Decision]:
+    """Of every pair of groups which is better by an outcome, by their labels.
 
     The tests of all pairs are corrected together, by Holm's method.
+
+    Args:
+        study: the groups.
+        outcome: of which more is better; None for the primary one.
     """
     pairs = list(combinations(study.compared, 2))
-    outcome = primary(study)
+    outcome = outcome or primary(study)
     found = [difference(outcome, *pair) for pair in pairs]
     corrected = holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
     return {
-        (one.label, other.label): _decide(study, (one, other), estimate, p, count)
+        (one.label, other.label): _decide(study, outcome, (one, other), estimate, p, count)
         for (one, other), estimate, p in zip(pairs, found, corrected, strict=True)
     }
 
 
 def _decide(
-    study: Study, pair: tuple[Group, Group], estimate: Estimate, p: float, count: int
+    study: Study,
+    outcome: Outcome,
+    pair: tuple[Group, Group],
+    estimate: Estimate,
+    p: float,
+    count: int,
 ) -> Decision:
-    runs = [len(primary(study).known(group)) for group in pair]
+    runs = [len(outcome.known(group)) for group in pair]
     if min(runs) < FEWEST:
         text = f"{runs[0]} and {runs[1]} seeds, and it takes {FEWEST} of each"
         return Decision(None, TOO_FEW, p, text)
@@ -189,6 +198,13 @@ def _decide(
     if not learnt(winner, study.headline, study.horizon):
         return Decision(None, NOT_LEARNT, p, f"{text}, but {winner.label} hardly learnt")
     return Decision(winner.label, f"{winner.label} is better", p, text)
+
+
+def between(
+    found: Mapping[tuple[str, str], Decision], one: Group, other: Group
+) -> tuple[Group, Decision]:
+    """The other of two groups, and what was decided between them."""
+    return other, found.get((one.label, other.label)) or found[other.label, one.label]
 
 
 def comparisons(study: Study) -> list[Comparison]:

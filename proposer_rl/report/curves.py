@@ -34,7 +34,8 @@ def learning_curves(study: Study) -> Drawing:
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
         "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t), from "
-        f"{FEWEST} seeds on. Thin: not all runs of the method are that long. Bars: mean number of "
+        f"{FEWEST} seeds on; with fewer every seed has a thin line of its own. Thin, too: not all "
+        "runs of the method are that long. Bars: mean number of "
         "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
         "runs, which never got there.",
         [*panels, bars],
@@ -102,7 +103,7 @@ def difficulty(study: Study) -> Drawing | None:
 
 
 def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
-    """Mean and interval of runs over x.
+    """Mean and interval of runs over x, or all of them where they are too few for an interval.
 
     Args:
         axes: where to draw.
@@ -114,6 +115,8 @@ def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
         The mean, float [n].
     """
     mean, whole, low, high = band(rows)
+    if len(rows) < FEWEST:
+        axes.plot(x, rows.T, alpha=0.5, linewidth=0.6, color=look.colour, linestyle=look.dash)
     axes.plot(x, mean, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
     axes.plot(x, np.where(whole, mean, np.nan), **style(look, len(x)))
     axes.fill_between(x, low, high, color=look.colour, alpha=0.15, linewidth=0)

@@ -66,7 +66,19 @@ class Finding(NamedTuple):
 
 def findings(study: Study) -> list[Finding]:
     """The paper's findings whose methods are there, then whether each beats the baseline."""
-    beats = partial(_beats, study=study, decided=decisions(study))
+    beats, baseline = beats_in(study), study.baseline
+    tested = paper_findings(study)
+    found = [Finding(claim, PAPER, *evidence) for claim, evidence in tested if evidence]
+    return found + [
+        Finding(f"{one.label} beats {baseline.label}.", "ours", *beats((one, baseline)))
+        for one in study.compared
+        if one is not baseline
+    ]
+
+
+def paper_findings(study: Study) -> list[tuple[str, Evidence | None]]:
+    """All that the paper found, and what the runs say; None where its methods are missing."""
+    beats = beats_in(study)
     tests: list[tuple[str, Callable[[Study], Evidence | None]]] = [
         ("The baseline that trains on the target alone stalls at first.", _stall),
         ("Both Proposers learn almost at once.", _learn_at_once),
@@ -79,14 +91,12 @@ def findings(study: Study) -> list[Finding]:
         ("Proposals start easy and grow harder.", _grow_harder),
         ("The maximum gain of the copies stays positive while the mean falls below zero.", _gains),
     ]
-    tested = [(claim, test(study)) for claim, test in tests]
-    found = [Finding(claim, PAPER, *evidence) for claim, evidence in tested if evidence]
-    baseline = study.baseline
-    return found + [
-        Finding(f"{one.label} beats {baseline.label}.", "ours", *beats((one, baseline)))
-        for one in study.compared
-        if one is not baseline
-    ]
+    return [(claim, test(study)) for claim, test in tests]
+
+
+def beats_in(study: Study) -> Test:
+    """Tells of two methods of a study whether the first beats the second."""
+    return partial(_beats, study=study, decided=decisions(study))
 
 
 def finding_table(study: Study, rows: Sequence[Finding]) -> Table:
@@ -139,7 +149,10 @@ def _stall(study: Study) -> Evidence | None:
     soon, count, text = _started(study, groups[0])
     if count < FEWEST:
         return "too few seeds", text
-    return _either(majority(count - soon, count), majority(soon, count)), text
+    verdict = _either(majority(count - soon, count), majority(soon, count))
+    if verdict == "supported" and not learnt(groups[0], study.headline, study.horizon):
+        return "undecided", f"{text}; it is not shown to learn after that"
+    return verdict, text
 
 
 def _learn_at_once(study: Study) -> Evidence | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import io
 import json
 import re
 import shlex
@@ -15,16 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from PIL import Image
 
 from proposer_rl.report.answer import Meanings, meaning
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Look, Panel, panel_as_png
+from proposer_rl.report.style import Drawing, Look, Panel, in_few_colours, panel_as_png
 
 PIXELS = 78  # of an inch of a figure
-COLOURS = 256
 LARGEST = 8 * 2**20  # bytes of a page
 LONGEST_WORD = 2000  # of a command
 WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
@@ -146,15 +143,9 @@ def configs(study: Study) -> list[tuple[str, str]]:
 
 
 def _image(panel: Panel) -> Section:
-    """A panel in few colours: a page of vectors is five times as large."""
-    file = io.BytesIO()
-    with Image.open(io.BytesIO(panel_as_png(panel))) as image:
-        # The other ways to choose colours make those of two methods one.
-        far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
-        few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
-    few.save(file, format="PNG", optimize=True)
+    content = base64.b64encode(in_few_colours(panel_as_png(panel))).decode()
     return {
-        "address": f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}",
+        "address": f"data:image/png;base64,{content}",
         "description": panel.description,
         "width": round(panel.size[0] * PIXELS),
         "height": round(panel.size[1] * PIXELS),

@@ -54,7 +54,8 @@ def read_progress(folder: Path) -> Progress:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
             failure = printable(str(error).removeprefix(f"{folder}: "))
-    return Progress(folder, runs, failure, _age(folder), _activity(folder))
+    activity = recorded_activity(folder)
+    return Progress(folder, runs, failure, _age(folder), activity.text() if activity else "")
 
 
 def find_progress(folder: Path) -> list[Progress]:
@@ -87,16 +88,16 @@ class _Recorded(BaseModel):
     at_least: bool
 
 
-def _activity(folder: Path) -> str:
-    """What a run tells of itself; empty where it is over, or that cannot be read."""
+def recorded_activity(folder: Path) -> Activity | None:
+    """What a run tells of itself; None where it is over, or that cannot be read."""
     path = folder / FILE
     if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**12:
-        return ""
+        return None
     try:
         found = checked(_Recorded, json.loads(path.read_text(encoding="utf-8")), FILE)
     except (OSError, ValueError, RecursionError):
-        return ""
-    return Activity(**found.model_dump()).text()
+        return None
+    return Activity(**found.model_dump())
 
 
 def _age(folder: Path) -> float:

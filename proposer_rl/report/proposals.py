@@ -90,7 +90,7 @@ def heat_maps(study: Study) -> Drawing | None:
                 f"Heat maps of the proposals of {group.label} at several stages of training.",
                 partial(_draw_strip, group=group, updates=updates, shares=shares),
                 STRIP,
-                (group.label, _animate(group, updates, shares)),
+                (group.label, partial(_animate, group, updates, shares)),
             )
             for group, (updates, shares) in found
         ],

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -171,13 +171,23 @@ class Run:
         found = np.flatnonzero(self.metrics["updates"] == updates)
         return float(self.metrics[measurement][found[0]]) if len(found) else math.nan
 
-    def mean_until(self, measurement: str, updates: float) -> float:
-        """Mean of a measurement over the first updates; NaN for a shorter run."""
-        if self.updates < updates:
+    def mean_until(
+        self, measurement: str, budget: float, cost: Callable[[Run], Column] | None = None
+    ) -> float:
+        """Mean of a measurement along training; NaN for a run that did not spend the budget.
+
+        Args:
+            measurement: linear between two evaluations.
+            budget: of what is on the axis.
+            cost: of the run at each evaluation, the axis; None for updates.
+        """
+        x, y = self.metrics["updates"] if cost is None else cost(self), self.metrics[measurement]
+        if x[-1] < budget:
             return math.nan
-        inside = self.metrics["updates"] <= updates
-        x, y = self.metrics["updates"][inside], self.metrics[measurement][inside]
-        return float(np.trapezoid(y, x) / (x[-1] - x[0])) if len(x) > 1 else float(y[0])
+        end = float(np.interp(budget, x, y))
+        inside = x < budget
+        x, y = np.append(x[inside], budget), np.append(y[inside], end)
+        return float(np.trapezoid(y, x) / (x[-1] - x[0])) if len(x) > 1 else end
 
     def shares(self, cycle: Record) -> Column | None:
         """Shares of a cycle's proposals, a dimension for each axis; None if not recorded."""

@@ -12,6 +12,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
+from PIL import Image
 
 # Okabe and Ito's colours, which stay distinct under the common forms of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -30,6 +31,7 @@ DASHES = ("-", "--", "-.", ":")
 TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
+COLOURS = 256  # of a picture in few colours
 
 SETTINGS: Any = {
     "font.size": 9,
@@ -66,13 +68,13 @@ class Panel(NamedTuple):
         description: what is to be seen, for those who cannot see it.
         draw: draws it.
         size: width and height in inches.
-        animation: a GIF of the same, with a name for its file; None without one.
+        animation: makes a GIF of the same, with a name for its file; None without one.
     """
 
     description: str
     draw: Callable[[FigureBase], None]
     size: tuple[float, float] = PANEL
-    animation: tuple[str, bytes] | None = None
+    animation: tuple[str, Callable[[], bytes]] | None = None
 
 
 class Drawing(NamedTuple):
@@ -160,6 +162,17 @@ def panel_as_png(panel: Panel) -> bytes:
         figure = Figure(figsize=panel.size, layout="constrained")
         panel.draw(figure)
         return _render(figure, "png")
+
+
+def in_few_colours(png: bytes) -> bytes:
+    """A picture in a third of its size: a page of vectors is five times as large."""
+    file = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        # The other ways to choose colours make those of two methods one.
+        far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
+        few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
+    few.save(file, format="PNG", optimize=True)
+    return file.getvalue()
 
 
 def _render(figure: Figure, suffix: str) -> bytes:

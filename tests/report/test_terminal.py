@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.watch import main
 from proposer_rl.report.progress import find_progress, read_progress
+from proposer_rl.report.sweeps import Left, left
 from proposer_rl.report.terminal import BLOCKS, sparkline
 from tests.report.folders import TASK, cycle, write_run
 
@@ -90,6 +93,67 @@ def test_the_age_is_that_of_the_newest_file(tmp_path: Path) -> None:
     old = read_progress(folder).age
     (folder / "metrics.csv").touch()
     assert old > 1e8 and read_progress(folder).age < 60
+
+
+PLAN = """
+hydra:
+  sweeper: {params: {seed: "range(0,3)", +method: "target,plr,sfl", +scale: quick}}
+  overrides: {task: ["+sweep=x", "seed=4,5", compute.threads=1]}
+"""
+
+
+def write_planned(folder: Path, method: str, seed: int, **options: Any) -> Path:
+    overrides = ["compute.threads=1", "+scale=quick", f"+method={method}", f"seed={seed}"]
+    return write_run(folder / f"{method}{seed}", method, facts={"overrides": overrides}, **options)
+
+
+def finish(folder: Path, seconds: float) -> None:
+    overrides = json.loads((folder / "run.json").read_text())["overrides"]
+    (folder / "summary.json").write_text(json.dumps({"overrides": overrides, "seconds": seconds}))
+
+
+def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> None:
+    """Of six runs three are to be made; one goes on, and of one method nothing has finished."""
+    (tmp_path / "multirun.yaml").write_text(PLAN)
+    runs = [("target", 4, 100.0), ("plr", 4, 1000.0), ("plr", 5, 3000.0)]
+    for method, seed, seconds in runs:
+        finish(write_planned(tmp_path, method, seed), seconds)
+    assert sorted(planned(tmp_path)) == sorted(
+        (f"seed={seed}", f"+method={method}")
+        for seed in (4, 5)
+        for method in ("target", "plr", "sfl")
+    )
+    # target: 100; sfl twice: the mean of all, 4100 / 3
+    assert left(tmp_path, planned(tmp_path)) == Left(3, 6, pytest.approx(100 + 8200 / 3), 1, 2)
+    for seed, rest in ((4, 500.0), (5, 700.0)):
+        folder = write_planned(tmp_path, "sfl", seed, finished=False)
+        said = {"doing": "", "done": 0, "of": 0, "seconds_left": rest, "at_least": False}
+        (folder / "progress.json").write_text(json.dumps(said))
+    text = " ".join(watch(capsys, str(tmp_path)).split())
+    assert "sweep: 3 of 6 runs left, about 11 min, 2 at a time" in text  # (100 + 500 + 700) / 2
+    (folder / "progress.json").unlink()
+    write_planned(tmp_path, "target", 5, finished=False)
+    for path in tmp_path.iterdir():
+        if path.is_dir():
+            finish(path, 1.0)
+    assert "sweep: 0 of 6 runs left" in watch(capsys, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        "[",
+        "hydra: 3",
+        "hydra: {sweeper: {params: {a: 'range(0,1000000000)'}}, overrides: {task: []}}",
+        "hydra: {sweeper: {params: {}}, overrides: {task: [+ablation=glob(*)]}}",
+        "hydra: {sweeper: {params: {a: '{{{'}}, overrides: {task: []}}",
+        "hydra: {sweeper: {params: !!python/object:os.system {}}, overrides: {task: []}}",
+    ],
+)
+def test_a_plan_may_be_anything(plan: str, tmp_path: Path, capsys) -> None:
+    write_run(tmp_path / "a")
+    (tmp_path / "multirun.yaml").write_text(plan)
+    assert planned(tmp_path) == [] and "sweep:" not in watch(capsys, str(tmp_path))
 
 
 @pytest.mark.parametrize("arguments", [["missing"], ["."]])

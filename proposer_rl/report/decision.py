@@ -1,0 +1,179 @@
+"""Which curriculum to use, by what there is and what is scarce."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from proposer_rl.report.comparisons import (
+    TOO_FEW,
+    Decision,
+    Outcome,
+    between,
+    decisions,
+    learnt,
+    primary,
+)
+from proposer_rl.report.records import words
+from proposer_rl.report.runs import Run
+from proposer_rl.report.series import COSTS
+from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.tables import Cell, Table, write
+
+# What methods need, as their files say.
+TARGET, EXACT, GRADIENTS = "a target", "exact evaluation", "its gradients"
+Needs = Mapping[str, Collection[str]]  # by method
+
+SITUATIONS: Mapping[str, Collection[str]] = {
+    "a known target, exact evaluation": {TARGET, EXACT, GRADIENTS},
+    "a known target, episodes alone": {TARGET},
+    "no target, exact evaluation": {EXACT, GRADIENTS},
+    "no target, episodes alone": (),
+}
+UNITS = dict(zip(COSTS, ("million frames, the curriculum's too", "seconds"), strict=True))
+
+
+class Choice(NamedTuple):
+    """The best of the methods that one can use.
+
+    Attributes:
+        best: has the greatest mean.
+        value: its mean, with the interval.
+        level: labels of those from which it is not told apart, from the best to the worst.
+        others: how many it was compared with.
+        doubt: why nothing is chosen, in words; empty where something is.
+    """
+
+    best: Group
+    value: str
+    level: Sequence[str]
+    others: int
+    doubt: str
+
+    def text(self) -> str:
+        """As in ``ncc 0.53 [0.51, 0.55], better than all others (5)``."""
+        told = f"{self.best.label} {self.value}"
+        if self.doubt:
+            return f"{told}, but {self.doubt}"
+        if not self.others:
+            return f"{told}, the only one"
+        if self.level:
+            return f"{told}, not told apart from {', '.join(self.level)}"
+        return f"{told}, better than all others ({self.others})"
+
+
+def budgets(study: Study) -> Mapping[str, Outcome]:
+    """What methods are ranked by, by what is scarce: the headline's mean over a budget of it.
+
+    Of updates it is the primary outcome. Of what else training costs the budget is what the run
+    that cost least spent on all of its updates, so that every method has spent it.
+    """
+    name, whole = study.headline, [run for group in study.compared for run in group.runs]
+    whole = [run for run in whole if run.updates >= study.horizon]
+    found = {"updates": primary(study)}
+    for axis, cost in COSTS.items():
+        budget = min(float(cost(run)[-1]) for run in whole)
+        value = partial(Run.mean_until, measurement=name, budget=budget, cost=cost)
+        found[axis] = Outcome(f"{words(name)}, mean over {budget:.2g} {UNITS[axis]}", value)
+    return found
+
+
+def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[str]:
+    """What a group's method needs: as its runs recorded it, or else as the caller knows it.
+
+    A variant that asked for no evaluation of levels needs none to be exact.
+
+    Args:
+        group: of the method.
+        needs: for runs that recorded none.
+        unknown: of a method of which nobody knows.
+    """
+    run = group.runs[0]
+    about = run.facts.get("about")
+    said = about.get("needs") if isinstance(about, Mapping) else None
+    known = set(needs.get(run.method, unknown))
+    found = set(filter(None, said.split(", "))) if isinstance(said, str) else known
+    asked = any(run.metrics["evaluations"][-1] > 0 for run in group.runs)
+    return found if asked else found - {EXACT, GRADIENTS}
+
+
+def choose(
+    study: Study,
+    usable: Sequence[Group],
+    outcome: Outcome,
+    found: Mapping[tuple[str, str], Decision],
+) -> Choice | None:
+    """The best of some methods by an outcome; None where none has a value.
+
+    Args:
+        study: the runs.
+        usable: the methods.
+        outcome: of which more is better.
+        found: what was decided by it of every pair.
+    """
+    means = {group.label: outcome.values(group) for group in usable}
+    ranked = sorted(
+        (group for group in usable if means[group.label]),
+        key=lambda group: -np.mean(means[group.label]),
+    )
+    if not ranked:
+        return None
+    best, *others = ranked
+    pairs = [between(found, best, other) for other in others]
+    level = [other.label for other, decision in pairs if decision.winner != best.label]
+    doubt = ""
+    if len(means[best.label]) < FEWEST or any(each.verdict == TOO_FEW for _, each in pairs):
+        doubt = f"it takes {FEWEST} seeds of each to decide"
+    elif not learnt(best, study.headline, study.horizon):
+        doubt = "it is not shown to have learnt"
+    return Choice(best, write(mean_interval(means[best.label])), level, len(others), doubt)
+
+
+def choices(study: Study, needs: Needs) -> dict[str, dict[str, Choice | None]]:
+    """The best method, by what there is and then by what is scarce.
+
+    Methods that need something else besides are left out.
+    """
+    ranked = budgets(study)
+    found = {scarce: decisions(study, outcome) for scarce, outcome in ranked.items()}
+    return {
+        there: {
+            scarce: choose(study, usable(study, needs, have), outcome, found[scarce])
+            for scarce, outcome in ranked.items()
+        }
+        for there, have in SITUATIONS.items()
+    }
+
+
+def usable(study: Study, needs: Needs, have: Collection[str]) -> list[Group]:
+    """The compared methods that need nothing but what there is."""
+    unknown = {"nobody knows"}
+    return [group for group in study.compared if needs_of(group, needs, unknown) <= set(have)]
+
+
+def ranking(study: Study, needs: Needs) -> Table:
+    """Every method with what it needs, what it reaches for each budget, and what it costs."""
+    ranked = budgets(study)
+    groups = sorted(study.compared, key=lambda g: -np.mean(ranked["updates"].values(g)))
+    rows: list[dict[str, Cell]] = []
+    for group in groups:
+        said = sorted(needs_of(group, needs, {"not declared"}))
+        row: dict[str, Cell] = {"method": group.label, "needs": ", ".join(said) or "nothing"}
+        row["seeds"] = len(group.runs)
+        for outcome in ranked.values():
+            values = outcome.values(group)
+            row[outcome.name] = mean_interval(values) if values else None
+        last = [run.metrics["evaluations"][-1] for run in group.runs]
+        row["frames (M)"] = float(np.mean([run.total_frames[-1] for run in group.runs]) / 1e6)
+        row["evaluations"] = int(np.mean(last))
+        row["seconds"] = float(np.mean([run.own_seconds[-1] for run in group.runs]))
+        rows.append(row)
+    note = (
+        "Brackets: 95 % interval of the mean over seeds, not corrected. Frames, evaluations of "
+        "levels that the curriculum asked for, and seconds: means of whole runs."
+    )
+    return Table("ranking", "The methods", note, rows)

@@ -1,0 +1,124 @@
+"""What Solvers do at the end on levels of other sets than those measured along training."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from proposer_rl.report.records import is_rate, number, printable, words
+from proposer_rl.report.runs import Run, UnreadableRun
+from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.tables import Cell, Table, to_csv
+from proposer_rl.runs.folder import storage
+
+LARGEST_FILE = 2**24
+LONGEST_NAME = 80
+
+
+class Score(NamedTuple):
+    """A Solver's mean over a set of levels.
+
+    Attributes:
+        run: name of its folder.
+        seed: its own.
+        updates: after so many.
+        levels: name of the set.
+        size: how many levels it has.
+        success: NaN where the task has none.
+        returns: the mean return.
+    """
+
+    run: str
+    seed: int
+    updates: int
+    levels: str
+    size: int
+    success: float
+    returns: float
+
+
+def write_scores(scores: Iterable[Score]) -> bytes:
+    """Scores as CSV."""
+    return to_csv(Score._fields, [list(score) for score in scores]).encode()
+
+
+def read_scores(file: Path) -> list[Score]:
+    """Scores as ``bin/eval`` writes them for several runs.
+
+    Raises:
+        UnreadableRun: if the file holds something else.
+        StorageError: if it cannot be read.
+    """
+    with storage(file, "read"), file.open("rb") as opened:
+        content = opened.read(LARGEST_FILE + 1)
+    try:
+        if len(content) > LARGEST_FILE:
+            raise ValueError("too large")
+        rows = csv.DictReader(io.StringIO(content.decode()))
+        return [
+            Score(
+                row["run"],
+                int(row["seed"]),
+                int(row["updates"]),
+                printable(row["levels"])[:LONGEST_NAME],
+                int(row["size"]),
+                number(float(row["success"] or "nan")),
+                number(float(row["returns"] or "nan")),
+            )
+            for row in rows
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnreadableRun(f"{file}: holds no scores of runs as bin/eval writes them") from error
+
+
+def scored(run: Run, scores: Sequence[Score], levels: str) -> Score | None:
+    """A run's score on a set at its end; None where there is none."""
+    key = (run.folder.name, run.seed, run.updates, levels)
+    return next((score for score in scores if score[:4] == key), None)
+
+
+def generalisation_table(study: Study, scores: Sequence[Score]) -> Table:
+    """One row per method: its mean on each set, and on the worst tenth of what was measured on."""
+    sets = list(dict.fromkeys(score.levels for score in scores))
+    worst = [f"{name}_worst10" for name in study.measurements if name != study.headline]
+    worst = [name for name in worst if any(name in run.metrics for run in study.runs)]
+    rows: list[dict[str, Cell]] = []
+    for group in study.compared:
+        row: dict[str, Cell] = {"method": group.label}
+        for levels in sets:
+            found = [_result(run, scores, levels, study) for run in group.runs]
+            row |= _row(levels, found)
+        for name in worst:
+            found = [run.at(name, study.horizon) for run in group.runs if name in run.metrics]
+            row |= _row(words(name).replace("worst10", "on the worst 10 %"), found)
+        rows.append(row)
+    measure = "Success" if is_rate(study.headline) else "Return"
+    note = (
+        f"{measure} after {study.horizon} updates, mean over the {study.example.task.levels} of "
+        f"each set. Brackets: 95 % interval of the mean over seeds, from {FEWEST} seeds on; not "
+        "corrected for their number."
+    )
+    return Table("generalisation", "Other levels", note, rows)
+
+
+def _result(run: Run, scores: Sequence[Score], levels: str, study: Study) -> float:
+    score = scored(run, scores, levels) if run.updates == study.horizon else None
+    if score is None:
+        return math.nan
+    return score.success if is_rate(study.headline) else score.returns
+
+
+def _row(name: str, values: Sequence[float]) -> dict[str, Cell]:
+    known = [value for value in values if not math.isnan(value)]
+    return {name: mean_interval(known) if known else None}
+
+
+def whole(groups: Iterable[Group]) -> list[Run]:
+    """The finished runs of some groups, one of each folder."""
+    runs = (run for group in groups for run in group.runs if run.finished)
+    return list({run.folder: run for run in runs}.values())

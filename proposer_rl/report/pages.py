@@ -1,0 +1,218 @@
+"""Pages of the documentation, drawn from runs: which curriculum to use, and which claims hold."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from proposer_rl.report import curves, page, proposals
+from proposer_rl.report.build import FIGURES, OutputError, check_output, write_files
+from proposer_rl.report.comparisons import ALIKE, primary
+from proposer_rl.report.decision import (
+    SITUATIONS,
+    Choice,
+    Needs,
+    budgets,
+    choices,
+    needs_of,
+    ranking,
+    usable,
+)
+from proposer_rl.report.findings import GAIN, TITLE, Evidence, finding_table, paper_findings
+from proposer_rl.report.generalisation import generalisation_table, read_scores
+from proposer_rl.report.own_findings import own_findings
+from proposer_rl.report.records import words
+from proposer_rl.report.runs import find_runs
+from proposer_rl.report.statistics import FEWEST
+from proposer_rl.report.studies import Study, read_studies
+from proposer_rl.report.style import Drawing, in_few_colours, save
+from proposer_rl.report.tables import Table, escape_markdown
+
+CHOICE, CLAIMS = "which_curriculum.md", "claims.md"
+SCARCE = ("updates of the Solver", "environment frames", "seconds")
+
+# Of the page of claims.
+DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
+    curves.learning_curves,
+    curves.cost_curves,
+    proposals.heat_maps,
+    curves.difficulty,
+)
+
+
+def write_pages(
+    folders: Sequence[Path],
+    output: Path,
+    needs: Needs,
+    threshold: float | None = None,
+    baseline: str | None = None,
+    scores: Path | None = None,
+) -> list[Path]:
+    """Write the pages.
+
+    Args:
+        folders: of runs, or with runs in them; all measured alike.
+        output: folder to write to; pages in it are replaced.
+        needs: what methods need, for runs that do not tell.
+        threshold: see :func:`~proposer_rl.report.build.write_report`.
+        baseline: the same.
+        scores: of the runs on further levels, as ``bin/eval`` writes them.
+
+    Returns:
+        The pages.
+
+    Raises:
+        UnreadableRun: if a folder has no run, or none can be read.
+        OutputError: if the output folder holds something else, or the runs were not measured alike.
+    """
+    check_output(output, CHOICE)
+    studies, notes = read_studies(find_runs(folders), threshold, baseline)
+    if len(studies) > 1:
+        titles = "; ".join(study.title for study in studies)
+        raise OutputError(f"--pages: the runs were not measured alike ({titles}); give fewer")
+    (study,) = studies
+    asked = shlex.split(page.report_command(folders, threshold, baseline))
+    asked += [] if scores is None else ["--scores", str(scores)]
+    command = shlex.join([*asked, "--pages", "docs/findings"])
+    others = generalisation_table(study, [] if scores is None else read_scores(scores))
+    files: dict[str, bytes] = {}
+    pages = {CHOICE: _choice(study, needs, files), CLAIMS: _claims(study, needs, others, files)}
+    for name, parts in pages.items():
+        lines = [*parts, "## How this page is made", _origin(study, command, notes)]
+        files[name] = ("\n\n".join(lines) + "\n").encode()
+    write_files(output, files, [FIGURES])
+    return [output / name for name in pages]
+
+
+def _choice(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
+    """The page for who wants to use a curriculum."""
+    found = choices(study, needs)
+    named = {c.best.label for row in found.values() for c in row.values() if c and not c.doubt}
+    named |= {study.baseline.label}
+    shown = replace(study, groups=tuple(g for g in study.groups if g.label in named))
+    kept = [group.label for have in SITUATIONS.values() for group in usable(study, needs, have)]
+    left = [group for group in study.compared if group.label not in kept]
+    table = ranking(study, needs)
+    parts = [
+        "# Which curriculum should I use?",
+        f"From {_runs(study)}. By what there is, and by what is scarce: the method with the "
+        f"highest mean of {words(study.headline)} along training, over a budget of it.",
+        _picture(curves.cost_curves(shown)._replace(name="recommended"), files),
+        _decision_table(found),
+        _budgets(study),
+    ]
+    if left:
+        also = (f"{g.label} ({', '.join(sorted(needs_of(g, needs, {'?'})))})" for g in left)
+        parts.append(
+            "Not chosen from, because they take something else, too, but in the table below: "
+            f"{escape_markdown(', '.join(also))}."
+        )
+    return [*parts, f"## {table.title}", table.to_markdown().strip(), table.note]
+
+
+def _decision_table(found: Mapping[str, Mapping[str, Choice | None]]) -> str:
+    head = ["there is", *(f"{scarce} are scarce" for scarce in SCARCE)]
+    rows = [
+        [there, *("–" if c is None else _cell(c) for c in row.values())]
+        for there, row in found.items()
+    ]
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cell(choice: Choice) -> str:
+    label = escape_markdown(choice.best.label)
+    rest = escape_markdown(choice.text().removeprefix(choice.best.label))
+    return f"{label if choice.doubt else f'**{label}**'} {rest}"
+
+
+def _budgets(study: Study) -> str:
+    names = "; ".join(outcome.name for outcome in budgets(study).values())
+    return (
+        f"Ranked by {names}. The budget of frames and of seconds is what the run that cost least "
+        "spent on all of its updates: a method that spends more gets as far as that allows. *Told "
+        "apart*: by t tests over seeds, in pairs where methods have the same ones, corrected for "
+        "all pairs of methods on this page by Holm's method, each column for itself, at 5 %; and "
+        "the better one must have learnt. A method that is not told apart from the best may be as "
+        f"good. Brackets: 95 % intervals, from {FEWEST} seeds on. *No target*: the method is not "
+        "told it; what is measured is success on it all the same. *Exact evaluation*: the task can "
+        "say how a Solver does on a level without playing it, with gradients. Seconds hold for the "
+        "machine below, and for what else it did."
+    )
+
+
+def _claims(study: Study, needs: Needs, others: Table, files: dict[str, bytes]) -> list[str]:
+    """The page for who wants to know what is true."""
+    drawn = [drawing for draw in DRAWINGS if (drawing := draw(study)) is not None]
+    # Strips under each other would be twice as high as a screen.
+    drawn = [each._replace(columns=max(each.columns, 2)) for each in drawn]
+    figures = {each.name: _picture(each, files) for each in drawn}
+    told = {each.name: f"{each.title}. {each.caption}" for each in drawn}
+    sections = {
+        "What each curriculum proposes": "proposals",
+        "What the Solver trained on, and its success there": "difficulty",
+    }
+    parts = [
+        "# What the paper claims and what we found",
+        f"From {_runs(study)}.",
+        *(text for name in ("learning_curves", "cost") for text in (figures[name], told[name])),
+        "## The paper's claims",
+        f"The paper is *{TITLE}*, whose method is `{GAIN}`.",
+        _list(paper_findings(study)),
+        "## Our claims",
+        _list(own_findings(study, needs)),
+        "What each method costs in frames, evaluations and seconds stands in "
+        f"[the table of methods]({CHOICE}#the-methods).",
+        "## How it is decided",
+        finding_table(study, []).note + f" *Alike* and *level* are bounds of {ALIKE}: that no "
+        "difference is seen does not show that there is none.",
+    ]
+    for title, name in sections.items():
+        if name in figures:
+            parts += [f"## {title}", figures[name], told[name]]
+    if len(others.columns) > 1:
+        parts += [f"## {others.title}", others.to_markdown().strip(), others.note]
+    return parts
+
+
+def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
+    lines = []
+    for number, (claim, evidence) in enumerate(found, 1):
+        verdict, text = evidence or ("not tested", "its methods are not among these runs")
+        lines.append(f"{number}. {claim} **{verdict.capitalize()}**: {escape_markdown(text)}.")
+    return "\n".join(lines)
+
+
+def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
+    path = f"{FIGURES}/{drawing.name}.png"
+    files[path] = in_few_colours(save(drawing)["png"])
+    return f"![{escape_markdown(drawing.title)}]({path})"
+
+
+def _runs(study: Study) -> str:
+    seeds = sorted({len(group.runs) for group in study.groups})
+    count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    return (
+        f"{len(study.runs)} runs ({escape_markdown(study.title)}): {len(study.groups)} methods or "
+        f"variants, {count} seeds of each, {study.horizon} updates of the Solver, compared by "
+        f"{primary(study).name}"
+    )
+
+
+def _origin(study: Study, command: str, notes: Sequence[str]) -> str:
+    facts = [f"- {escape_markdown(f'{name}: {text}')}" for name, text in page.origin(study)]
+    short = page.unfinished(study)
+    facts += [f"- Unfinished: {escape_markdown(', '.join(short))}"] if short else []
+    facts += [f"- {escape_markdown(note)}" for note in notes]
+    made = "\n".join(page.commands(study))
+    return "\n\n".join(
+        [
+            f"```bash\n{command}\n```",
+            "writes both pages from the folders of these runs; given `sweeps/medium`, which "
+            "`bin/train +sweep=medium` makes, from those. The runs were made by",
+            f"```bash\n{made}\n```",
+            "\n".join(facts),
+        ]
+    )

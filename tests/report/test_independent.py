@@ -1,0 +1,165 @@
+"""The report's tables against pandas and SciPy, from nothing but ``metrics.csv``."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import integrate, stats
+
+from proposer_rl.report.outcomes import comparison_table, group_table
+from proposer_rl.report.statistics import FEWEST
+from proposer_rl.report.studies import read_studies
+from tests.report.folders import write_run
+
+RESULTS = Path(__file__).parents[2] / "results"
+# Tables of the present form; some older ones have no primary outcome.
+COMMITTED = [
+    folder.parent
+    for folder in sorted(RESULTS.glob("*/tables/methods.csv"))
+    if "mean over" in folder.read_text(encoding="utf-8").partition("\n")[0]
+]
+
+
+def outcomes_of(metrics: pd.DataFrame, columns: pd.Index) -> pd.DataFrame:
+    """Every outcome that the table names, of every whole run, indexed by method and seed."""
+    (primary,) = (c for c in columns if re.fullmatch(r".*, mean over \d+ updates", c))
+    (waiting,) = (c for c in columns if re.fullmatch(r"updates to .* \(at most \d+\)", c))
+    horizon = int(primary.split()[-2])
+    threshold = float(waiting.split()[2].rstrip("%")) / 100
+    headline = primary.partition(",")[0].lower().replace(" ", "_")
+    found = {}
+    for key, run in metrics.groupby(["method", "seed"]):
+        run = run.set_index("updates").sort_index()
+        if run.index[-1] >= horizon:
+            run = run.loc[:horizon]
+            reached = run.index[run[headline] >= threshold]
+            found[key] = {
+                primary: integrate.trapezoid(run[headline], run.index) / horizon,
+                waiting: reached[0] if len(reached) else horizon,
+                **{
+                    c: run.loc[horizon, c.partition(" after ")[0].lower().replace(" ", "_")]
+                    for c in columns
+                    if c.endswith(f" after {horizon} updates")
+                },
+            }
+    return pd.DataFrame.from_dict(found, orient="index")
+
+
+def student(values: pd.Series) -> tuple[float, float, float, float]:
+    """Mean, interval and p-value; runs that share a value give one degree of freedom at most."""
+    if len(values) < FEWEST or values.nunique() == 1:
+        return values.mean(), math.nan, math.nan, math.nan
+    freedom = max(len(values) - values.value_counts().max(), 1)
+    error = stats.sem(values)
+    ends = stats.t.interval(0.95, freedom, values.mean(), error)
+    return values.mean(), *ends, 2 * stats.t.sf(abs(values.mean()) / error, freedom)
+
+
+def between(one: pd.Series, other: pd.Series) -> tuple[float, float, float, float]:
+    """Difference of two methods' values by seed, in pairs where the seeds are the same."""
+    value, paired = one.mean() - other.mean(), one.index.equals(other.index)
+    if paired and (len(one) < FEWEST or (one - other).nunique() < len(one)):
+        return student(one - other)
+    if min(len(one), len(other)) < FEWEST or one.nunique() == other.nunique() == 1:
+        return value, math.nan, math.nan, math.nan
+    test = stats.ttest_rel(one, other) if paired else stats.ttest_ind(one, other, equal_var=False)
+    return value, *test.confidence_interval(), test.pvalue
+
+
+def improvement(one: pd.Series, other: pd.Series) -> tuple[float, float, float]:
+    """Mann's and Whitney's statistic as a share, with Clopper's and Pearson's interval."""
+    count = min(len(one), len(other))
+    share = stats.mannwhitneyu(one, other, method="asymptotic").statistic / (len(one) * len(other))
+    if count < FEWEST:
+        return share, math.nan, math.nan
+    wins = share * count
+    low = stats.beta.ppf(0.025, wins, count - wins + 1) if wins else 0
+    high = stats.beta.ppf(0.975, wins + 1, count - wins) if wins < count else 1
+    return share, low, high
+
+
+def holm(p: pd.Series) -> pd.Series:
+    """By the definition: the largest q among those up to p, each times how many are not below q."""
+    steps = p.map(lambda q: q * (p >= q).sum())
+    return p.map(lambda own: min(steps[p <= own].max(), 1))
+
+
+def check(metrics: pd.DataFrame, methods: pd.DataFrame, pairs: pd.DataFrame, rel: float) -> None:
+    """The numbers of both tables that are told with an interval, and the corrected p-values."""
+    runs = outcomes_of(metrics, methods.columns)
+    horizon = int(runs.columns[0].split()[-2])
+    of = {method: table.droplevel(0) for method, table in runs.groupby(level=0)}
+    assert set(of) == set(methods["method"])
+    near = {"rel": rel, "abs": rel, "nan_ok": True}
+    for _, row in methods.iterrows():
+        for name, values in of[row["method"]].items():
+            expected = list(student(values)[:3])
+            if name == runs.columns[1]:  # no number of updates is below none or above the cut
+                expected[1:] = np.clip(expected[1:], 0, horizon)
+            shown = [row[name], row.get(f"{name}, low", math.nan), row.get(f"{name}, high")]
+            assert [math.nan if x is None else x for x in shown] == pytest.approx(expected, **near)
+    expected_pairs = list(itertools.combinations(sorted(of), 2))
+    found = pd.DataFrame(
+        [
+            (name, one, other, *between(of[one][name], of[other][name]))
+            for name in runs.columns
+            for one, other in expected_pairs
+            if name == runs.columns[0] or one == expected_pairs[0][0]  # time, and they are alike
+        ],
+        columns=["outcome", "first", "second", "value", "low", "high", "p"],
+    )
+    primary = found["outcome"] == runs.columns[0]
+    found["corrected"] = holm(found.loc[primary, "p"])
+    assert len(pairs) == len(expected_pairs) * len(runs.columns)
+    table = found.merge(pairs, on=["outcome", "first", "second"], validate="one_to_one")
+    assert len(table) == len(found)
+    for _, row in table.iterrows():
+        shown = [row["difference"], row["difference, low"], row["difference, high"]]
+        assert shown == pytest.approx([row["value"], row["low"], row["high"]], **near)
+        sign = -1 if row["outcome"] == runs.columns[1] else 1
+        values = [sign * of[row[side]][row["outcome"]] for side in ("first", "second")]
+        shown = [row[f"P(first better){part}"] for part in ("", ", low", ", high")]
+        assert shown == pytest.approx(improvement(*values), **near)
+        # A p-value of millions of differences tells their rounding: its exponent must be right.
+        assert row["p (Holm)"] == pytest.approx(row["corrected"], rel=200 * rel, nan_ok=True)
+        if str(row["verdict"]).endswith(" is better"):
+            winner = row["first"] if row["value"] > 0 else row["second"]
+            assert row["verdict"] == f"{winner} is better" and row["corrected"] <= 0.05
+        elif row["verdict"] == "undecided":
+            assert not row["corrected"] <= 0.05
+
+
+def test_of_runs_with_every_kind_of_seed(tmp_path: Path) -> None:
+    """Paired, with other seeds, cut off, too short, too few, and equal throughout."""
+    random = np.random.default_rng(5)
+    seeds = {"a": range(7), "b": range(7), "c": range(2, 9), "few": range(3), "flat": range(6)}
+    speeds = {"a": 1.5, "b": 1.9, "c": 1.2, "few": 1.8, "flat": 0.0}
+    curves = {(m, seed): random.gamma(2.0, 0.07, 8) * speeds[m] for m in seeds for seed in seeds[m]}
+    folders = {
+        tmp_path / f"{method}{seed}": (method, seed, 1 - np.exp(-np.cumsum([0, *steps])))
+        for (method, seed), steps in curves.items()
+    }
+    folders[tmp_path / "short"] = ("a", 77, np.array([0.0, 0.9]))
+    for folder, (method, seed, curve) in folders.items():
+        write_run(folder, method, [seed], curve, finished=len(curve) > 2)
+    study = read_studies(folders, None)[0][0]
+    metrics = pd.concat(
+        pd.read_csv(folder / "metrics.csv").assign(method=method)
+        for folder, (method, *_) in folders.items()
+    )
+    tables = (pd.read_csv(io.StringIO(t(study).to_csv())) for t in (group_table, comparison_table))
+    check(metrics, *tables, rel=1e-5)
+
+
+@pytest.mark.parametrize("folder", COMMITTED, ids=lambda folder: folder.parent.name)
+def test_of_the_committed_results(folder: Path) -> None:
+    """Their measurements have six significant digits."""
+    names = ("metrics", "methods", "comparisons")
+    check(*(pd.read_csv(folder / f"{name}.csv") for name in names), rel=1e-4)

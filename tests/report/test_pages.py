@@ -1,0 +1,284 @@
+"""Pages of the docs that are drawn from runs: which curriculum to use, and which claims hold."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import integrate
+
+from proposer_rl.cli.help import needs
+from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.cli.report import main
+from proposer_rl.report.curves import cost_curves, learning_curves
+from proposer_rl.report.decision import budgets, choices
+from proposer_rl.report.generalisation import (
+    Score,
+    generalisation_table,
+    read_scores,
+    write_scores,
+)
+from proposer_rl.report.own_findings import own_findings
+from proposer_rl.report.pages import CHOICE, CLAIMS
+from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.statistics import Interval
+from proposer_rl.report.studies import Study, read_studies
+from proposer_rl.report.tables import write
+from tests.report.folders import cycle, write_rockets, write_run
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "findings"
+NEEDS = needs([CONFIG_FOLDER])
+SEEDS = 5
+FLAT, SLOW = [0.0] * 6, [0.0, 0.0, 0.05, 0.3, 0.5, 0.6]
+FAST, FASTEST = [0.0, 0.4, 0.7, 0.85, 0.9, 0.9], [0.0, 0.8, 0.9, 0.95, 0.95, 0.95]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def unsafe() -> Iterator[None]:
+    """What is written here need not outlive the machine, and disks take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda file: None)
+        yield
+
+
+def write_methods(
+    folder: Path, curves: Mapping[str, Sequence[float]], seeds: int = SEEDS, **facts: str
+) -> Path:
+    """Seeds of each method; ``perf_gain`` spends twelve times the frames of the others."""
+    harder = [cycle(i, [0.1, 0.2], [[8 - i, 1, 1], [1, 1, 1 + i]], every=6) for i in range(8)]
+    for label, base in curves.items():
+        method, _, ablation = label.partition(", ")
+        proposes = method == "perf_gain"
+        for seed in range(seeds):
+            write_run(
+                folder / f"{label}_{seed}",
+                method,
+                [seed],
+                [value * (1 - 0.01 * seed) for value in base],
+                cycles=harder if proposes else (),
+                copies=1100 if proposes else 0,
+                ablation=ablation or "none",
+                facts={"about": facts} if facts else None,
+            )
+    return folder
+
+
+def study_of(folder: Path) -> Study:
+    return read_studies(sorted(folder.iterdir()), None)[0][0]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    curves = {
+        "perf_gain": FASTEST,
+        "ncc": FAST,
+        "hand_made": FASTEST,
+        "domain_randomization": SLOW,
+        "target": FLAT,
+    }
+    return write_methods(tmp_path_factory.mktemp("runs"), curves)
+
+
+@pytest.fixture(scope="module")
+def pages(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("docs") / "findings"
+    main([str(runs), "--pages", str(folder)])
+    return folder
+
+
+def test_the_best_depends_on_what_there_is_and_on_what_is_scarce(runs: Path) -> None:
+    """Levels that are sorted by hand nobody has here: that method is not chosen."""
+    best = {
+        there: [choice.best.label if choice else None for choice in row.values()]
+        for there, row in choices(study_of(runs), NEEDS).items()
+    }
+    assert best == {
+        "a known target, exact evaluation": ["perf_gain", "ncc", "perf_gain"],
+        "a known target, episodes alone": ["domain_randomization"] * 3,
+        "no target, exact evaluation": ["ncc"] * 3,
+        "no target, episodes alone": ["domain_randomization"] * 3,
+    }
+
+
+def test_the_mean_over_a_budget_is_the_area_under_the_curve_up_to_it(runs: Path) -> None:
+    study = study_of(runs)
+    updates, frames, seconds = budgets(study).values()
+    assert frames.name == "ID success, mean over 0.005 million frames, the curriculum's too"
+    assert seconds.name == "ID success, mean over 10 seconds"
+    for group in study.groups:
+        for run in group.runs:
+            y, x = run.metrics["id_success"], run.metrics["updates"]
+            for outcome in (updates, seconds):
+                assert outcome.value(run) == pytest.approx(integrate.trapezoid(y, x) / 50)
+            spent = x * (1200 if group.label == "perf_gain" else 100)
+            fine = np.linspace(0, 5000, 100_001)
+            expected = integrate.trapezoid(np.interp(fine, spent, y), fine) / 5000
+            assert frames.value(run) == pytest.approx(expected, rel=1e-6)
+
+
+def test_methods_that_cannot_be_told_apart_are_named(tmp_path: Path) -> None:
+    for method, ends in {"plr": (0.6, 0.02), "accel": (0.7, -0.02), "target": (0, 0)}.items():
+        for seed in range(SEEDS):
+            end = ends[0] + ends[1] * seed
+            write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end / 2, end])
+    choice = choices(study_of(tmp_path), NEEDS)["a known target, episodes alone"]["updates"]
+    assert choice is not None and choice.others == 2
+    assert {choice.best.label, *choice.level} == {"plr", "accel"}
+    assert "not told apart from" in choice.text()
+
+
+@pytest.mark.parametrize(
+    ("curves", "seeds", "doubt"),
+    [
+        ({"plr": FAST, "accel": SLOW}, 4, "it takes 5 seeds of each to decide"),
+        ({"plr": [0.0, 0.05, 0.05], "accel": FLAT[:3]}, 6, "it is not shown to have learnt"),
+    ],
+)
+def test_thin_evidence_chooses_nothing(curves, seeds: int, doubt: str, tmp_path: Path) -> None:
+    found = choices(study_of(write_methods(tmp_path, curves, seeds)), NEEDS)
+    choice = found["no target, episodes alone"]["updates"]
+    assert choice is not None and choice.best.label == "plr" and choice.doubt == doubt
+    assert ("[" in choice.value) == (seeds >= 5)
+
+
+def test_what_a_method_needs_is_what_its_runs_say(tmp_path: Path) -> None:
+    """Else what its file says; of whose needs nobody knows is not chosen."""
+    write_methods(tmp_path, {"plr": FAST}, needs="a target, a moon")
+    write_methods(tmp_path, {"mine": FASTEST, "accel": SLOW})
+    found = choices(study_of(tmp_path), NEEDS)
+    best = {choice.best.label for row in found.values() for choice in row.values() if choice}
+    assert best == {"accel"}
+    write_methods(tmp_path / "own", {"mine": FASTEST, "accel": SLOW}, needs="")
+    found = choices(study_of(tmp_path / "own"), NEEDS)
+    assert found["no target, episodes alone"]["updates"].best.label == "mine"  # type: ignore
+
+
+def verdicts(study: Study) -> list[str]:
+    return [evidence[0] if evidence else "" for _, evidence in own_findings(study, NEEDS)]
+
+
+def test_our_claims_hold_where_they_are_true(tmp_path: Path) -> None:
+    true = {
+        "first_order_gain": FASTEST,
+        "first_order_proposer": FAST,
+        "hand_made": FAST,
+        "domain_randomization": SLOW,
+        "perf_gain, paper_literal": [value * 0.9 for value in SLOW],
+        "target": FLAT,
+    }
+    study = study_of(write_methods(tmp_path / "true", true))
+    assert verdicts(study) == ["supported"] * 3
+    few = [replace(group, runs=group.runs[1:]) for group in study.groups]
+    assert verdicts(replace(study, groups=tuple(few))) == ["too few seeds"] * 3
+    one = [group for group in study.groups if group.label == "first_order_gain"]
+    assert verdicts(replace(study, groups=tuple(one))) == [""] * 3
+    false = {**true, "first_order_gain": SLOW, "first_order_proposer": FLAT, "ncc": FAST}
+    assert verdicts(study_of(write_methods(tmp_path / "false", false))) == ["contradicted"] * 3
+    nothing = {label: [value / 20 for value in curve] for label, curve in true.items()}
+    study = study_of(write_methods(tmp_path / "nothing", nothing))
+    assert "supported" not in verdicts(study)
+
+
+def test_the_same_runs_give_the_same_pages(
+    runs: Path, pages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("proposer_rl.report.pages.DRAWINGS", [learning_curves, cost_curves])
+    folders = sorted(map(str, runs.iterdir()), reverse=True)
+    command = f"bin/report {runs.name} --pages docs/findings"
+    before = contents(pages)
+    assert set(before) >= {CHOICE, CLAIMS, "figures/cost.png", "figures/proposals.png"}
+    main([*folders, "--pages", str(tmp_path / "again")])
+    after = contents(tmp_path / "again")
+    assert [name for name in after if name.endswith(".png") and after[name] != before[name]] == []
+    texts = [found[CHOICE].decode().splitlines() for found in (before, after)]
+    assert command in texts[0]
+    one, other = ([line for line in text if "--pages" not in line] for text in texts)
+    assert one == other
+
+
+def test_the_pages_say_what_was_found(pages: Path) -> None:
+    text = (pages / CHOICE).read_text(encoding="utf-8")
+    assert "| **perf\\_gain** 0." in text and "better than all others (" in text
+    assert "hand\\_made (a target, levels sorted by hand)" in text
+    claims = (pages / CLAIMS).read_text(encoding="utf-8")
+    ours = claims.partition("## Our claims")[2]
+    assert claims.count("**Supported**") and ours.count("**Not tested**") == 3
+    for page in (text, claims):
+        for picture in re.findall(r"!\[[^]]+\]\((.*)\)", page):
+            assert (pages / picture).is_file()
+
+
+def test_other_levels_are_told_by_method(runs: Path, tmp_path: Path) -> None:
+    """A mean over the seeds of each; a score of other updates is none of the end."""
+    scores = [
+        Score(folder.name, int(folder.name[-1]), updates, "big, new", 7, 0.1 * rank, math.nan)
+        for rank, folder in enumerate(sorted(runs.glob("ncc_*")), 1)
+        for updates in (50, 40)
+    ]
+    (tmp_path / "scores.csv").write_bytes(write_scores(scores))
+    for read, score in zip(read_scores(tmp_path / "scores.csv"), scores, strict=True):
+        assert read[:5] == score[:5] and read[5:] == pytest.approx(score[5:], nan_ok=True)
+    found = generalisation_table(study_of(runs), read_scores(tmp_path / "scores.csv"))
+    of = {row["method"]: row for row in found.rows}
+    assert of["ncc"]["big, new"].estimate == pytest.approx(0.3)  # type: ignore[union-attr]
+    assert of["target"]["big, new"] is None
+    worst = of["ncc"]["OOD success on the worst 10 %"].estimate  # type: ignore[union-attr]
+    assert worst == pytest.approx(0.45 * np.mean([1 - 0.01 * seed for seed in range(SEEDS)]))
+    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(UnreadableRun, match="holds no scores of runs"):
+        read_scores(tmp_path / "scores.csv")
+
+
+def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Path, capsys) -> None:
+    write_rockets(tmp_path / "rockets", "target", 0)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.md").write_text("mine")
+    wrong = {
+        "were not measured alike": [str(tmp_path / "rockets"), str(runs), "--pages", "new"],
+        f"but no {CHOICE}": [str(runs), "--pages", str(tmp_path / "mine")],
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        assert end.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: ") and message in line
+
+
+def table(lines: Sequence[str], title: str) -> list[dict[str, str]]:
+    """The first table of Markdown after a heading."""
+    rows = [line for line in lines[lines.index(title) :] if line.startswith("| ")]
+    names, _, *cells = ([cell.strip() for cell in row[1:-2].split(" | ")] for row in rows)
+    return [dict(zip(names, row, strict=True)) for row in cells]
+
+
+def test_the_committed_pages_tell_the_committed_results() -> None:
+    """Of each method the primary outcome, as the table of some folder of results has it."""
+    shown = table((PAGES / CHOICE).read_text(encoding="utf-8").splitlines(), "## The methods")
+    (primary,) = (name for name in shown[0] if re.search(r"mean over \d+ updates", name))
+    told = {row["method"].replace("\\", ""): row[primary].replace("\\", "") for row in shown}
+    results = []
+    for file in sorted((ROOT / "results").glob("*/tables/methods.csv")):
+        rows = list(csv.DictReader(file.open(encoding="utf-8")))
+        if primary in rows[0]:
+            results.append({row["method"]: cell(row, primary) for row in rows})
+    assert told in results
+    pictures = [path.stat().st_size for path in (PAGES / "figures").iterdir()]
+    assert sum(pictures) < 1.5e6
+
+
+def cell(row: Mapping[str, str], name: str) -> str:
+    """A mean with its interval as Markdown has it."""
+    ends = [float(row[f"{name}{part}"] or "nan") for part in ("", ", low", ", high")]
+    return write(Interval(*ends))

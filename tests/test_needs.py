@@ -1,0 +1,61 @@
+"""What methods say that they need, against what they ask for while they train."""
+
+from __future__ import annotations
+
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from proposer_rl.cli.build import build, parts
+from proposer_rl.cli.help import needs
+from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.mazes.task import MazeTask
+from proposer_rl.report.decision import EXACT, GRADIENTS, TARGET
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.signals import StopSignals
+from tests.tiny import composed
+
+NEEDS = needs([CONFIG_FOLDER])
+REUSED = "frozen_proposer"  # of another run's checkpoint
+SMALL = ["+scale=smoke", "compute.progress=false", "schedule.updates=2", "hand_made.until=[1]"]
+
+
+class Watched:
+    """A distribution that notes when somebody asks for something of it."""
+
+    def __init__(self, distribution: Any, asked: list[str]) -> None:
+        self._distribution, self._asked = distribution, asked
+
+    def __getattr__(self, name: str) -> Any:
+        self._asked.append(name)
+        return getattr(self._distribution, name)
+
+
+def test_every_method_says_what_it_needs() -> None:
+    assert set(NEEDS) == {file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml")}
+    known = {TARGET, EXACT, GRADIENTS, "levels sorted by hand", "a Proposer that has learnt"}
+    assert {need for found in NEEDS.values() for need in found} == known
+    assert "a Proposer that has learnt" in NEEDS[REUSED]
+
+
+@pytest.mark.parametrize("method", sorted(NEEDS.keys() - {REUSED}))
+def test_a_method_asks_for_what_it_says(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    made = MazeTask.__init__
+
+    @wraps(made)  # settings are checked against its types
+    def watched(self: MazeTask, **given: Any) -> None:
+        made(self, **given)
+        self.target = self.distributions[given["target"]] = Watched(self.target, asked)
+
+    monkeypatch.setattr(MazeTask, "__init__", watched)
+    config = composed(f"+method={method}", *SMALL)
+    signals = StopSignals()
+    summary = build(config, parts(config, signals), RunFolder(tmp_path), signals).run()
+    assert bool(asked) == (TARGET in NEEDS[method]), asked
+    assert (summary["evaluations"] > 0) == (EXACT in NEEDS[method])
+    assert GRADIENTS not in NEEDS[method] or EXACT in NEEDS[method]
