@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from proposer_rl.cli.instruments import positive
+
 
 def main() -> None:
     """Entry point; :func:`benchmarks.command.answer` has the exit codes."""
@@ -23,8 +25,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks; default: see --list")
     parser.add_argument("--list", action="store_true", help="list the benchmarks and stop")
     parser.add_argument("--output", type=Path, default=Path("bench.json"), metavar="FILE")
-    parser.add_argument("--repeats", type=_positive, default=5, help="rounds of each comparison")
-    parser.add_argument("--threads", type=_positive, help="CPU threads; default: torch's choice")
+    parser.add_argument("--repeats", type=positive, default=5, help="rounds of each comparison")
+    parser.add_argument("--threads", type=positive, help="CPU threads; default: torch's choice")
     parser.add_argument(
         "--precision",
         choices=["auto", "fp32", "bf16"],
@@ -36,13 +38,6 @@ def _parser() -> argparse.ArgumentParser:
     size.add_argument("--full", action="store_true", help="the paper's values throughout (longer)")
     size.add_argument("--tiny", action="store_true", help="only see that everything runs")
     return parser
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
-    return number
 
 
 if __name__ == "__main__":

@@ -25,13 +25,15 @@ PAGES = {file.stem: file.read_text(encoding="utf-8") for file in sorted(DOCS.glo
 CODE = [page for page, text in PAGES.items() if blocks("python", text)]
 
 
-def programs() -> dict[str, str]:
-    """The module behind every command of bin/ that is a Python program."""
+def programs() -> dict[str, list[str]]:
+    """The module behind every command of bin/ that is a Python program, and its first arguments."""
     found = {}
     for file in (ROOT / "bin").iterdir():
-        started = re.search(r"-m ((?:proposer_rl|benchmarks)\S*)", file.read_text(encoding="utf-8"))
+        started = re.search(
+            r'-m ((?:proposer_rl|benchmarks).*) "', file.read_text(encoding="utf-8")
+        )
         if started:
-            found[file.name] = started[1]
+            found[file.name] = started[1].split()
     return found
 
 
@@ -99,8 +101,8 @@ def test_the_arguments_are_understood(
         raise Parsed
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
-    monkeypatch.setattr(sys, "argv", [f"bin/{program}", *arguments])
-    module = programs()[program]
+    module, *first = programs()[program]
+    monkeypatch.setattr(sys, "argv", [f"bin/{program}", *first, *arguments])
     main = importlib.import_module(
         f"{module}.__main__" if (ROOT / module.replace(".", "/")).is_dir() else module
     ).main

@@ -113,7 +113,7 @@ def _evaluate_parser() -> argparse.ArgumentParser:
 
 
 def _steps(text: str) -> int:
-    number = _positive(text)
+    number = positive(text)
     if number > MOST_STEPS:
         raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_STEPS:,}, got {number}")
     return number
@@ -129,12 +129,12 @@ def _foresight_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
-        "--ahead", type=_positive, nargs="+", default=[1, 5, 20, 50],
+        "--ahead", type=positive, nargs="+", default=[1, 5, 20, 50],
         help="numbers of updates after which gains are measured (1 5 20 50)",
     )  # fmt: skip
-    parser.add_argument("--proposals", type=_positive, default=16, help="different mixtures (16)")
-    parser.add_argument("--copies", type=_positive, default=2, help="copies of each (2)")
-    parser.add_argument("--levels", type=_positive, default=512, help="of the target (512)")
+    parser.add_argument("--proposals", type=positive, default=16, help="different mixtures (16)")
+    parser.add_argument("--copies", type=positive, default=2, help="copies of each (2)")
+    parser.add_argument("--levels", type=positive, default=512, help="of the target (512)")
     parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
     parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     parser.set_defaults(files={"output": (".json",)})
@@ -169,12 +169,12 @@ def _snr_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
-        "--meta-episode-length", type=_positive, help="updates of an episode; the run's"
+        "--meta-episode-length", type=positive, help="updates of an episode; the run's"
     )
-    parser.add_argument("--proposals", type=_positive, default=8, help="different proposals (8)")
-    parser.add_argument("--copies", type=_positive, default=3, help="copies of each (3)")
+    parser.add_argument("--proposals", type=positive, default=8, help="different proposals (8)")
+    parser.add_argument("--copies", type=positive, default=3, help="copies of each (3)")
     parser.add_argument(
-        "--levels", type=_positive, nargs="+", default=[75, 256, 1024],
+        "--levels", type=positive, nargs="+", default=[75, 256, 1024],
         help="sizes of the validation batch (75 256 1024)",
     )  # fmt: skip
     parser.add_argument(
@@ -191,13 +191,19 @@ def _snr_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """An argument's whole number of at least 1."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
     return number
 
 
+def main() -> None:
+    """What the commands in ``bin/`` start; the first argument is the command's name."""
+    named = {"eval": evaluate, "foresight": foresight, "look": look, "snr": snr}
+    named[sys.argv[1]](sys.argv[2:])
+
+
 if __name__ == "__main__":
-    # bin/ gives the command's name first.
-    {"eval": evaluate, "foresight": foresight, "look": look, "snr": snr}[sys.argv[1]](sys.argv[2:])
+    main()
