@@ -15,31 +15,45 @@ from proposer_rl.streams import Streams
 
 
 def throughput(options: Options) -> Result:
-    """Throughput per worker of two against one, each on one core of this machine."""
-    scale = TINY if options.tiny else QUICK
+    """Throughput per worker of two against one, each on one core of this machine.
+
+    A worker of two has half of the copies, over which what an update costs whatever their number is
+    shared by fewer. What the workers themselves cost is seen against one process with that many.
+    """
+    scale = TINY.but("proposer.rollouts=4") if options.tiny else QUICK
     engines = ["multiprocess"]
     if not options.tiny and find_spec("ray") is not None:
         engines.append("ray")
     rows, lines = [], []
-    copies = f"K = {scale.config.proposer.rollouts}, {scale.name} values"
+    number = scale.config.proposer.rollouts
+    half = scale.but(f"proposer.rollouts={number // 2}")
+    copies = f"K = {number}, {scale.name} values"
     for engine in engines:
         with threads(1), _cluster(engine), ExitStack() as stack:
             rounds = {
                 "one process": _cycle(scale, options, stack),
+                "one process, half of the copies": _cycle(half, options, stack),
                 "one worker": _cycle(scale, options, stack, *_workers(engine, 1, options)),
                 "two workers": _cycle(scale, options, stack, *_workers(engine, 2, options)),
             }
             seconds = interleave(rounds, options.few, options.device)
-        rows.append(
+        against = {
+            "of one worker": ratio(seconds["one worker"], seconds["two workers"], 0.5),
+            "of a process with half of the copies": ratio(
+                seconds["one process, half of the copies"], seconds["two workers"]
+            ),
+        }
+        rows += [
             Row(
                 f"throughput per worker of two {engine} workers, {copies}",
-                "of one worker",
-                ratio(seconds["one worker"], seconds["two workers"], 0.5),
+                reference,
+                measured,
                 "x",
                 target=0.95 if engine == "multiprocess" else None,
                 samples=seconds,
             )
-        )
+            for reference, measured in against.items()
+        ]
         lines += [[engine, name, f"{Spread.of(s).median:.2f}"] for name, s in seconds.items()]
     title = f"Rollouts of the copies of a cycle, {copies}, one core each"
     return Result(rows, [Table(title, ["engine", "where", "seconds"], lines)])
