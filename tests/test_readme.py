@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
+from proposer_rl.report.generalisation import write_scores
 from tests.gymnasium_task.toys import TINY
 from tests.report.folders import write_run
 
@@ -62,10 +64,11 @@ def test_the_commands_run(
         small += TINY
     if any(word.startswith("+sweep=") for word in small):
         # Of a sweep one run, in this process: there may be no cluster here. An ablation is one of
-        # the sweep's own method.
-        small = [word for word in small if not re.search(r"launcher|^seed=|^\+method=", word)]
-        one = [] if any(word.startswith("+ablation") for word in small) else ["+method=target"]
-        small += ["seed=0", *one]
+        # the method that is given, or else of the sweep's own.
+        ablation = any(word.startswith("+ablation") for word in small)
+        given = r"launcher|^seed=" if ablation else r"launcher|^seed=|^\+method="
+        small = [word for word in small if not re.search(given, word)]
+        small += ["seed=0", *([] if ablation else ["+method=target"])]
     monkeypatch.chdir(tmp_path)
     before = [
         ["+method=perf_gain", "+scale=smoke", word.replace("checkpoint", "hydra.run.dir")]
@@ -89,7 +92,13 @@ def test_the_commands_about_runs_run(
     for folder in {arguments[0] for arguments in found}:
         write_run(tmp_path / folder / "run")
     for arguments in found:
+        if "--scores" in arguments:
+            scores = Path(arguments[arguments.index("--scores") + 1])
+            scores.parent.mkdir(parents=True, exist_ok=True)
+            scores.write_bytes(write_scores([]))
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
+        if "--scores" in arguments:  # no report goes into a folder with other files in it
+            scores.unlink()
 
 
 def test_the_commands_about_levels_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,6 +114,11 @@ def test_the_commands_about_levels_run(tmp_path: Path, monkeypatch: pytest.Monke
     found = commands("bin/eval")
     assert found
     for arguments in found:
+        if arguments[0] != "my_run":  # a folder with runs in it
+            shutil.copytree("my_run", Path(arguments[0], "run"), dirs_exist_ok=True)
+        output = Path(arguments[arguments.index("-o") + 1] if "-o" in arguments else "none.csv")
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.unlink(missing_ok=True)  # what an earlier command wrote may be of another kind
         evaluate_main(arguments)
     assert Path("scores.csv").is_file() and Path("paths.png").is_file()
 

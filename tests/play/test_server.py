@@ -18,7 +18,7 @@ import torch
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.evaluate import evaluate
+from proposer_rl.cli.evaluate import evaluate, load
 from proposer_rl.cli.stored import checkpoints, read_checkpoint, restored
 from proposer_rl.mazes.level_files import levels_to_text, read_levels, shipped_levels
 from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
@@ -121,7 +121,7 @@ def test_every_checkpoint_is_examined_as_the_command_does(
     successes = set()
     for number, file in enumerate(checkpoints(page.run), 1):
         told = asked(page, "examine", {**EXAMINE, "checkpoint": number, "solver": solver})
-        found = evaluate(file, str(tmp_path / "drawn.txt"))
+        found = evaluate(load(file), str(tmp_path / "drawn.txt"))
         assert told["updates"] == found.updates == 2 * number
         results = found.scores[solver].results
         for name in ("success", "return"):
@@ -139,7 +139,7 @@ def test_a_solver_with_memory_is_examined_as_the_command_does(
         question = {"checkpoint": number, "solver": 0, "rows": rows}
         told = asked(view_page, "examine", question)
         assert told == asked(view_page, "examine", question)
-        (score,) = evaluate(file, str(tmp_path / "drawn.txt")).scores
+        (score,) = evaluate(load(file), str(tmp_path / "drawn.txt")).scores
         for name in ("success", "return"):
             assert told["results"][name] == pytest.approx(score.results[name], abs=1e-5)
         paths = told["paths"]
