@@ -24,6 +24,7 @@ EXPLORATIONS = {
     "uneven": "Very uneven mixtures, Dirichlet(0.15) over all bins, held for the episode.",
 }
 MEASURES = ("return", "log_success")
+STAGES = "A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000."
 
 
 def evaluate(arguments: Sequence[str] | None = None) -> None:
@@ -125,7 +126,7 @@ def _foresight_parser() -> argparse.ArgumentParser:
         description="Compare first-order gain with what training brings: from every checkpoint, "
         "copies of the Solver train on different mixtures, and their gains on the target after "
         "some updates are held against those predicted without any training.",
-        epilog="A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
+        epilog=STAGES,
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
@@ -135,10 +136,7 @@ def _foresight_parser() -> argparse.ArgumentParser:
     parser.add_argument("--proposals", type=positive, default=16, help="different mixtures (16)")
     parser.add_argument("--copies", type=positive, default=2, help="copies of each (2)")
     parser.add_argument("--levels", type=positive, default=512, help="of the target (512)")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
-    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
-    parser.set_defaults(files={"output": (".json",)})
-    return parser
+    return _writing_rows(parser, "of all draws")
 
 
 def _look_parser() -> argparse.ArgumentParser:
@@ -147,14 +145,11 @@ def _look_parser() -> argparse.ArgumentParser:
         description="Shows what a Proposer proposes to Solvers at several stages of training, and "
         "what changes when it is shown the probes or the return of another Solver. If nothing "
         "does, it does not look.",
-        epilog="A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
+        epilog=STAGES,
     )
     parser.add_argument("proposer", type=Path, help="folder of a run with a Proposer")
     parser.add_argument("solvers", type=Path, help="folder of a run; all its checkpoints are shown")
-    parser.add_argument("--seed", type=int, default=0, help="of the levels it looks at (0)")
-    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
-    parser.set_defaults(files={"output": (".json",)})
-    return parser
+    return _writing_rows(parser, "of the levels it looks at")
 
 
 def _snr_parser() -> argparse.ArgumentParser:
@@ -165,7 +160,7 @@ def _snr_parser() -> argparse.ArgumentParser:
         "several copies each; an analysis of variance splits their gains into signal and noise.",
         epilog="Explorations: "
         + " ".join(f"{name}: {about}" for name, about in EXPLORATIONS.items())
-        + " A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000.",
+        + f" {STAGES}",
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
@@ -185,7 +180,12 @@ def _snr_parser() -> argparse.ArgumentParser:
         "--measures", nargs="+", choices=MEASURES,
         help="what gain is counted in (both, as far as the task tells them)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (0)")
+    return _writing_rows(parser, "of all draws")
+
+
+def _writing_rows(parser: argparse.ArgumentParser, seed: str) -> argparse.ArgumentParser:
+    """With the options of every instrument whose answer is rows; what the seed is of."""
+    parser.add_argument("--seed", type=int, default=0, help=f"{seed} (0)")
     parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     parser.set_defaults(files={"output": (".json",)})
     return parser

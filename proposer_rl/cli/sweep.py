@@ -22,12 +22,11 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from proposer_rl.report.progress import FAILURE, find_progress
-from proposer_rl.report.sweeps import left
+from proposer_rl.report.sweeps import PLAN, left
 from proposer_rl.report.terminal import overview
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.lock import InUseError
 
-PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder
 LARGEST_PLAN, MOST_RUNS = 2**20, 10_000
 
 

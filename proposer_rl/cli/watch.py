@@ -15,7 +15,7 @@ from rich.text import Text
 
 from proposer_rl.cli.errors import command
 from proposer_rl.report.progress import find_progress
-from proposer_rl.report.sweeps import left
+from proposer_rl.report.sweeps import PLAN, left
 from proposer_rl.report.terminal import overview, screen
 
 EPILOG = """\
@@ -50,13 +50,13 @@ def draw(folder: Path) -> RenderableType:
         UnreadableRun: if there is nothing to look at.
     """
     found = find_progress(folder)
-    if len(found) == 1:
-        return screen(found[0])
-    # It takes a while to import, and a single run has no plan.
-    from proposer_rl.cli.sweep import planned
+    shown = screen(found[0]) if len(found) == 1 else overview(found)
+    if not (folder / PLAN).exists():
+        return shown
+    from proposer_rl.cli.sweep import planned  # only now: it takes a while
 
     rest = left(folder, planned(folder))
-    return overview(found) if rest is None else Group(overview(found), Text(rest.text()))
+    return shown if rest is None else Group(shown, Text(rest.text()))
 
 
 def _parser() -> argparse.ArgumentParser:

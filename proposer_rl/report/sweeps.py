@@ -16,6 +16,7 @@ from proposer_rl.report.records import number
 from proposer_rl.report.runs import begun
 from proposer_rl.runs.status import FILE, duration
 
+PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder
 SUMMARY = "summary.json"
 LARGEST_FILE = 2**20
 GOING = 600.0  # seconds since a run that goes on has said so

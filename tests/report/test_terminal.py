@@ -118,6 +118,7 @@ def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> Non
     runs = [("target", 4, 100.0), ("plr", 4, 1000.0), ("plr", 5, 3000.0)]
     for method, seed, seconds in runs:
         finish(write_planned(tmp_path, method, seed), seconds)
+        assert "sweep: " in watch(capsys, str(tmp_path))  # of the first run, too
     assert sorted(planned(tmp_path)) == sorted(
         (f"seed={seed}", f"+method={method}")
         for seed in (4, 5)
