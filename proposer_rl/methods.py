@@ -17,6 +17,7 @@ from torch import nn
 from torch.distributions import Distribution
 
 from proposer_rl.curricula import (
+    Choice,
     Curriculum,
     FirstOrderCurriculum,
     FirstOrderProposer,
@@ -58,6 +59,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
 Made = TypeVar("Made", bound=Curriculum)
+Choose = Mapping[str, Any] | None
 
 
 class Workers(NamedTuple):
@@ -94,23 +96,26 @@ class Parts(NamedTuple):
     workers: Workers | None = None
 
 
-def target(parts: Parts) -> Curriculum:
+def target(parts: Parts, choose: Choose = None) -> Curriculum:
     """Train on the target distribution itself (the paper's baseline)."""
-    return SamplingCurriculum(parts.task.target)
+    return SamplingCurriculum(parts.task.target, _choice(parts.task, choose))
 
 
-def domain_randomization(parts: Parts) -> Curriculum:
+def domain_randomization(parts: Parts, choose: Choose = None) -> Curriculum:
     """Train on levels drawn evenly from the Proposer's space."""
-    return SamplingCurriculum(parts.task.space)
+    return SamplingCurriculum(parts.task.space, _choice(parts.task, choose))
 
 
-def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -> Curriculum:
+def schedule(
+    parts: Parts, distributions: Sequence[str], until: Sequence[int], choose: Choose = None
+) -> Curriculum:
     """Train on named distributions one after another: a curriculum by hand.
 
     Args:
         parts: the task.
         distributions: names, in order.
         until: updates after which each but the last ends.
+        choose: see :func:`_choice`.
 
     Raises:
         ValueError: for an unknown name, or as :class:`ScheduleCurriculum`.
@@ -119,7 +124,10 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
     unknown = [name for name in distributions if name not in known]
     if unknown:
         raise ValueError(f"distributions must be among {sorted(known)}, got {unknown}")
-    return ScheduleCurriculum([SamplingCurriculum(known[name]) for name in distributions], until)
+    choice = _choice(parts.task, choose)
+    return ScheduleCurriculum(
+        [SamplingCurriculum(known[name], choice) for name in distributions], until
+    )
 
 
 def proposer(
@@ -202,20 +210,40 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
     )
 
 
-def _of_task(make: Callable[..., Made]) -> Callable[..., Made]:
-    """Makes the factory of a curriculum that needs the task alone, and numbers of its own."""
+def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
+    """Train on draws from Gaussians; see :class:`MixtureCurriculum` for the numbers."""
+    return MixtureCurriculum(parts.task, **numbers)
 
-    def factory(parts: Parts, **numbers: Any) -> Made:
-        return make(parts.task, **numbers)
+
+def _of_bins(make: Callable[..., Made]) -> Callable[..., Made]:
+    """Makes the factory of a curriculum over bins, which takes numbers of its own."""
+
+    def factory(parts: Parts, choose: Choose = None, **numbers: Any) -> Made:
+        return make(parts.task, choice=_choice(parts.task, choose), **numbers)
 
     return factory
 
 
-first_order_gain = _of_task(FirstOrderCurriculum)
-first_order_sampled = _of_task(SampledFirstOrderCurriculum)
-learning_progress = _of_task(LearningProgressCurriculum)
-alp_gmm = _of_task(MixtureCurriculum)
-currot = _of_task(TransportCurriculum)
+first_order_gain = _of_bins(FirstOrderCurriculum)
+first_order_sampled = _of_bins(SampledFirstOrderCurriculum)
+learning_progress = _of_bins(LearningProgressCurriculum)
+currot = _of_bins(TransportCurriculum)
+
+
+def _choice(task: Task, choose: Choose) -> Choice | None:
+    """Which of more levels are trained on.
+
+    ``choose`` has ``score``, ``source`` and ``rollouts`` of :class:`Scorer`, ``times`` and
+    ``temperature`` of :class:`Choice`; None for all.
+    """
+    if choose is None:
+        return None
+    numbers = dict(choose)
+    try:
+        scorer = Scorer(task, *(numbers.pop(name) for name in ("score", "source", "rollouts")))
+        return Choice(scorer, **numbers)
+    except ValueError as error:
+        raise ValueError(f"choose.{error}") from error
 
 
 def replay(
@@ -257,7 +285,7 @@ def learnability(
 
 
 def first_order_proposer(
-    parts: Parts, target_levels: int, batches: int, **numbers: Any
+    parts: Parts, target_levels: int, choose: Choose = None, **numbers: Any
 ) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
@@ -265,7 +293,7 @@ def first_order_proposer(
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
             them the probes, the network and PPO's other numbers.
         target_levels: see :class:`FirstOrderProposer`.
-        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
+        choose: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
@@ -274,17 +302,17 @@ def first_order_proposer(
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        batches=batches,
+        choice=_choice(parts.task, choose),
         target_levels=target_levels,
     )
 
 
-def paired(parts: Parts, batches: int, **numbers: Any) -> PairedProposer:
+def paired(parts: Parts, choose: Choose = None, **numbers: Any) -> PairedProposer:
     """Train on the draws of a policy that is paid the regret against a second Solver.
 
     Args:
         parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
-        batches: see :class:`~proposer_rl.curricula.ProblemProposer`.
+        choose: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
@@ -293,7 +321,7 @@ def paired(parts: Parts, batches: int, **numbers: Any) -> PairedProposer:
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        batches=batches,
+        choice=_choice(parts.task, choose),
         streams=Streams(parts.seeds[0], "antagonist"),
     )
 

@@ -211,7 +211,6 @@ WRONG = [
         "'my_parts'; if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
     ),
     ("curriculum._target_=os.system", "curriculum: Target 'os.system' is blocklisted"),
-    ("curriculum._target_=builtins.len", "curriculum: must make a Curriculum, but makes int"),
     ("+curriculum.x=1", "curriculum: target() got an unexpected"),
 ]
 WRONG_COMMANDS = [
@@ -247,6 +246,27 @@ WRONG_COMMANDS = [
     ),
     (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
     (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
+    (
+        ["+method=task_difficulty", *SMOKE, "curriculum._target_=builtins.len"],
+        "curriculum: must make a Curriculum, but makes int",
+    ),
+    (
+        ["+choose=learnability", "+method=target"],
+        "+method: must come before +choose, or it would undo it",
+    ),
+    (["+method=plr", *SMOKE, "+choose=learnability"], "unexpected keyword argument 'choose'"),
+    (
+        ["+method=target", *SMOKE, "+choose=learnability", "curriculum.choose.times=1"],
+        "curriculum: choose.times must be a whole number from 2 to 1,000,000, got 1",
+    ),
+    (
+        ["+method=target", *SMOKE, "+choose=learnability", "curriculum.choose.score=luck"],
+        "curriculum: choose.score='luck': from source=exact there are",
+    ),
+    (
+        ["task=cartpole", "+method=target", "+choose=learnability"],
+        "curriculum: choose.source=exact: GymnasiumTask tells performance by playing",
+    ),
     (["+score=sampled", "+method=sfl"], "+method: must come before +score, or it would undo it"),
     (
         ["+method=perf_gain", *SMOKE, "proposer.advance=best", "schedule.cycle_length=5"],

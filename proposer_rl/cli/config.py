@@ -195,7 +195,7 @@ def check_order(given: Sequence[str]) -> None:
     changed_by = None
     for override in given:
         group = override.partition("=")[0]
-        if group in ("+ablation", "+as", "+score"):
+        if group in ("+ablation", "+as", "+score", "+choose"):
             changed_by = changed_by or group
         elif group in ("+method", "+scale") and changed_by is not None:
             raise ConfigError(f"{group}: must come before {changed_by}, or it would undo it")

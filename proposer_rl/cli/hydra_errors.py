@@ -14,7 +14,7 @@ from proposer_rl.extras import install_command
 
 LAUNCHERS = [f"hydra/launcher/{name}" for name in ("joblib", "submitit_local", "submitit_slurm")]
 # Groups of which nothing is chosen until a command does.
-ADDED = ("method", "scale", "ablation", "as", "score", "sweep")
+ADDED = ("method", "scale", "ablation", "as", "score", "choose", "sweep")
 _NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
 
 

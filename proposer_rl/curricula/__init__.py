@@ -2,6 +2,7 @@
 
 from proposer_rl.curricula.alp_gmm import MixtureCurriculum
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.first_order import (
     FirstOrderCurriculum,
@@ -21,6 +22,7 @@ from proposer_rl.curricula.selection import SelectionCurriculum
 
 __all__ = [
     "Advance",
+    "Choice",
     "Curriculum",
     "FirstOrderCurriculum",
     "FirstOrderProposer",

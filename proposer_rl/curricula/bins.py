@@ -11,6 +11,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.checks import whole
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.streams import Streams
@@ -25,6 +26,7 @@ class BinCurriculum(Curriculum):
     Args:
         task: whose space has the bins.
         every: updates between two looks at the Solvers.
+        choice: of the levels that are trained on, among several times as many; None for all.
 
     Raises:
         ValueError: if a number is out of range.
@@ -33,8 +35,9 @@ class BinCurriculum(Curriculum):
     told: ClassVar[Sequence[str]] = ("score",)
     """Scores that are told of each cycle."""
 
-    def __init__(self, task: Task, *, every: int) -> None:
+    def __init__(self, task: Task, *, every: int, choice: Choice | None = None) -> None:
         self.task = task
+        self._choice = choice
         self._every = whole("every", every, 1)
         self.begin()
 
@@ -52,13 +55,18 @@ class BinCurriculum(Curriculum):
         """Of the bins in the next batch, float [K, N]; they add up to one."""
 
     def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P], drawn systematically from the shares."""
+        """Levels [K, P], drawn systematically from the shares, or chosen among such."""
         first = not self.scores
         cost = self.look(learner, streams) if first or updates % self._every == 0 else (0, 0)
         draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
-        self._choices = systematic_draw(self.shares(), self.task.batch_size, draws)
+        count = self.task.batch_size * (self._choice.times if self._choice else 1)
+        self._choices = systematic_draw(self.shares(), count, draws)
+        proposal = Proposal(self.task.space.generate(self._choices, levels), *cost)
+        if self._choice:
+            index, proposal = self._choice(learner, proposal, streams)
+            self._choices = self._choices.gather(1, index)
         self._proposed += self._choices.flatten().bincount(minlength=len(self._proposed))
-        return Proposal(self.task.space.generate(self._choices, levels), *cost)
+        return proposal
 
     def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
         """Tell of the last cycle: counts, and of each Solver scores and how even its shares are."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from proposer_rl.curricula.base import Improvement
 from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.checks import real
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.probes import Probes
 from proposer_rl.curricula.transport import step_towards
 from proposer_rl.learning import PPO
@@ -46,6 +47,7 @@ class TransportCurriculum(BinCurriculum):
         every: updates between two looks at the Solvers.
         probes: levels of each bin.
         measure: of performance, ``"success"`` or ``"return"``.
+        choice: see :class:`BinCurriculum`.
 
     Raises:
         TypeError: if the task does not say where its target lies.
@@ -63,6 +65,7 @@ class TransportCurriculum(BinCurriculum):
         every: int = 5,
         probes: int = 16,
         measure: str = "success",
+        choice: Choice | None = None,
     ) -> None:
         located = require_target(task)
         self._delta = real("delta", delta)
@@ -73,7 +76,7 @@ class TransportCurriculum(BinCurriculum):
         places = task.space.coordinates.double()
         self._costs = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
         self._costs = self._costs.square()
-        super().__init__(task, every=every)
+        super().__init__(task, every=every, choice=choice)
 
     def begin(self) -> None:
         """Forget the last Solver: its distribution and its probes."""

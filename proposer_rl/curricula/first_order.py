@@ -11,6 +11,7 @@ from torch import Tensor
 from proposer_rl.curricula.base import Improvement
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.checks import part, real
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO, Update
 from proposer_rl.meta.first_order import (
     advantages,
@@ -37,15 +38,24 @@ class _AlignedBins(BinCurriculum):
         every: updates between two looks at the Solvers.
         temperature: of the shares.
         smoothing: share of the old score in the average.
+        choice: see :class:`BinCurriculum`.
 
     Raises:
         ValueError: if a number is out of range.
     """
 
-    def __init__(self, task: Task, *, every: int, temperature: float, smoothing: float) -> None:
+    def __init__(
+        self,
+        task: Task,
+        *,
+        every: int,
+        temperature: float,
+        smoothing: float,
+        choice: Choice | None,
+    ) -> None:
         self._temperature = real("temperature", temperature, above=0)
         self.smoothing = part("smoothing", smoothing, below_one=True)
-        super().__init__(task, every=every)
+        super().__init__(task, every=every, choice=choice)
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
@@ -69,6 +79,7 @@ class FirstOrderCurriculum(_AlignedBins):
         candidates: levels C of each bin.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
+        choice: see :class:`BinCurriculum`.
 
     Raises:
         TypeError: if the task's performance has no gradients.
@@ -79,12 +90,13 @@ class FirstOrderCurriculum(_AlignedBins):
         self,
         task: Task,
         *,
-        every: int = 1,
+        every: int = 2,
         target_levels: int = 128,
         candidates: int = 8,
         temperature: float = 0.1,
-        smoothing: float = 0.95,
+        smoothing: float = 0.9,
         measure: str = "log_success",
+        choice: Choice | None = None,
     ) -> None:
         exact = require_gradients(task)
         if min(target_levels, candidates) < 1:
@@ -92,7 +104,9 @@ class FirstOrderCurriculum(_AlignedBins):
                 "target_levels and candidates must be at least 1, got "
                 f"{target_levels}, {candidates}"
             )
-        super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
+        super().__init__(
+            task, every=every, temperature=temperature, smoothing=smoothing, choice=choice
+        )
         self._exact = exact
         self._target_levels = target_levels
         self._candidates = candidates
@@ -147,6 +161,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
             s its averaged score.
         smoothing: share of the old score in the average.
         exploration: part of each batch that is drawn evenly.
+        choice: see :class:`BinCurriculum`.
 
     Raises:
         ValueError: if a number is out of range.
@@ -160,8 +175,11 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         temperature: float = 0.1,
         smoothing: float = 0.9,
         exploration: float = 0.2,
+        choice: Choice | None = None,
     ) -> None:
-        super().__init__(task, every=every, temperature=temperature, smoothing=smoothing)
+        super().__init__(
+            task, every=every, temperature=temperature, smoothing=smoothing, choice=choice
+        )
         self._exploration = part("exploration", exploration)
 
     def begin(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.first_order import require_gradients
 from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
 from proposer_rl.learning import PPO
@@ -20,7 +21,7 @@ class FirstOrderProposer(ProblemProposer):
         agent: see :class:`ProblemProposer`.
         settings: the same.
         probe_levels: probes C.
-        batches: see :class:`ProblemProposer`.
+        choice: see :class:`ProblemProposer`.
         target_levels: fresh levels E of the target that the direction is taken from.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
@@ -36,12 +37,12 @@ class FirstOrderProposer(ProblemProposer):
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
-        batches: int = 1,
+        choice: Choice | None = None,
         target_levels: int = 256,
         measure: str = "log_success",
     ) -> None:
         self._exact = require_gradients(task)
-        super().__init__(task, agent, settings, probe_levels=probe_levels, batches=batches)
+        super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
         self._target_levels, self._measure = target_levels, measure
 
     def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.checks import one_of, part
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.probes import Probes
 from proposer_rl.learning import PPO, Update, first_episode_return, first_episode_success
 from proposer_rl.streams import Streams
@@ -44,6 +45,7 @@ class LearningProgressCurriculum(BinCurriculum):
             which is of probabilities.
         fast, slow: share of the old in either average.
         exploration: part of each batch that is drawn evenly.
+        choice: see :class:`BinCurriculum`.
 
     Raises:
         ValueError: if a value is out of range.
@@ -62,13 +64,14 @@ class LearningProgressCurriculum(BinCurriculum):
         fast: float = 0.9,
         slow: float = 0.9,
         exploration: float = 0.2,
+        choice: Choice | None = None,
     ) -> None:
         self._source = one_of("source", source, SOURCES)
         self._probes = Probes(task, probes, measure)
         self._fast = part("fast", fast, below_one=True)
         self._slow = part("slow", slow, below_one=True)
         self._exploration = part("exploration", exploration)
-        super().__init__(task, every=every)
+        super().__init__(task, every=every, choice=choice)
 
     def begin(self) -> None:
         """Forget the last Solver: its averages, its episodes and its probes."""

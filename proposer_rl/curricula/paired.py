@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
 from proposer_rl.learning import PPO, Update
 from proposer_rl.models import ActorCritic
@@ -33,7 +34,7 @@ class PairedProposer(ProblemProposer):
         agent: see :class:`ProblemProposer`.
         settings: the same.
         probe_levels: probes C.
-        batches: see :class:`ProblemProposer`.
+        choice: see :class:`ProblemProposer`.
         streams: that the antagonist's weights are drawn from.
     """
 
@@ -45,9 +46,9 @@ class PairedProposer(ProblemProposer):
         *,
         streams: Streams,
         probe_levels: int = 16,
-        batches: int = 1,
+        choice: Choice | None = None,
     ) -> None:
-        super().__init__(task, agent, settings, probe_levels=probe_levels, batches=batches)
+        super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
         self.antagonist = task.learner([streams])
         self._newborn = self.antagonist.snapshot()
 

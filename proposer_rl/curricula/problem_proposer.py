@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import PPOSettings
@@ -41,8 +42,8 @@ class ProblemProposer(Curriculum):
     At every update the policy sees what the Solver would do on probe levels of the target, draws
     the bin of each problem, and is paid for each, standardised over all that it drew. A few
     gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7),
-    with no critic. What problems are worth is known before anybody trains on them, so that one may
-    draw more batches than the Solver can train on, and learn from all.
+    with no critic. What problems are worth is known before anybody trains on them: where the Solver
+    trains on a choice among more of them, the policy learns from all that it drew.
 
     Args:
         task: whose target is seen, and whose space has the bins.
@@ -51,10 +52,7 @@ class ProblemProposer(Curriculum):
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
-        batches: drawn and paid B at every update; the Solver trains on the first.
-
-    Raises:
-        ValueError: if there is no batch.
+        choice: of the levels that are trained on, among several times as many draws; None for all.
     """
 
     def __init__(
@@ -64,13 +62,11 @@ class ProblemProposer(Curriculum):
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
-        batches: int = 1,
+        choice: Choice | None = None,
     ) -> None:
-        if batches < 1:
-            raise ValueError(f"batches must be at least 1, got {batches}")
         self.agent, self.task = agent, task
         self._settings = settings
-        self._batches = batches
+        self._choice = choice
         self._probe_levels = probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
@@ -94,7 +90,7 @@ class ProblemProposer(Curriculum):
         """What each of the levels [1, E] is worth to the Solver, who has not trained on it yet."""
 
     def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [1, P] of the policy's draws, from which it has learnt already.
+        """Levels [1, P] of the policy's draws, from all of which it has learnt already.
 
         Raises:
             ValueError: for several Solvers: a Proposer learns from one.
@@ -107,12 +103,12 @@ class ProblemProposer(Curriculum):
         with torch.no_grad():
             seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [1])
             policy = agent.distribution(agent(seen.copy()))
-            shape = (self._batches, task.batch_size)
+            shape = (self._choice.times if self._choice else 1, task.batch_size)
             noise = torch.rand(shape, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(task.device))  # [B, P]
+            choices = draw(policy, noise.to(task.device))  # [times, P]
             log_prob = policy.log_prob(choices)
-        bins = choices.cpu()
-        levels = task.space.generate(bins.view(1, -1), [stream.generator("levels")])
+        bins = choices.cpu().view(1, -1)
+        levels = task.space.generate(bins, [stream.generator("levels")])
         worth = self.worth(learner, levels, stream)
         played = TensorDict(
             {
@@ -123,9 +119,13 @@ class ProblemProposer(Curriculum):
             shape,
         )
         self._learn(seen, played)
-        self._proposed += bins[0].bincount(minlength=len(self._proposed))
         self._told |= worth.told
-        return Proposal(levels[:, : task.batch_size], worth.frames, worth.evaluations)
+        proposal = Proposal(levels, worth.frames, worth.evaluations)
+        if self._choice:
+            index, proposal = self._choice(learner, proposal, streams)
+            bins = bins.gather(1, index)
+        self._proposed += bins.flatten().bincount(minlength=len(self._proposed))
+        return proposal
 
     def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
         """Tell of the last cycle."""

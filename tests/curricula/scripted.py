@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.curricula.base import Curriculum
+from proposer_rl.curricula.scores import Scored, Scorer, unseen
 from proposer_rl.learning.ppo import Update
 from proposer_rl.streams import Streams
 
@@ -54,3 +55,15 @@ def step(curriculum: Curriculum, task: Scripted, update: int, *seeds: int) -> Te
     levels = curriculum.propose(task, update, streams).levels
     curriculum.observe(task, levels, played(task.agent.skills.gather(1, levels)))
     return levels
+
+
+class GivenScores(Scorer):
+    """Scores levels [K, n], whatever they are, by numbers [K, n] that a test gives."""
+
+    from_episodes = False
+
+    def __init__(self, numbers: Tensor) -> None:
+        self._numbers = numbers.double()
+
+    def ask(self, learner: Any, levels: Any, streams: Any, *purpose: Any) -> tuple[Scored, int]:
+        return Scored(self._numbers, *unseen(levels.shape)), levels.shape[1]

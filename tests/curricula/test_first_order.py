@@ -68,7 +68,7 @@ def test_shares_follow_the_known_alignments() -> None:
 
 def test_scores_are_averaged_over_time_and_forgotten_by_a_fresh_solver() -> None:
     task = Skills(1, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum = FirstOrderCurriculum(task, measure="return", smoothing=0.75)
+    curriculum = FirstOrderCurriculum(task, measure="return", every=1, smoothing=0.75)
     curriculum.propose(task, 0, [Streams(0)])
     first = curriculum.state_dict()["scores"]["score"]
     task.wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])

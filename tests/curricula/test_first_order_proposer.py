@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from proposer_rl.curricula import Choice
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
 from proposer_rl.learning.ppo import PPOSettings
 from proposer_rl.models import (
@@ -23,6 +24,7 @@ from proposer_rl.models import (
 )
 from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.streams import Streams
+from tests.curricula.scripted import GivenScores
 from tests.curricula.test_first_order import BINS, P, Skills
 
 WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
@@ -42,14 +44,14 @@ def agent() -> ActorCritic:
     return proposer_actor_critic(network, categorical)
 
 
-def proposer(task: Seen, batches: int = 1, **settings: Any) -> FirstOrderProposer:
+def proposer(task: Seen, choice: Choice | None = None, **settings: Any) -> FirstOrderProposer:
     chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
     return FirstOrderProposer(
         task,
         agent(),
         PPOSettings(**chosen),
         probe_levels=2,
-        batches=batches,
+        choice=choice,
         target_levels=3,
         measure="return",
     )
@@ -65,21 +67,24 @@ def test_it_learns_to_choose_what_the_target_needs() -> None:
     assert (proposal.levels == 2).float().mean() > 0.8
 
 
-@pytest.mark.parametrize("batches", [1, 3])
-def test_every_problem_is_credited_with_its_own_alignment(batches: int) -> None:
-    """Also those of batches that the Solver does not train on."""
+@pytest.mark.parametrize("times", [1, 3])
+def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
+    """Also those that the Solver does not train on."""
     task = Seen(1, WANTED)
     settings = {"epochs": 1, "entropy_coeff": 0.3, "max_grad_norm": 100.0}
-    curriculum = proposer(task, batches, **settings)
+    scores = torch.arange(float(times * P)).unsqueeze(0)
+    pick = Choice(GivenScores(scores), times=times, temperature=1e-3) if times > 1 else None
+    curriculum = proposer(task, pick, **settings)
     expected = copy.deepcopy(curriculum.agent)
     proposal = curriculum.propose(task, 0, [Streams(0)])
-    assert proposal.evaluations == 3 + 2 * P * batches
+    assert proposal.evaluations == 3 + 2 * P * times + (P * times if pick else 0)
 
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(batches, P, generator=Streams(0).generator("choices"))
+    noise = torch.rand(times, P, generator=Streams(0).generator("choices"))
     choices = draw(policy, noise)
-    assert torch.equal(proposal.levels, choices[:1])
+    # Of the scores above those of the last are the highest.
+    assert sorted(proposal.levels[0].tolist()) == sorted(choices[-1].tolist())
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
@@ -88,11 +93,6 @@ def test_every_problem_is_credited_with_its_own_alignment(batches: int) -> None:
     by_hand.step()
     for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
-
-
-def test_no_batch_is_refused() -> None:
-    with pytest.raises(ValueError, match="batches must be at least 1, got 0"):
-        FirstOrderProposer(Seen(1, WANTED), agent(), PPOSettings(), batches=0)
 
 
 def test_a_resumed_proposer_goes_on_bit_by_bit() -> None:

@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from proposer_rl.curricula import (
+    Choice,
     Curriculum,
     LearningProgressCurriculum,
     MixtureCurriculum,
+    Scorer,
     TransportCurriculum,
 )
 from proposer_rl.learning import PPO
@@ -20,6 +22,7 @@ from proposer_rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, learners
 
+SCORER = Scorer(TASK, "learnability", "exact")
 K, P, N = 2, TASK.batch_size, TASK.space.size
 SMOKE = ("+scale=smoke", "compute.progress=false", "hydra.run.dir=run")
 Make = Callable[[], Curriculum]
@@ -30,6 +33,9 @@ MAKERS: dict[str, Make] = {
     "mixtures": lambda: MixtureCurriculum(TASK, warmup=8, refit=6, components=3),
     "exact mixtures": lambda: MixtureCurriculum(
         TASK, source="exact", warmup=8, refit=6, components=3
+    ),
+    "a choice": lambda: LearningProgressCurriculum(
+        TASK, probes=2, every=2, choice=Choice(SCORER, times=2, temperature=0.1)
     ),
     "transport": lambda: TransportCurriculum(TASK, delta=0.2, every=2, probes=2),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from proposer_rl.curricula import PairedProposer
+from proposer_rl.curricula import Choice, PairedProposer
 from proposer_rl.models import (
     ActorCritic,
     ProblemHead,
@@ -28,10 +28,10 @@ def agent() -> ActorCritic:
     return proposer_actor_critic(network, categorical)
 
 
-def paired(streams: Streams | None = None) -> PairedProposer:
+def paired(streams: Streams | None = None, choice: Choice | None = None) -> PairedProposer:
     settings = PPOSettings(horizon=1, learning_rate=3e-3, epochs=2)
     streams = streams or Streams(0, "antagonist")
-    return PairedProposer(TASK, agent(), settings, streams=streams, probe_levels=2)
+    return PairedProposer(TASK, agent(), settings, streams=streams, probe_levels=2, choice=choice)
 
 
 def test_it_lives_as_a_curriculum_should() -> None:
