@@ -34,6 +34,11 @@ def _parser() -> argparse.ArgumentParser:
         help="where not both are compared; auto: bf16 for the wide network if the processor has it",
     )
     parser.add_argument("--device", default="auto", help="auto (cuda where there is one), cpu, ...")
+    parser.add_argument(
+        "--jaxued",
+        metavar="PYTHON",
+        help="an interpreter that has jaxued: view measures its maze in JAX, too, on the CPU",
+    )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the paper's values throughout (longer)")
     size.add_argument("--tiny", action="store_true", help="only see that everything runs")

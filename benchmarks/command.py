@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import torch
 
+from benchmarks.peer import require_jaxued
 from benchmarks.registry import BENCHMARKS, selected
 from benchmarks.report import describe, machine, summary, versions
 from benchmarks.results import Options, Result, Size
@@ -100,7 +101,20 @@ def _options(arguments: argparse.Namespace) -> Options:
     except (RuntimeError, AssertionError) as error:
         _refuse(f"--device {device}: {str(error).splitlines()[0]}")
     size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
-    return Options(arguments.repeats, arguments.precision, device, size)
+    if arguments.jaxued is not None:
+        _check_jaxued(arguments.jaxued, arguments.names, device)
+    return Options(arguments.repeats, arguments.precision, device, size, arguments.jaxued)
+
+
+def _check_jaxued(python: str, names: list[str], device: str) -> None:
+    if names and "view" not in names:
+        _refuse(f"--jaxued {python}: is for the benchmark view, not for {', '.join(names)}")
+    if torch.device(device).type != "cpu":
+        _refuse(f"--jaxued {python}: JAX is measured on the CPU; give --device cpu, not {device}")
+    try:
+        require_jaxued(python)
+    except ValueError as error:
+        _refuse(f"--jaxued {python}: {error}; must be an interpreter that can import jaxued")
 
 
 def _list() -> None:

@@ -84,12 +84,12 @@ def _range(row: Row) -> str:
 
 
 def number(value: float, unit: Unit) -> str:
-    """A number with its unit, to about three figures."""
+    """A number with its unit, to two or three figures."""
     if unit == "%":
         return f"{100 * value:.1f} %"
     if unit == "/s":
         return f"{value:,.0f} /s"
     if unit == "ms":
         return f"{1e3 * value:.3g} ms"
-    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
+    digits = next((d for d, least in enumerate((100, 10, 0.1)) if abs(value) >= least), 3)
     return f"{value:.{digits}f}{'x' if unit == 'x' else ' ' + unit}"

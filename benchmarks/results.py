@@ -22,12 +22,14 @@ class Options:
             faster one.
         device: where the Solver and its levels live.
         size: ``tiny`` to see that everything runs, ``full`` for the paper's values throughout.
+        jaxued: an interpreter that has jaxued, to be measured beside our view maze; None for none.
     """
 
     repeats: int = 5
     precision: str = "auto"
     device: str = "cpu"
     size: Size = "normal"
+    jaxued: str | None = None
 
     @property
     def few(self) -> int:

@@ -1,11 +1,15 @@
-"""Steps per second in the field's maze: TorchRL's interface, and MiniGrid's own environment."""
+"""Steps per second in the field's maze: TorchRL's interface, MiniGrid's own, and jaxued's."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from benchmarks.environment import through_torchrl
+from benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
+from benchmarks.peer import Peer, jaxued_maze
 from benchmarks.results import Options, Result, Row
 from benchmarks.timing import interleave, rate, ratio
 from proposer_rl.mazes.view.env import ViewMazeEnv
@@ -15,10 +19,11 @@ from proposer_rl.mazes.view.levels import ViewLevel
 MAX_STEPS = 250
 WALLS = 30
 FEW = 32  # of MiniGrid's environments, whose steps take equally long in any number
+RESETS = {WRAPPER: "AutoReplayWrapper", LEAN: "resetting only what changes"}
 
 
 def view_steps(options: Options) -> Result:
-    """Random actions with resets; both must get the same rewards on the same levels."""
+    """Random actions with resets; all must get the same rewards on the same levels."""
     batch, steps, few = (FEW, 20, 20) if options.tiny else (4096, 50, 100)
     draw = torch.Generator().manual_seed(0)
     levels = scattered_walls(torch.full((batch,), WALLS), 13, 13, draw)
@@ -40,12 +45,81 @@ def view_steps(options: Options) -> Result:
     interface = f"ViewMazeEnv through TorchRL, batch {batch:,}"
     fast = rate(batch * steps, seconds["TorchRL"])
     relative = ratio(seconds["MiniGrid"], seconds["TorchRL"], batch * steps / (few * FEW))
-    return Result(
+    result = Result(
         [
             Row(interface, "random actions and resets", fast, "/s", target=1e6, samples=seconds),
             Row(f"speed of {interface}", "MiniGrid's environments", relative, "x"),
         ]
     )
+    if options.jaxued is not None:
+        longer = torch.randint(3, (few if options.tiny else 2 * MAX_STEPS, FEW), generator=draw)
+        sizes = [(levels, many), (levels[:FEW], longer)]
+        beside = beside_jaxued(
+            sizes[-1:] if options.tiny else sizes, options.jaxued, options.repeats
+        )
+        result.rows += beside.rows
+        result.notes += beside.notes
+    return result
+
+
+def beside_jaxued(sizes: list[tuple[ViewLevel, Tensor]], python: str, repeats: int) -> Result:
+    """Ours and jaxued's maze in turn, on the CPU, each with as many cores as torch has threads.
+
+    Args:
+        sizes: levels [N] and actions [T, N], int64, to play one after another.
+        python: an interpreter that has jaxued.
+        repeats: rounds of timings.
+
+    Raises:
+        AssertionError: If total rewards differ.
+        RuntimeError: As :func:`benchmarks.peer.jaxued_maze`.
+    """
+    result = Result([])
+    for levels, actions in sizes:
+        env = ViewMazeEnv(levels, max_steps=MAX_STEPS)
+        ours = float(through_torchrl(env, actions))
+        with jaxued_maze(python, levels, actions, MAX_STEPS) as peer:
+            for way in WAYS:
+                theirs = peer.play(way)[1]  # compiles, too
+                if abs(ours - theirs) > 1e-3:
+                    raise AssertionError(f"the environments differ: total rewards {(ours, theirs)}")
+            clock: dict[str, list[float]] = {way: [] for way in WAYS}
+            seconds = interleave(
+                {
+                    "TorchRL": partial(through_torchrl, env, actions),
+                    **{way: partial(_timed, peer, way, clock[way]) for way in WAYS},
+                },
+                repeats,
+            )
+        # What that process's own clock says leaves out the way there and back.
+        seconds |= {way: times[-repeats:] for way, times in clock.items()}
+        interface = f"ViewMazeEnv through TorchRL, batch {len(levels):,}"
+        result.rows.append(
+            Row(
+                interface,
+                "in turn with jaxued",
+                rate(actions.numel(), seconds["TorchRL"]),
+                "/s",
+                samples=seconds,
+            )
+        )
+        for way, reset in RESETS.items():
+            result.rows += [
+                Row(
+                    f"jaxued's Maze, batch {len(levels):,}",
+                    f"lax.scan in jit, {reset}",
+                    rate(actions.numel(), seconds[way]),
+                    "/s",
+                ),
+                Row(
+                    f"speed of {interface}",
+                    f"jaxued, {reset}",
+                    ratio(seconds[way], seconds["TorchRL"]),
+                    "x",
+                ),
+            ]
+        result.notes = [f"{peer.about}; torch with {torch.get_num_threads()} thread(s)."]
+    return result
 
 
 def through_minigrid(levels: ViewLevel, actions: Tensor) -> float:
@@ -63,3 +137,7 @@ def through_minigrid(levels: ViewLevel, actions: Tensor) -> float:
             if terminated or truncated:
                 env.reset()
     return total
+
+
+def _timed(peer: Peer, way: str, seconds: list[float]) -> None:
+    seconds.append(peer.play(way)[0])

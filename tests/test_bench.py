@@ -18,7 +18,7 @@ from benchmarks.plain import PlainPPO, PlainUNet
 from benchmarks.plain_env import PlainMaze
 from benchmarks.profiling import kind_of
 from benchmarks.registry import BENCHMARKS, measure, selected
-from benchmarks.report import summary
+from benchmarks.report import number, summary
 from benchmarks.results import Options, Result, Row, Spread
 from benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from benchmarks.timing import interleave, ratio, threads
@@ -75,6 +75,7 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
         "precision": "fp32",
         "device": "cuda" if torch.cuda.is_available() else "cpu",
         "size": "tiny",
+        "jaxued": None,
     }
     assert content["machine"]["cores"] and content["versions"]["torch"] == torch.__version__
     assert "error" in content["benchmarks"]["absent"]
@@ -206,6 +207,13 @@ def test_interleaving_alternates_and_pairs_rounds() -> None:
 def test_a_row_says_whether_its_target_is_reached(value, at_most, reached) -> None:
     row = Row("this", "that", Spread.of([value]), "x", target=2.0, at_most=at_most)
     assert summary([Result([row])]).splitlines()[-1].split("|")[-2].strip() == reached
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(208.4, "208x"), (-12.34, "-12.3x"), (0.1, "0.10x"), (0.0134, "0.013x")]
+)
+def test_a_ratio_is_shown_to_two_or_three_figures(value: float, shown: str) -> None:
+    assert number(value, "x") == shown
 
 
 @pytest.mark.parametrize(
