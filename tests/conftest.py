@@ -30,6 +30,9 @@ hypothesis.settings.load_profile("proposer_rl")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+# What tests write need not outlive the machine, and waiting for disks takes long.
+os.fsync = lambda file: None
+
 # Tensors in tests are too small for threads to pay, and tests share the machine.
 torch.set_num_threads(1)
 

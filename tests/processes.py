@@ -75,7 +75,8 @@ class Processes:
             stdout=subprocess.PIPE,
             text=True,
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            env=os.environ
+            | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'examples'}", "OMP_NUM_THREADS": "1"},
         )
 
     def __call__(self, *arguments: str, **options: Any) -> Ended:
@@ -119,7 +120,9 @@ def python(
 def serve() -> None:
     from proposer_rl.cli import train
 
-    import_module("proposer_rl.cli.run")  # what takes seconds, before the first fork
+    # What takes seconds, before the first fork. tensordict loads pandas where there is one.
+    for module in ("proposer_rl.cli.run", "proposer_rl.mazes.task", "pandas"):
+        import_module(module)
 
     for line in sys.stdin:
         values = json.loads(line)

@@ -98,3 +98,34 @@ def test_environments_keep_the_extras_that_they_have(tmp_path: Path) -> None:
 def test_the_site_needs_only_its_own_extra() -> None:
     assert "use_environment docs\n" in (BIN / "docs").read_text(encoding="utf-8")
     assert "use_environment dev\n" in (BIN / "test").read_text(encoding="utf-8")
+
+
+# A python3 with everything installed that says which module is to run, and which may fail.
+STAGES = """\
+#!/bin/sh
+case "$*" in
+  -E*) echo installed ;;
+  "-m $FAILING"*) echo "bad $FAILING"; exit 3 ;;
+  "-m "*) echo "ran $2" ;;
+esac
+"""
+
+
+@pytest.mark.parametrize("failing", ["ruff", "mypy", "sphinx", "pytest", "nothing"])
+def test_a_stage_that_fails_is_the_last_and_gives_its_status(failing: str, tmp_path: Path) -> None:
+    """Types and docs, too, which are checked side by side."""
+    file = tmp_path / "python3"
+    file.write_text(STAGES)
+    file.chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "FAILING": failing}
+    ended = subprocess.run(
+        [BIN / "test"], env=environment, capture_output=True, text=True, check=False, timeout=30
+    )
+    order = [("format", "ruff"), ("lint", "ruff"), ("types", "mypy"), ("docs", "sphinx")]
+    expected = []
+    for stage, module in [*order, ("tests", "pytest")]:
+        expected += [f"== {stage}", f"{'bad' if module == failing else 'ran'} {module}"]
+        if module == failing:
+            break
+    assert ended.stdout.splitlines() == expected
+    assert ended.returncode == (0 if failing == "nothing" else 3)

@@ -52,13 +52,6 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     assert "not reached in 6 updates (censored)" in said and "run.png" in said
 
 
-def test_the_seed_decides_everything(train) -> None:
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        assert train("+method=perf_gain", *SMOKE, f"seed={seed}", f"hydra.run.dir={name}") == 0
-    assert_same_run(Path("a"), Path("b"))
-    assert tables(Path("a")) != tables(Path("c"))
-
-
 def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:
     arguments = ["+method=target", *SMOKE, "hydra.run.dir=run"]
     assert train(*arguments) == 0

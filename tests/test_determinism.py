@@ -29,10 +29,21 @@ def _one_thread_afterwards():
     torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="module")
+def wholes() -> dict[str, Path]:
+    """Of each method the run that the others are compared with; they only read it."""
+    return {}
+
+
 @pytest.fixture
-def whole(train, method: str) -> Path:
-    assert train(f"+method={method}", *SMOKE, "hydra.run.dir=whole") == 0
-    return Path("whole")
+def whole(
+    train, method: str, wholes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    if method not in wholes:
+        folder = tmp_path_factory.mktemp(method)
+        assert train(f"+method={method}", *SMOKE, f"hydra.run.dir={folder}") == 0
+        wholes[method] = folder
+    return wholes[method]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-import time
 from pathlib import Path
 from signal import SIGKILL
 
@@ -14,50 +10,42 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from proposer_rl.cli.report import main as report
+from proposer_rl.cli.watch import main as watch
+from proposer_rl.report.levels import along_training, side_by_side
 from proposer_rl.runs.folder import read_csv
+from tests.processes import Processes
 from tests.same_run import assert_same_run
+from tests.tiny import EXAMPLES
 
-ROOT = Path(__file__).parents[1]
 TRAIN = [
-    *("-m", "proposer_rl.cli.start", "--config-dir", str(ROOT / "examples" / "conf")),
+    *("--config-dir", f"{EXAMPLES}/conf"),
     *("task=mountain_car", "+method=perf_gain", "compute.progress=false", "schedule.updates=6"),
     *("proposer.meta_episode_length=2", "proposer.action_repeat=1", "proposer.rollouts=2"),
     *("task.levels=8", "solver.ppo.horizon=10", "schedule.checkpoint_every=2"),
 ]
-ENVIRONMENT = os.environ | {
-    "PYTHONPATH": f"{ROOT / 'examples'}{os.pathsep}{ROOT}",
-    "OMP_NUM_THREADS": "1",
-}
-
-
-def call(*arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, *arguments], env=ENVIRONMENT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.mark.slow
-def test_it_trains_is_killed_goes_on_and_is_looked_at(tmp_path: Path) -> None:
+def test_it_trains_is_killed_goes_on_and_is_looked_at(
+    processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     whole, run = tmp_path / "whole", tmp_path / "run"
-    call(*TRAIN, f"hydra.run.dir={whole}")
-    process = subprocess.Popen(
-        [sys.executable, *TRAIN, f"hydra.run.dir={run}"],
-        env=ENVIRONMENT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    while not list(run.glob("checkpoints/*.pt")):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.kill()
-    assert process.wait() == -SIGKILL
-    call(*TRAIN, f"hydra.run.dir={run}")
+    ended = processes(*TRAIN, f"hydra.run.dir={whole}")
+    assert ended.code == 0, ended.output
+    # At the write that follows the first checkpoint.
+    saved = [name.startswith("replace .step_") for name in ended.writes].index(True)
+    killed = processes(*TRAIN, f"hydra.run.dir={run}", signal_at={saved + 1: int(SIGKILL)})
+    assert killed.code == -SIGKILL, killed.output
+    assert len(list(run.glob("checkpoints/*.pt"))) == 1
+    ended = processes(*TRAIN, f"hydra.run.dir={run}")
+    assert ended.code == 0, ended.output
     assert_same_run(whole, run)
     assert {"target_success", "all_success"} <= read_csv(run / "metrics.csv")[-1].keys()
-    assert "gravity" in call("-m", "proposer_rl.cli.watch", str(run), "--once")
-    call("-m", "proposer_rl.cli.report", str(run), "-o", str(tmp_path / "report"))
+    watch([str(run), "--once"])
+    assert "gravity" in capsys.readouterr().out
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [along_training, side_by_side])
+    report([str(run), "-q", "-o", str(tmp_path / "report")])
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     page = re.sub(r'<script.*?</script>|base64,[^"]*', "", page, flags=re.DOTALL)  # what is packed
     assert "mountain cars" in page and "maze" not in page.casefold()

@@ -67,9 +67,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
 
 
 def test_it_trains_and_reports_from_an_empty_folder(installed: Installed, tmp_path: Path) -> None:
-    said = installed("proposer-train", "+method=perf_gain", "+scale=smoke", folder=tmp_path)
-    assert "perf_gain, seed 0: " in said
-    (run,) = tmp_path.glob("outputs/perf_gain/*")
+    said = installed("proposer-train", "+method=target", "+scale=smoke", folder=tmp_path)
+    assert "target, seed 0: " in said
+    (run,) = tmp_path.glob("outputs/target/*")
     assert (run / "summary.json").is_file()
     hydra = yaml.safe_load((run / ".hydra" / "hydra.yaml").read_text())["hydra"]
     sources = {source["provider"]: source["path"] for source in hydra["runtime"]["config_sources"]}
@@ -79,10 +79,10 @@ def test_it_trains_and_reports_from_an_empty_folder(installed: Installed, tmp_pa
 
 
 def test_a_sweep_finds_its_configuration(installed: Installed, tmp_path: Path) -> None:
-    arguments = ["+sweep=quick", "+method=target", "+scale=smoke", "seed=0"]
+    arguments = ["+sweep=quick", "+method=perf_gain", "+scale=smoke", "seed=0"]
     installed("proposer-train", *arguments, folder=tmp_path)
     (summary,) = tmp_path.glob("sweeps/quick/*/summary.json")
-    assert summary.parent.name == "target-none-seed_0"
+    assert summary.parent.name == "perf_gain-none-seed_0"
 
 
 def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -> None:

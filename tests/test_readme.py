@@ -16,6 +16,7 @@ from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
+from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.generalisation import write_scores
 from tests.gymnasium_task.toys import TINY
 from tests.report.folders import write_run
@@ -86,8 +87,11 @@ def test_the_commands_run(
 def test_the_commands_about_runs_run(
     program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Each command with few figures: it is the words that are tested here."""
     found = commands(program)
     assert found
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [cost_curves])
+    monkeypatch.setattr("proposer_rl.report.pages.DRAWINGS", [learning_curves, cost_curves])
     monkeypatch.chdir(tmp_path)
     for folder in {arguments[0] for arguments in found}:
         write_run(tmp_path / folder / "run")

@@ -14,7 +14,6 @@ from torchrl.record.loggers import get_logger
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
-from proposer_rl.report.proposals import last_map
 from proposer_rl.report.records import numbers, picture
 from proposer_rl.settings import LoggerSettings
 
@@ -80,6 +79,8 @@ def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[n
         if tiles:
             yield name, _sheet(tiles)
     if "histogram" in row:
+        from proposer_rl.report.proposals import last_map  # figures, which other loggers need not
+
         image = last_map(path)
         if image is not None:
             yield "histogram", image

@@ -14,7 +14,6 @@ from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.checks import real
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.probes import Probes
-from proposer_rl.curricula.transport import step_towards
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
@@ -85,6 +84,8 @@ class TransportCurriculum(BinCurriculum):
 
     def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
         """Move the distributions, each by its own Solver's performance on the probes."""
+        from proposer_rl.curricula.transport import step_towards  # SciPy's solvers: no other needs
+
         performance, evaluations = self._probes.performance(learner, streams)
         best = performance.amax(-1, keepdim=True)
         allowed = performance >= best.clamp(max=self._delta)

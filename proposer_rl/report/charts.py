@@ -11,11 +11,12 @@ from proposer_rl.report.curves import axis_text
 from proposer_rl.report.proposals import gain_numbers, own_numbers
 from proposer_rl.report.records import Column, is_rate
 from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.series import COSTS, UPDATES, Series, band, over_cost, over_cycles
+from proposer_rl.report.series import COSTS, Series, band, over_cost, over_cycles
 from proposer_rl.report.series import over_updates as against_updates
 from proposer_rl.report.single_levels import level_means, told, worst_series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.style import UPDATES
 
 Json = Any
 DIGITS = 5

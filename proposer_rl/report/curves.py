@@ -12,10 +12,10 @@ from matplotlib.figure import FigureBase
 
 from proposer_rl.report.comparisons import updates_needed, waiting_outcome
 from proposer_rl.report.records import Column, is_rate, level_text, words
-from proposer_rl.report.series import COSTS, UPDATES, Series, band, over_cost, over_updates
+from proposer_rl.report.series import COSTS, Series, band, over_cost, over_updates
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import PANEL, Drawing, Look, Panel, axes_of, style
+from proposer_rl.report.style import PANEL, UPDATES, Drawing, Look, Panel, axes_of, finish, style
 
 MOST_PANELS = 12
 
@@ -121,32 +121,6 @@ def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
     axes.plot(x, np.where(whole, mean, np.nan), **style(look, len(x)))
     axes.fill_between(x, low, high, color=look.colour, alpha=0.15, linewidth=0)
     return mean
-
-
-def finish(
-    axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
-) -> None:
-    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge.
-
-    Args:
-        axes: where they are drawn.
-        x: name of the abscissa.
-        y: name of the ordinate.
-        means: of all methods.
-        rate: whether the ordinate goes from 0 to 1.
-        zero: whether it begins at zero, where nothing is less.
-    """
-    axes.set(xlabel=x, ylabel=y)
-    axes.margins(x=0.01)
-    values = np.concatenate([[], *means])
-    values = values[np.isfinite(values)]
-    if rate or not len(values):
-        axes.set_ylim(0, 1)
-        return
-    low, high = float(values.min()), float(values.max())
-    zero = zero and low >= 0
-    margin = 0.3 * (high - (0 if zero else low)) or 0.1 * abs(high) or 1.0
-    axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
 def _curve_panel(study: Study, name: str, table: str = "metrics") -> Panel:

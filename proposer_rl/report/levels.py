@@ -10,12 +10,19 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from proposer_rl.report.curves import finish
 from proposer_rl.report.records import LevelRecord, SampleRecord, is_rate, picture, words
 from proposer_rl.report.runs import Run, read_run
-from proposer_rl.report.series import UPDATES
 from proposer_rl.report.studies import Study
-from proposer_rl.report.style import SETTINGS, SKY, VERMILLION, Drawing, Panel, axes_of
+from proposer_rl.report.style import (
+    SETTINGS,
+    SKY,
+    UPDATES,
+    VERMILLION,
+    Drawing,
+    Panel,
+    axes_of,
+    finish,
+)
 
 STAGES = 5
 BATCH = 2  # levels of a batch

@@ -18,12 +18,12 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
-from proposer_rl.report.curves import draw_curve, finish
+from proposer_rl.report.curves import draw_curve
 from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
 from proposer_rl.report.runs import Run, read_run, share_map
-from proposer_rl.report.series import UPDATES, over_cycles
+from proposer_rl.report.series import over_cycles
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of
+from proposer_rl.report.style import SETTINGS, UPDATES, Drawing, Panel, axes_of, finish
 
 Value = Callable[[Record], float]  # of a cycle; NaN where it has none
 

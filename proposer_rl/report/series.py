@@ -14,7 +14,6 @@ from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group
 
 GRID_POINTS = 100
-UPDATES = "Solver updates"
 # What training cost beside updates: in words, and of a run at each of its evaluations.
 COSTS: Mapping[str, Callable[[Run], Column]] = {
     "environment frames, millions (all)": lambda run: run.total_frames / 1e6,

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
-from proposer_rl.report.curves import draw_curve, finish
+from proposer_rl.report.curves import draw_curve
 from proposer_rl.report.records import Column, is_rate, words
 from proposer_rl.report.series import Series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Panel, axes_of
+from proposer_rl.report.style import Drawing, Panel, axes_of, finish
 from proposer_rl.report.tables import Cell
 
 SHARES = np.geomspace(0.01, 1.0, 61)

@@ -8,11 +8,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from PIL import Image
+
+from proposer_rl.report.records import Column
 
 # Okabe and Ito's colours, which stay distinct under the common forms of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -31,6 +34,7 @@ DASHES = ("-", "--", "-.", ":")
 TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
+UPDATES = "Solver updates"  # the abscissa of most figures
 COLOURS = 256  # of a picture in few colours
 
 SETTINGS: Any = {
@@ -133,6 +137,32 @@ def axes_of(figure: FigureBase) -> Axes:
     return axes
 
 
+def finish(
+    axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
+) -> None:
+    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge.
+
+    Args:
+        axes: where they are drawn.
+        x: name of the abscissa.
+        y: name of the ordinate.
+        means: of all methods.
+        rate: whether the ordinate goes from 0 to 1.
+        zero: whether it begins at zero, where nothing is less.
+    """
+    axes.set(xlabel=x, ylabel=y)
+    axes.margins(x=0.01)
+    values = np.concatenate([[], *means])
+    values = values[np.isfinite(values)]
+    if rate or not len(values):
+        axes.set_ylim(0, 1)
+        return
+    low, high = float(values.min()), float(values.max())
+    zero = zero and low >= 0
+    margin = 0.3 * (high - (0 if zero else low)) or 0.1 * abs(high) or 1.0
+    axes.set_ylim(0 if zero else low - margin, high + margin)
+
+
 def save(drawing: Drawing) -> dict[str, bytes]:
     """A figure with all of its panels and its legend.
 
@@ -153,7 +183,9 @@ def save(drawing: Drawing) -> dict[str, bytes]:
             figure.legend(
                 handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
             )
-        return {suffix: _render(figure, suffix) for suffix in ("svg", "png")}
+        png = _render(figure, "png")
+        figure.set_layout_engine("none")  # it stands: to find it takes longer than to draw
+        return {"svg": _render(figure, "svg"), "png": png}
 
 
 def panel_as_png(panel: Panel) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,14 +38,6 @@ NEEDS = needs([CONFIG_FOLDER])
 SEEDS = 5
 FLAT, SLOW = [0.0] * 6, [0.0, 0.0, 0.05, 0.3, 0.5, 0.6]
 FAST, FASTEST = [0.0, 0.4, 0.7, 0.85, 0.9, 0.9], [0.0, 0.8, 0.9, 0.95, 0.95, 0.95]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def unsafe() -> Iterator[None]:
-    """What is written here need not outlive the machine, and disks take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("os.fsync", lambda file: None)
-        yield
 
 
 def write_methods(
