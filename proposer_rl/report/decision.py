@@ -85,7 +85,8 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
 def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[str]:
     """What a group's method needs: as its runs recorded it, or else as the caller knows it.
 
-    A variant that asked for no evaluation of levels needs none to be exact.
+    A variant may ask for evaluations where its method does not, or for none where it does: what
+    its runs spent decides.
 
     Args:
         group: of the method.
@@ -98,7 +99,7 @@ def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[s
     known = set(needs.get(run.method, unknown))
     found = set(filter(None, said.split(", "))) if isinstance(said, str) else known
     asked = any(run.metrics["evaluations"][-1] > 0 for run in group.runs)
-    return found if asked else found - {EXACT, GRADIENTS}
+    return found | {EXACT} if asked else found - {EXACT, GRADIENTS}
 
 
 def choose(

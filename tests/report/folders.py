@@ -78,6 +78,7 @@ def write_run(
     finished: bool = True,
     cycles: Sequence[dict[str, Any]] = (),
     copies: int = 0,
+    asked: int = 3,
     task: dict[str, Any] = TASK,
     levels: Sequence[float] = (),
     facts: dict[str, Any] | None = None,
@@ -85,7 +86,8 @@ def write_run(
 ) -> Path:
     """A run whose measurement on every distribution is ``curve``, one value per evaluation.
 
-    ``levels`` is what is reached on every single level at the end, on every distribution.
+    At every update the curriculum spends ``copies`` frames and ``asked`` evaluations. ``levels`` is
+    what is reached on every single level at the end, on every distribution.
     """
     run = RunFolder(folder)
     settings = config(method, seeds[0], **changes)
@@ -98,7 +100,7 @@ def write_run(
             cost = {
                 "frames": 100 * updates,
                 "curriculum_frames": copies * updates,
-                "evaluations": 3 * updates,
+                "evaluations": asked * updates,
                 "seconds": 2.0 * i,
             }
             measured = {f"{name}_{kind}": float(value) for name in task["distributions"]}

@@ -17,7 +17,7 @@ from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import cost_curves, learning_curves
-from proposer_rl.report.decision import budgets, choices
+from proposer_rl.report.decision import EXACT, budgets, choices
 from proposer_rl.report.generalisation import (
     Score,
     generalisation_table,
@@ -56,6 +56,7 @@ def write_methods(
                 [value * (1 - 0.01 * seed) for value in base],
                 cycles=harder if proposes else (),
                 copies=1100 if proposes else 0,
+                asked=3 if EXACT in NEEDS.get(method, ()) or ablation == "chosen" else 0,
                 ablation=ablation or "none",
                 facts={"about": facts} if facts else None,
             )
@@ -123,7 +124,7 @@ def test_methods_that_cannot_be_told_apart_are_named(tmp_path: Path) -> None:
     for method, ends in {"plr": (0.6, 0.02), "accel": (0.7, -0.02), "target": (0, 0)}.items():
         for seed in range(SEEDS):
             end = ends[0] + ends[1] * seed
-            write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end / 2, end])
+            write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end / 2, end], asked=0)
     choice = choices(study_of(tmp_path), NEEDS)["a known target, episodes alone"]["updates"]
     assert choice is not None and choice.others == 2
     assert {choice.best.label, *choice.level} == {"plr", "accel"}
@@ -154,6 +155,15 @@ def test_what_a_method_needs_is_what_its_runs_say(tmp_path: Path) -> None:
     write_methods(tmp_path / "own", {"mine": FASTEST, "accel": SLOW}, needs="")
     found = choices(study_of(tmp_path / "own"), NEEDS)
     assert found["no target, episodes alone"]["updates"].best.label == "mine"  # type: ignore
+
+
+def test_a_variant_needs_what_its_runs_asked_for(tmp_path: Path) -> None:
+    """With a choice by exact success even domain randomization needs that."""
+    curves = {"domain_randomization": SLOW, "domain_randomization, chosen": FASTEST}
+    found = choices(study_of(write_methods(tmp_path, curves)), NEEDS)
+    best = {there: row["updates"].best.label for there, row in found.items() if row["updates"]}
+    assert best["no target, exact evaluation"] == "domain_randomization, chosen"
+    assert best["no target, episodes alone"] == "domain_randomization"
 
 
 def verdicts(study: Study) -> list[str]:
