@@ -9,20 +9,33 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-METHODS = ROOT / "results" / "curricula" / "tables" / "methods.csv"
-# The column of a page, that of the results, and the digits that are shown; brackets are intervals.
-INTERVALS = {
-    "mean success along training": ("ID success, mean over 240 updates", 3),
-    "success after 240 updates": ("ID success after 240 updates", 3),
-    "out of distribution": ("OOD success after 240 updates", 3),
-    "worst tenth": ("ID success, worst 10 %", 3),
-    "updates to 80 % (at most 240)": ("updates to 80% ID success (at most 240)", 0),
-}
 FRAMES = "with the curriculum's (M)"
-PAGES = ["README.md", "docs/comparison.md", "docs/first_order.md"]
+# Pages with tables, updates of the runs in them, folder of their results, least number of rows.
+TABLES = [
+    ("README.md", 240, "curricula", 20),
+    ("docs/comparison.md", 240, "curricula", 20),
+    ("docs/first_order.md", 240, "curricula", 8),
+    ("docs/choice.md", 240, "curricula", 8),
+    ("README.md", 400, "medium", 5),
+    ("docs/comparison.md", 400, "medium", 5),
+]
 
 
-def rows(page: str) -> Iterator[dict[str, str]]:
+def intervals(updates: int) -> dict[str, tuple[str, int]]:
+    """By the column of a page that of the results, and the digits shown; brackets are intervals."""
+    return {
+        "mean success along training": (f"ID success, mean over {updates} updates", 3),
+        f"success after {updates} updates": (f"ID success after {updates} updates", 3),
+        "out of distribution": (f"OOD success after {updates} updates", 3),
+        "worst tenth": ("ID success, worst 10 %", 3),
+        f"updates to 80 % (at most {updates})": (
+            f"updates to 80% ID success (at most {updates})",
+            0,
+        ),
+    }
+
+
+def rows(page: str, updates: int) -> Iterator[dict[str, str]]:
     """Of all tables of a page that compare methods by what the results tell."""
     names: list[str] = []
     for line in (ROOT / page).read_text(encoding="utf-8").splitlines():
@@ -31,7 +44,9 @@ def rows(page: str) -> Iterator[dict[str, str]]:
             continue
         cells = [cell.strip() for cell in line.strip("| ").split(" | ")]
         names = names or cells
-        if {"method", "mean success along training", "success after 240 updates"} <= set(names):
+        if {"method", "mean success along training", f"success after {updates} updates"} <= set(
+            names
+        ):
             row = dict(zip(names, cells, strict=True))
             if row["method"].startswith("`"):
                 yield row
@@ -44,16 +59,20 @@ def shown(result: dict[str, str], name: str, digits: int) -> str:
     return f"{float(mean):.{digits}f} [{float(low):.{digits}f}, {float(high):.{digits}f}]"
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_the_tables_have_the_numbers_of_the_results(page: str) -> None:
-    with METHODS.open(encoding="utf-8") as file:
+@pytest.mark.parametrize(("page", "updates", "folder", "least"), TABLES)
+def test_the_tables_have_the_numbers_of_the_results(
+    page: str, updates: int, folder: str, least: int
+) -> None:
+    methods = ROOT / "results" / folder / "tables" / "methods.csv"
+    with methods.open(encoding="utf-8") as file:
         results = {row["method"]: row for row in csv.DictReader(file)}
-    found = list(rows(page))
-    assert len(found) >= 8
+    found = list(rows(page, updates))
+    assert len(found) >= least
     for row in found:
         result = results[row["method"].strip("`").replace("`, `", ", ")]
         expected = {
-            column: shown(result, name, digits) for column, (name, digits) in INTERVALS.items()
+            column: shown(result, name, digits)
+            for column, (name, digits) in intervals(updates).items()
         } | {
             "frames, the curriculum's included": f"{float(result[FRAMES]):.2f} M",
             "evaluations": f"{float(result['evaluations']):,.0f}",
