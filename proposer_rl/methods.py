@@ -33,6 +33,7 @@ from proposer_rl.curricula import (
     Scorer,
     SelectionCurriculum,
     TransportCurriculum,
+    require_gradients,
 )
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import Prioritization, ReplayRule
@@ -215,16 +216,24 @@ def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
     return MixtureCurriculum(parts.task, **numbers)
 
 
-def _of_bins(make: Callable[..., Made]) -> Callable[..., Made]:
-    """Makes the factory of a curriculum over bins, which takes numbers of its own."""
+def _of_bins(
+    make: Callable[..., Made], require: Callable[[Task], object] = lambda task: None
+) -> Callable[..., Made]:
+    """Makes the factory of a curriculum over bins, which takes numbers of its own.
+
+    Args:
+        make: the curriculum.
+        require: refuses a task that it cannot do with, whatever is chosen from it.
+    """
 
     def factory(parts: Parts, choose: Choose = None, **numbers: Any) -> Made:
+        require(parts.task)
         return make(parts.task, choice=_choice(parts.task, choose), **numbers)
 
     return factory
 
 
-first_order_gain = _of_bins(FirstOrderCurriculum)
+first_order_gain = _of_bins(FirstOrderCurriculum, require_gradients)
 first_order_sampled = _of_bins(SampledFirstOrderCurriculum)
 learning_progress = _of_bins(LearningProgressCurriculum)
 currot = _of_bins(TransportCurriculum)
@@ -296,6 +305,7 @@ def first_order_proposer(
         choose: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
+    require_gradients(parts.task)
     agent, settings = _problem_policy(parts, **numbers)
     return FirstOrderProposer(
         parts.task,

@@ -51,7 +51,9 @@ MAKERS = {
     "of a schedule": lambda: ScheduleCurriculum(
         [SamplingCurriculum(d, choice()) for d in (TASK.space, TASK.target)], [2]
     ),
-    "of bins": lambda: FirstOrderCurriculum(TASK, target_levels=8, candidates=2, choice=choice()),
+    "of bins": lambda: FirstOrderCurriculum(
+        TASK, every=1, target_levels=8, candidates=2, choice=choice()
+    ),
     "of bins that are observed": lambda: LearningProgressCurriculum(
         TASK, source="episodes", choice=choice()
     ),
