@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from tensordict import TensorDict
-from torch import nn
-from torch.distributions import Distribution
 
 from proposer_rl.curricula import (
     Choice,
@@ -40,22 +38,19 @@ from proposer_rl.curricula.buffer import Prioritization, ReplayRule
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.meta import rewards
-from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
-from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.view import SolverView
+from proposer_rl.meta.assembly import (
+    meta_env,
+    proposer_actions,
+    proposer_agent,
+    solver_view,
+    worker_env,
+)
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import (
     ActorCritic,
-    MixtureHead,
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    joint_categorical,
-    normal,
-    proposer_actor_critic,
 )
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
-from proposer_rl.settings import MixtureSettings, PPOSettings, ProblemSettings, ProposerSettings
+from proposer_rl.settings import PPOSettings, ProblemSettings, ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -155,16 +150,16 @@ def proposer(
             "proposer.advantage=leave_one_out"
         )
     streams = Streams(parts.seeds[0], "proposer")
-    env = _meta_env(task, chosen, streams, reward, range(chosen.rollouts), parts.on_update)
+    env = meta_env(task, chosen, streams, reward, range(chosen.rollouts), parts.on_update)
     with streams.as_default("weights"):
-        agent = _agent(task, chosen)
+        agent = proposer_agent(task, chosen)
     numbers = PPOSettings(horizon=env.steps, **asdict(chosen.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if chosen.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
     copies = None
     if parts.workers is not None:
         settings, make_task, tell = parts.workers
-        make_env = partial(_worker_env, make_task, chosen, streams, reward)
+        make_env = partial(worker_env, make_task, chosen, streams, reward)
         copies = CopiesInWorkers(learner, make_env, settings, tell)
     return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
 
@@ -193,7 +188,7 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
     if not checkpoint:
         raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
     task, chosen = parts.task, parts.proposer
-    agent = _agent(task, chosen)
+    agent = proposer_agent(task, chosen)
     learnt = _curriculum_state(Path(checkpoint))
     try:
         load_agent(agent, TensorDict(learnt["proposer"]))
@@ -203,8 +198,8 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
         ) from error
     return ProposerCurriculum(
         agent,
-        _view(task, chosen),
-        _actions(task, chosen),
+        solver_view(task, chosen),
+        proposer_actions(task, chosen),
         meta_episode_length=chosen.meta_episode_length,
         action_repeat=chosen.action_repeat,
         own_action=chosen.own_action,
@@ -350,82 +345,11 @@ def _problem_policy(
     _one_solver(parts)
     task, chosen = parts.task, parts.proposer
     with Streams(parts.seeds[0], "proposer").as_default("weights"):
-        agent = _agent(task, replace(chosen, observes=[], action=ProblemSettings()))
+        agent = proposer_agent(task, replace(chosen, observes=[], action=ProblemSettings()))
     numbers = replace(
         chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
     return agent, PPOSettings(horizon=1, **asdict(numbers))
-
-
-def _meta_env(
-    task: Task,
-    chosen: ProposerSettings,
-    streams: Streams,
-    reward: rewards.Reward,
-    share: range,
-    on_update: Callable[[int], None] | None = None,
-    kind: type[SolverTrainingEnv] = SolverTrainingEnv,
-) -> SolverTrainingEnv:
-    """The environment of a share of the K copies."""
-    return kind(
-        task.learner([streams] * len(share)),
-        view=_view(task, chosen),
-        actions=_actions(task, chosen),
-        reward=reward,
-        meta_episode_length=chosen.meta_episode_length,
-        action_repeat=chosen.action_repeat,
-        first_copy=share.start,
-        on_update=on_update,
-    )
-
-
-def _worker_env(
-    make_task: Callable[[str], Task],
-    chosen: ProposerSettings,
-    streams: Streams,
-    reward: rewards.Reward,
-    *,
-    share: range,
-    device: str,
-    kind: type[SolverTrainingEnv],
-) -> SolverTrainingEnv:
-    return _meta_env(make_task(device), chosen, streams, reward, share, kind=kind)
-
-
-def _view(task: Task, chosen: ProposerSettings) -> SolverView:
-    return SolverView(
-        task, validation_levels=chosen.validation_levels, probe_levels=chosen.probe_levels
-    )
-
-
-def _actions(task: Task, chosen: ProposerSettings) -> Actions:
-    kinds = {MixtureSettings: Mixture, ProblemSettings: ProblemChoices}
-    return kinds[type(chosen.action)](task.space)
-
-
-def _agent(task: Task, chosen: ProposerSettings) -> ActorCritic:
-    width = chosen.context + len(chosen.observes)
-    head, distribution = _head(task, chosen, width)
-    network = ProposerNetwork(
-        head,
-        task.probe_encoder(chosen.context),
-        context=chosen.context,
-        numbers=len(chosen.observes),
-        hidden=chosen.hidden,
-    ).to(task.device)
-    return proposer_actor_critic(network, distribution, ["probes", *chosen.observes])
-
-
-def _head(
-    task: Task, chosen: ProposerSettings, width: int
-) -> tuple[nn.Module, Callable[..., Distribution]]:
-    """From a context of that width to the parameters of the action's distribution."""
-    action, hidden = chosen.action, chosen.hidden
-    if isinstance(action, MixtureSettings):
-        directions = task.space.coordinates.shape[1]
-        return MixtureHead(width, directions, hidden=hidden, spread=action.spread), normal
-    head = ProblemHead(width, task.batch_size, task.space.size, hidden=hidden, bands=action.bands)
-    return head, joint_categorical if action.ratio == "joint" else categorical
 
 
 def _one_solver(parts: Parts) -> None:

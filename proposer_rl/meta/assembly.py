@@ -1,0 +1,111 @@
+"""A Proposer's network, its actions and its environment, put together from its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import nn
+from torch.distributions import Distribution
+
+from proposer_rl.meta import rewards
+from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
+from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.view import SolverView
+from proposer_rl.models import (
+    ActorCritic,
+    MixtureHead,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    joint_categorical,
+    normal,
+    proposer_actor_critic,
+)
+from proposer_rl.settings import MixtureSettings, ProblemSettings, ProposerSettings
+from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+
+
+def meta_env(
+    task: Task,
+    chosen: ProposerSettings,
+    streams: Streams,
+    reward: rewards.Reward,
+    share: range,
+    on_update: Callable[[int], None] | None = None,
+    kind: type[SolverTrainingEnv] = SolverTrainingEnv,
+) -> SolverTrainingEnv:
+    """The environment in which a share of the K copies of a Solver is trained.
+
+    Args:
+        task: that they learn.
+        chosen: what is seen of them, how actions are drawn and how long they hold.
+        streams: of the run's Proposer.
+        reward: what an update is worth.
+        share: numbers of the copies.
+        on_update: called with the number of updates done in an episode.
+        kind: the class.
+    """
+    return kind(
+        task.learner([streams] * len(share)),
+        view=solver_view(task, chosen),
+        actions=proposer_actions(task, chosen),
+        reward=reward,
+        meta_episode_length=chosen.meta_episode_length,
+        action_repeat=chosen.action_repeat,
+        first_copy=share.start,
+        on_update=on_update,
+    )
+
+
+def worker_env(
+    make_task: Callable[[str], Task],
+    chosen: ProposerSettings,
+    streams: Streams,
+    reward: rewards.Reward,
+    *,
+    share: range,
+    device: str,
+    kind: type[SolverTrainingEnv],
+) -> SolverTrainingEnv:
+    """The same in another process, whose task is made there, on its device."""
+    return meta_env(make_task(device), chosen, streams, reward, share, kind=kind)
+
+
+def solver_view(task: Task, chosen: ProposerSettings) -> SolverView:
+    """What a Proposer sees of a Solver."""
+    return SolverView(
+        task, validation_levels=chosen.validation_levels, probe_levels=chosen.probe_levels
+    )
+
+
+def proposer_actions(task: Task, chosen: ProposerSettings) -> Actions:
+    """What its actions mean."""
+    kinds = {MixtureSettings: Mixture, ProblemSettings: ProblemChoices}
+    return kinds[type(chosen.action)](task.space)
+
+
+def proposer_agent(task: Task, chosen: ProposerSettings) -> ActorCritic:
+    """The Proposer, with weights from torch's default generator."""
+    width = chosen.context + len(chosen.observes)
+    head, distribution = _head(task, chosen, width)
+    network = ProposerNetwork(
+        head,
+        task.probe_encoder(chosen.context),
+        context=chosen.context,
+        numbers=len(chosen.observes),
+        hidden=chosen.hidden,
+    ).to(task.device)
+    return proposer_actor_critic(network, distribution, ["probes", *chosen.observes])
+
+
+def _head(
+    task: Task, chosen: ProposerSettings, width: int
+) -> tuple[nn.Module, Callable[..., Distribution]]:
+    """From a context of that width to the parameters of the action's distribution."""
+    action, hidden = chosen.action, chosen.hidden
+    if isinstance(action, MixtureSettings):
+        directions = task.space.coordinates.shape[1]
+        return MixtureHead(width, directions, hidden=hidden, spread=action.spread), normal
+    head = ProblemHead(width, task.batch_size, task.space.size, hidden=hidden, bands=action.bands)
+    return head, joint_categorical if action.ratio == "joint" else categorical
