@@ -46,9 +46,7 @@ from proposer_rl.meta.assembly import (
     worker_env,
 )
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
-from proposer_rl.models import (
-    ActorCritic,
-)
+from proposer_rl.models import ActorCritic
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.settings import PPOSettings, ProblemSettings, ProposerSettings
 from proposer_rl.streams import Streams
@@ -289,14 +287,16 @@ def learnability(
 
 
 def first_order_proposer(
-    parts: Parts, target_levels: int, choose: Choose = None, **numbers: Any
+    parts: Parts, target_levels: int, copies: int = 0, choose: Choose = None, **numbers: Any
 ) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
     Args:
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
-            them the probes, the network and PPO's other numbers.
+            them the probes, the network and PPO's other numbers, and with copies the length of
+            their episode.
         target_levels: see :class:`FirstOrderProposer`.
+        copies: the same.
         choose: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
@@ -309,6 +309,9 @@ def first_order_proposer(
         probe_levels=parts.proposer.probe_levels,
         choice=_choice(parts.task, choose),
         target_levels=target_levels,
+        copies=copies,
+        copy_updates=parts.proposer.meta_episode_length,
+        on_update=parts.on_update or (lambda done: None),
     )
 
 

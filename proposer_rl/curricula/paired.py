@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -56,21 +56,22 @@ class PairedProposer(ProblemProposer):
         """The antagonist begins anew, too."""
         self.antagonist.restore(self._newborn)
 
-    def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:
+    def worth(self, learner: PPO, levels: Levels, streams: Sequence[Streams]) -> Worth:
         """The regret of each level; and what the antagonist's training on them will cost."""
         task, both = self.task, (self.antagonist, learner)
+        (stream,) = streams
         with torch.no_grad():
             returns = [
                 task.performance(
                     student.agent, levels, stream.generator("regret", device=task.device)
-                )["return"][0]
+                )["return"]
                 for student in both
             ]
         regret = (returns[0] - returns[1]).clamp_min(0)
         told = {"regret": float(regret.mean()), "regret_sd": float(regret.std())}
         self._draws = stream.generator("antagonist", device=task.device)
         frames = task.batch_size * self.antagonist.settings.horizon
-        return Worth(regret, told, frames=frames, evaluations=2 * len(regret))
+        return Worth(regret, told, frames=frames, evaluations=2 * regret.shape[1])
 
     def observe(self, learner: PPO, levels: Levels, update: Update) -> None:
         """Train the antagonist on the same levels.

@@ -24,10 +24,10 @@ class Worth(NamedTuple):
     """What problems are worth.
 
     Attributes:
-        paid: for each, float [E].
+        paid: for each, float [K, E].
         told: of all of them, by name.
-        frames: environment steps that it cost.
-        evaluations: of a policy on a level.
+        frames: environment steps that it cost each Solver.
+        evaluations: of a policy on a level, for each Solver.
     """
 
     paid: Tensor
@@ -47,7 +47,7 @@ class ProblemProposer(Curriculum):
 
     Args:
         task: whose target is seen, and whose space has the bins.
-        agent: from ``probes`` [1, C, ...] to logits [1, P, N] of independent categoricals, as
+        agent: from ``probes`` [K, C, ...] to logits [K, P, N] of independent categoricals, as
             :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
@@ -86,8 +86,8 @@ class ProblemProposer(Curriculum):
         self._told: dict[str, float] = {}
 
     @abstractmethod
-    def worth(self, learner: PPO, levels: Levels, stream: Streams) -> Worth:
-        """What each of the levels [1, E] is worth to the Solver, who has not trained on it yet."""
+    def worth(self, learner: PPO, levels: Levels, streams: Sequence[Streams]) -> Worth:
+        """What each of the levels [K, E] is worth to its Solver, who has not trained on it yet."""
 
     def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
         """Levels [1, P] of the policy's draws, from all of which it has learnt already.
@@ -97,26 +97,36 @@ class ProblemProposer(Curriculum):
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
-        (stream,) = streams
+        bins, proposal = self.draw_and_learn(learner, streams)
+        self._proposed += bins.flatten().bincount(minlength=len(self._proposed))
+        return proposal
+
+    def draw_and_learn(self, learner: PPO, streams: Sequence[Streams]) -> tuple[Tensor, Proposal]:
+        """Draw for K Solvers that are all seen through the same probes, and learn from all draws.
+
+        Returns:
+            The bins of their levels, int64 [K, P], and the levels [K, P].
+        """
         task, agent = self.task, self.agent
-        probes = task.target.sample(self._probe_levels, stream.generator("probes"))
+        probes = task.target.sample(self._probe_levels, streams[0].generator("probes"))
         with torch.no_grad():
-            seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [1])
+            seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [len(streams)])
             policy = agent.distribution(agent(seen.copy()))
             shape = (self._choice.times if self._choice else 1, task.batch_size)
-            noise = torch.rand(shape, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(task.device))  # [times, P]
+            noise = [torch.rand(shape, generator=s.generator("choices")) for s in streams]
+            choices = draw(policy, torch.stack(noise, 1).to(task.device))  # [times, K, P]
             log_prob = policy.log_prob(choices)
-        bins = choices.cpu().view(1, -1)
-        levels = task.space.generate(bins, [stream.generator("levels")])
-        worth = self.worth(learner, levels, stream)
+        bins = choices.transpose(0, 1).flatten(1).cpu()  # [K, times * P]
+        levels = task.space.generate(bins, [stream.generator("levels") for stream in streams])
+        worth = self.worth(learner, levels, streams)
+        paid = worth.paid.unflatten(1, shape).transpose(0, 1)
         played = TensorDict(
             {
                 agent.action_key: choices,
                 agent.log_prob_key: log_prob,
-                "advantage": worth.paid.view(*shape, 1),
+                "advantage": paid.unsqueeze(-1),
             },
-            shape,
+            choices.shape,
         )
         self._learn(seen, played)
         self._told |= worth.told
@@ -124,8 +134,7 @@ class ProblemProposer(Curriculum):
         if self._choice:
             index, proposal = self._choice(learner, proposal, streams)
             bins = bins.gather(1, index)
-        self._proposed += bins.flatten().bincount(minlength=len(self._proposed))
-        return proposal
+        return bins, proposal
 
     def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
         """Tell of the last cycle."""
@@ -165,8 +174,8 @@ class ProblemProposer(Curriculum):
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
         """A few steps on all draws: the clipped objective of each problem, with its advantage."""
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key]  # [1, P, N]
-            everywhere = logits.expand(len(played), -1, -1)
+            logits = self.agent(seen.copy())[self.agent.logits_key]  # [K, P, N]
+            everywhere = logits.expand(len(played), -1, -1, -1)
             losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
             (losses["loss_objective"] + losses["loss_entropy"]).backward()

@@ -24,8 +24,10 @@ from proposer_rl.models import (
 )
 from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.streams import Streams
+from tests.curricula.living import check_it_resumes, solvers
 from tests.curricula.scripted import GivenScores
 from tests.curricula.test_first_order import BINS, P, Skills
+from tests.tiny import TASK as MAZES
 
 WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
 
@@ -34,7 +36,7 @@ class Seen(Skills):
     """Skills that a Proposer looks at."""
 
     def probe(self, agent: nn.Module, levels: Tensor) -> Tensor:  # type: ignore[override]
-        return torch.ones(1, len(levels), 3)
+        return torch.ones(len(self.agent.skills), len(levels), 3)
 
 
 def agent() -> ActorCritic:
@@ -67,24 +69,26 @@ def test_it_learns_to_choose_what_the_target_needs() -> None:
     assert (proposal.levels == 2).float().mean() > 0.8
 
 
-@pytest.mark.parametrize("times", [1, 3])
-def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
-    """Also those that the Solver does not train on."""
-    task = Seen(1, WANTED)
+@pytest.mark.parametrize(("times", "solvers"), [(1, 1), (3, 1), (3, 2)])
+def test_every_problem_is_credited_with_its_own_alignment(times: int, solvers: int) -> None:
+    """Also those that the Solver does not train on, and those of its copies."""
+    task = Seen(solvers, WANTED)
     settings = {"epochs": 1, "entropy_coeff": 0.3, "max_grad_norm": 100.0}
-    scores = torch.arange(float(times * P)).unsqueeze(0)
+    scores = torch.arange(float(times * P)).expand(solvers, -1)
     pick = Choice(GivenScores(scores), times=times, temperature=1e-3) if times > 1 else None
     curriculum = proposer(task, pick, **settings)
     expected = copy.deepcopy(curriculum.agent)
-    proposal = curriculum.propose(task, 0, [Streams(0)])
+    streams = [Streams(seed) for seed in range(solvers)]
+    _, proposal = curriculum.draw_and_learn(task, streams)
     assert proposal.evaluations == 3 + 2 * P * times + (P * times if pick else 0)
 
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(times, P, generator=Streams(0).generator("choices"))
-    choices = draw(policy, noise)
+    noise = [torch.rand(times, P, generator=s.generator("choices")) for s in streams]
+    choices = draw(policy, torch.stack(noise))  # [K, times, P]
     # Of the scores above those of the last are the highest.
-    assert sorted(proposal.levels[0].tolist()) == sorted(choices[-1].tolist())
+    for chosen, drawn in zip(proposal.levels, choices, strict=True):
+        assert sorted(chosen.tolist()) == sorted(drawn[-1].tolist())
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
@@ -93,6 +97,56 @@ def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     by_hand.step()
     for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def on_mazes(copies: int, **numbers: Any) -> FirstOrderProposer:
+    torch.manual_seed(0)
+    head = ProblemHead(8, MAZES.batch_size, MAZES.space.size, hidden=16, bands=4)
+    network = ProposerNetwork(head, MAZES.probe_encoder(8), context=8, hidden=8)
+    return FirstOrderProposer(
+        MAZES,
+        proposer_actor_critic(network, categorical),
+        PPOSettings(learning_rate=1e-2),
+        probe_levels=2,
+        target_levels=3,
+        copies=copies,
+        copy_updates=3,
+        **numbers,
+    )
+
+
+def test_it_learns_from_copies_and_leaves_the_solver_as_it_is() -> None:
+    done: list[int] = []
+    curriculum, learner = on_mazes(2, on_update=done.append), solvers([0])
+    before, weights = learner.snapshot().clone(), copy.deepcopy(curriculum.agent.state_dict())
+    batches = []
+    trained = curriculum._copies.env.set_levels
+    curriculum._copies.env.set_levels = lambda levels: (batches.append(levels), trained(levels))
+    outcome = curriculum.improve(learner, 0, [Streams(0)])
+    size, horizon = MAZES.batch_size, learner.settings.horizon
+    assert outcome.frames == 2 * 3 * size * horizon
+    assert outcome.evaluations == 2 * 3 * (3 + 2 * size)
+    assert done == [1, 2, 3] and len(batches) == 3
+    assert not (batches[0][0] == batches[0][1]).all()
+    assert (learner.snapshot() == before).all()
+    after = curriculum._copies.snapshot()
+    moved = [(entry[0] != entry[1]).any() for entry in after.flatten_keys().values()]
+    assert any(moved)
+    assert any(not torch.equal(w, weights[n]) for n, w in curriculum.agent.state_dict().items())
+
+    curriculum.propose(learner, 0, [Streams(0, "update")])
+    told = curriculum.improve(learner, 1, [Streams(1)]).metrics
+    assert int(torch.tensor(told["histogram"]).sum()) == size  # of the Solver's own batch alone
+
+
+def test_with_copies_it_resumes_bit_by_bit() -> None:
+    check_it_resumes(lambda: on_mazes(2))
+
+
+@pytest.mark.parametrize("copies", [-1, 1.5, True])
+def test_copies_that_make_no_sense_are_refused(copies: Any) -> None:
+    with pytest.raises(ValueError, match="copies must be a whole number from 0"):
+        on_mazes(copies)
 
 
 def test_a_resumed_proposer_goes_on_bit_by_bit() -> None:

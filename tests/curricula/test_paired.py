@@ -50,7 +50,7 @@ def test_the_antagonist_begins_anew_with_a_new_solver() -> None:
 def test_equal_students_have_no_regret() -> None:
     curriculum = paired(Streams(0, "solver"))  # the protagonist's own
     levels = TASK.space.sample(P, torch.Generator().manual_seed(0)).unsqueeze(0)
-    worth = curriculum.worth(solvers([0]), levels, Streams(0))
+    worth = curriculum.worth(solvers([0]), levels, [Streams(0)])
     assert (worth.paid == 0).all() and worth.told["regret"] == 0
 
 
@@ -59,7 +59,7 @@ def test_what_is_paid_is_what_the_antagonist_gets_more() -> None:
     lived = live(curriculum, learner, [0], range(2))
     assert lived.frames == [P * T] * 2 and lived.evaluations == [2 * P] * 2
     levels = TASK.space.sample(P, torch.Generator().manual_seed(1))
-    found = curriculum.worth(learner, levels.unsqueeze(0), Streams(0)).paid
+    found = curriculum.worth(learner, levels.unsqueeze(0), [Streams(0)]).paid[0]
     other, own = (
         evaluate(agent, levels)["return"][0]
         for agent in (curriculum.antagonist.agent, learner.agent)
