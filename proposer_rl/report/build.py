@@ -18,7 +18,7 @@ from proposer_rl.report.records import is_rate, words
 from proposer_rl.report.runs import find_runs
 from proposer_rl.report.stages import stages
 from proposer_rl.report.studies import Study, read_studies
-from proposer_rl.report.style import Drawing, save
+from proposer_rl.report.style import Drawing, render
 from proposer_rl.report.tables import Cell, escape_markdown, to_csv
 from proposer_rl.runs.folder import write_atomically
 
@@ -119,7 +119,7 @@ def write_report(
     html = page.render(title=title, command=command, sections=sections, notes=notes)
     if len(html) > page.LARGEST:  # the figures that are charts there, too, are files anyway
         for section in sections:
-            section["figures"] = [one for one in section["figures"] if not one["drawn"]]
+            section["figures"] = [one for one in section["figures"] if not one["charted"]]
         html = page.render(title=title, command=command, sections=sections, notes=notes)
     files["report.md"] = _markdown(title, command, sections).encode()
     write_files(output, files, (FIGURES, TABLES))
@@ -164,8 +164,9 @@ def _section(
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
-            figures.append(page.figure(drawing, draw in charted))
-            files |= {f"{path}.{suffix}": content for suffix, content in save(drawing).items()}
+            drawn = render(drawing)
+            figures.append(page.figure(drawing, drawn, draw in charted))
+            files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
             animations = [panel.animation for panel in drawing.panels if panel.animation]
             files |= {f"{path}_{_slug(name)}.gif": make() for name, make in animations}
         bar.update()

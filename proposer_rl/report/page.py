@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
+from PIL import Image
 
 from proposer_rl.report.answer import Meanings, meaning
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Look, Panel, in_few_colours, panel_as_png
+from proposer_rl.report.style import DPI, Drawing, Drawn, Look, in_few_colours
 
 PIXELS = 78  # of an inch of a figure
 LARGEST = 8 * 2**20  # bytes of a page
@@ -58,20 +59,24 @@ def pack(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def figure(drawing: Drawing, drawn: bool = False) -> Section:
+def figure(drawing: Drawing, drawn: Drawn, charted: bool = False) -> Section:
     """A figure as the page shows it: each panel an image of its own, so that they can wrap.
 
     Args:
         drawing: the figure.
-        drawn: whether the page has a chart of the same, which stands in for it in a browser.
+        drawn: the same.
+        charted: whether the page has a chart of the same, which stands in for it in a browser.
     """
     legend = [{"label": label, **_look(look)} for label, look in drawing.legend.items()]
     return {
         "title": drawing.title,
         "caption": drawing.caption,
-        "images": [_image(panel) for panel in drawing.panels],
+        "images": [
+            _image(panel.description, picture)
+            for panel, picture in zip(drawing.panels, drawn.panels, strict=True)
+        ],
         "legend": legend,
-        "drawn": drawn,
+        "charted": charted,
     }
 
 
@@ -142,14 +147,15 @@ def configs(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _image(panel: Panel) -> Section:
-    content = base64.b64encode(in_few_colours(panel_as_png(panel))).decode()
+def _image(description: str, picture: Image.Image) -> Section:
+    content = base64.b64encode(in_few_colours(picture)).decode()
+    width, height = (side / DPI for side in picture.size)
     return {
         "address": f"data:image/png;base64,{content}",
-        "description": panel.description,
-        "width": round(panel.size[0] * PIXELS),
-        "height": round(panel.size[1] * PIXELS),
-        "wide": panel.size[0] >= WIDE,
+        "description": description,
+        "width": round(width * PIXELS),
+        "height": round(height * PIXELS),
+        "wide": width >= WIDE,
     }
 
 

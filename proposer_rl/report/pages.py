@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+from PIL import Image
 
 from proposer_rl.report import curves, page, proposals
 from proposer_rl.report.build import FIGURES, OutputError, check_output, write_files
@@ -27,7 +30,7 @@ from proposer_rl.report.records import words
 from proposer_rl.report.runs import find_runs
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study, read_studies
-from proposer_rl.report.style import Drawing, in_few_colours, save
+from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
 
 CHOICE, CLAIMS = "which_curriculum.md", "claims.md"
@@ -187,7 +190,8 @@ def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
 
 def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
     path = f"{FIGURES}/{drawing.name}.png"
-    files[path] = in_few_colours(save(drawing)["png"])
+    with Image.open(io.BytesIO(render(drawing).png)) as image:
+        files[path] = in_few_colours(image)
     return f"![{escape_markdown(drawing.title)}]({path})"
 
 

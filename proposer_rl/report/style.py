@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure, FigureBase, SubFigure
 from matplotlib.lines import Line2D
 from PIL import Image
 
@@ -35,6 +35,7 @@ TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
 UPDATES = "Solver updates"  # the abscissa of most figures
+DPI = 130  # of a figure's PNG
 COLOURS = 256  # of a picture in few colours
 
 SETTINGS: Any = {
@@ -51,7 +52,7 @@ SETTINGS: Any = {
     "lines.linewidth": 1.8,
     "text.parse_math": False,  # a dollar sign in a name is no formula
     "svg.hashsalt": "proposer_rl",
-    "savefig.dpi": 130,
+    "savefig.dpi": DPI,
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
 }
@@ -163,20 +164,31 @@ def finish(
     axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
-def save(drawing: Drawing) -> dict[str, bytes]:
+class Drawn(NamedTuple):
     """A figure with all of its panels and its legend.
 
-    Returns:
-        The contents of files, by suffix: ``svg`` and ``png``.
+    Attributes:
+        svg: as a file.
+        png: the same.
+        panels: each cut out of it, without the legend.
     """
+
+    svg: bytes
+    png: bytes
+    panels: list[Image.Image]
+
+
+def render(drawing: Drawing) -> Drawn:
+    """Draw a figure, once: to lay it out takes longer than all else."""
     columns = min(drawing.columns, len(drawing.panels))
     rows = -(-len(drawing.panels) // columns)
     width, height = drawing.panels[0].size
     legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
     with rc_context(SETTINGS):
         figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
-        parts = figure.subfigures(rows, columns, squeeze=False).flat
-        for panel, part in zip(drawing.panels, parts, strict=False):
+        grid = figure.subfigures(rows, columns, squeeze=False)
+        parts = list(zip(drawing.panels, grid.flat, strict=False))
+        for panel, part in parts:
             panel.draw(part)
         if drawing.legend:
             handles = [Line2D([], [], label=n, **style(one)) for n, one in drawing.legend.items()]
@@ -184,25 +196,30 @@ def save(drawing: Drawing) -> dict[str, bytes]:
                 handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
             )
         png = _render(figure, "png")
-        figure.set_layout_engine("none")  # it stands: to find it takes longer than to draw
-        return {"svg": _render(figure, "svg"), "png": png}
+        figure.set_layout_engine("none")  # it stands
+        with Image.open(io.BytesIO(png)) as image:
+            panels = [image.crop(_place(part, image)) for _, part in parts]
+        return Drawn(_render(figure, "svg"), png, panels)
 
 
-def panel_as_png(panel: Panel) -> bytes:
-    """One panel alone."""
-    with rc_context(SETTINGS):
-        figure = Figure(figsize=panel.size, layout="constrained")
-        panel.draw(figure)
-        return _render(figure, "png")
+def _place(part: SubFigure, image: Image.Image) -> tuple[int, int, int, int]:
+    """Where a part of a figure is in a picture of it: left, upper, right and lower pixel."""
+    box, whole = part.bbox, part.figure.bbox
+    across, down = image.width / whole.width, image.height / whole.height
+    return (
+        round(box.x0 * across),
+        round(image.height - box.y1 * down),
+        round(box.x1 * across),
+        round(image.height - box.y0 * down),
+    )
 
 
-def in_few_colours(png: bytes) -> bytes:
-    """A picture in a third of its size: a page of vectors is five times as large."""
+def in_few_colours(image: Image.Image) -> bytes:
+    """A picture as PNG in a third of its size: a page of vectors is five times as large."""
     file = io.BytesIO()
-    with Image.open(io.BytesIO(png)) as image:
-        # The other ways to choose colours make those of two methods one.
-        far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
-        few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
+    # The other ways to choose colours make those of two methods one.
+    far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
+    few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
     few.save(file, format="PNG", optimize=True)
     return file.getvalue()
 

@@ -292,12 +292,12 @@ def test_bad_calls_of_a_batch_are_refused() -> None:
 
 @pytest.mark.slow
 def test_stable_baselines_learns_on_it() -> None:
-    """PPO's success on levels that it did not train on: from about 0.2 to over 0.8."""
-    rules = {"obstacle_fraction": 0.2, "path_length": 3, "height": 4, "width": 4, "max_steps": 10}
+    """PPO's success on levels that it did not train on: from about 0.3 to over 0.8."""
+    rules = {"obstacle_fraction": 0.25, "path_length": 2, "height": 4, "width": 4, "max_steps": 8}
     envs = make_vec_env(ID, n_envs=16, seed=0, env_kwargs=rules)
     fresh = make_vec_env(ID, n_envs=16, seed=1000, env_kwargs=rules)
     agent = PPO(
-        "MultiInputPolicy", envs, n_steps=64, batch_size=256, n_epochs=8, learning_rate=1e-3,
+        "MultiInputPolicy", envs, n_steps=32, batch_size=128, n_epochs=8, learning_rate=2e-3,
         ent_coef=0.01, policy_kwargs={"net_arch": [64, 64]}, seed=0, device="cpu",
     )  # fmt: skip
 
@@ -307,6 +307,6 @@ def test_stable_baselines_learns_on_it() -> None:
         )
         return float(np.mean(np.array(played[0]) > 0))
 
-    assert success() < 0.4
-    agent.learn(20_480)
+    assert success() < 0.5
+    agent.learn(10_240)
     assert success() > 0.8

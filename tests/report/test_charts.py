@@ -20,6 +20,7 @@ from proposer_rl.report.build import write_report
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.levels import side_by_side
 from proposer_rl.report.studies import read_studies
+from proposer_rl.report.style import render
 from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run
 
 SEEDS = 6
@@ -166,7 +167,8 @@ def test_stages_move_proposals_levels_and_success_together(
 
 def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:
     (study,), _ = read_studies(sorted(runs.iterdir()), None)
-    image = page.figure(learning_curves(study))["images"][0]
+    drawing = learning_curves(study)
+    image = page.figure(drawing, render(drawing))["images"][0]
     content = base64.b64decode(image["address"].removeprefix("data:image/png;base64,"))
     with Image.open(io.BytesIO(content)) as file:
         found = np.asarray(file.convert("RGB")).astype(int)
