@@ -59,7 +59,7 @@ class TransportCurriculum(BinCurriculum):
         self,
         task: Task,
         *,
-        delta: float = 0.5,
+        delta: float = 0.3,
         epsilon: float = 0.3,
         every: int = 5,
         probes: int = 16,
