@@ -187,7 +187,7 @@ def _curriculum(
     if chosen.workers is not None and not curriculum.trains_copies:
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no copies of the "
-            "Solver, so there is nothing for workers to do; leave compute.collector=single"
+            "Solver that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -209,6 +210,9 @@ def methods() -> list[str]:
 def why_not_made(error: BaseException) -> str:
     """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
     line = one_line(error).partition(", set env var HYDRA_FULL_ERROR")[0]
+    unknown = re.fullmatch(r"(\w+)\S*\(\) got an unexpected keyword argument (\S+)", line)
+    if unknown:
+        return f"{unknown[1]} has no setting {unknown[2]}"
     innermost = error
     while innermost.__cause__ is not None:
         innermost = innermost.__cause__
