@@ -34,6 +34,7 @@ SITUATIONS: Mapping[str, Collection[str]] = {
     "no target, exact evaluation": {EXACT, GRADIENTS},
     "no target, episodes alone": (),
 }
+STEADY = 1.5  # how many times one run of a method may cost what another does
 UNITS = dict(zip(COSTS, ("million frames, the curriculum's too", "seconds"), strict=True))
 
 
@@ -82,6 +83,20 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
     return found
 
 
+def spread(study: Study, scarce: str) -> float:
+    """How many times what one run of a method cost another of it did, of the method worst off.
+
+    Seconds are also those of whatever else the machine did; frames are not.
+    """
+    if scarce not in COSTS:
+        return 1.0
+    spent = [
+        [float(COSTS[scarce](run)[-1]) for run in group.runs if run.updates >= study.horizon]
+        for group in study.compared
+    ]
+    return max((max(each) / min(each) for each in spent if each and min(each) > 0), default=1.0)
+
+
 def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[str]:
     """What a group's method needs: as its runs recorded it, or else as the caller knows it.
 
@@ -107,6 +122,7 @@ def choose(
     usable: Sequence[Group],
     outcome: Outcome,
     found: Mapping[tuple[str, str], Decision],
+    unsteady: float = 1.0,
 ) -> Choice | None:
     """The best of some methods by an outcome; None where none has a value.
 
@@ -115,6 +131,7 @@ def choose(
         usable: the methods.
         outcome: of which more is better.
         found: what was decided by it of every pair.
+        unsteady: the :func:`spread` of what is scarce.
     """
     means = {group.label: outcome.values(group) for group in usable}
     ranked = sorted(
@@ -131,6 +148,8 @@ def choose(
         doubt = f"it takes {FEWEST} seeds of each to decide"
     elif not learnt(best, study.headline, study.horizon):
         doubt = "it is not shown to have learnt"
+    elif unsteady > STEADY:
+        doubt = f"what runs of one method took differs by up to {unsteady:.1f} times"
     return Choice(best, write(mean_interval(means[best.label])), level, len(others), doubt)
 
 
@@ -143,7 +162,9 @@ def choices(study: Study, needs: Needs) -> dict[str, dict[str, Choice | None]]:
     found = {scarce: decisions(study, outcome) for scarce, outcome in ranked.items()}
     return {
         there: {
-            scarce: choose(study, usable(study, needs, have), outcome, found[scarce])
+            scarce: choose(
+                study, usable(study, needs, have), outcome, found[scarce], spread(study, scarce)
+            )
             for scarce, outcome in ranked.items()
         }
         for there, have in SITUATIONS.items()

@@ -15,6 +15,7 @@ from proposer_rl.report.build import FIGURES, OutputError, check_output, write_f
 from proposer_rl.report.comparisons import ALIKE, primary
 from proposer_rl.report.decision import (
     SITUATIONS,
+    STEADY,
     Choice,
     Needs,
     budgets,
@@ -142,7 +143,8 @@ def _budgets(study: Study) -> str:
         f"good. Brackets: 95 % intervals, from {FEWEST} seeds on. *No target*: the method is not "
         "told it; what is measured is success on it all the same. *Exact evaluation*: the task can "
         "say how a Solver does on a level without playing it, with gradients. Seconds hold for the "
-        "machine below, and for what else it did."
+        "machine below, and for what else it did: where runs of one method differ by more than "
+        f"{STEADY} times, none is chosen by them."
     )
 
 

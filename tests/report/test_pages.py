@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import integrate
 
@@ -17,7 +18,7 @@ from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import cost_curves, learning_curves
-from proposer_rl.report.decision import EXACT, budgets, choices
+from proposer_rl.report.decision import EXACT, STEADY, budgets, choices
 from proposer_rl.report.generalisation import (
     Score,
     generalisation_table,
@@ -143,6 +144,22 @@ def test_thin_evidence_chooses_nothing(curves, seeds: int, doubt: str, tmp_path:
     choice = found["no target, episodes alone"]["updates"]
     assert choice is not None and choice.best.label == "plr" and choice.doubt == doubt
     assert ("[" in choice.value) == (seeds >= 5)
+
+
+@pytest.mark.parametrize("longer", [1.4, 1.6])
+def test_seconds_decide_nothing_where_the_machine_did_other_things(
+    longer: float, tmp_path: Path
+) -> None:
+    write_methods(tmp_path, {"plr": FAST, "accel": SLOW})
+    file = tmp_path / "accel_2" / "metrics.csv"
+    table = pd.read_csv(file)
+    table["seconds"] *= longer
+    table.to_csv(file, index=False)
+    found = choices(study_of(tmp_path), NEEDS)["no target, episodes alone"]
+    doubts = [choice.doubt for choice in found.values() if choice]
+    assert doubts[:2] == ["", ""]
+    assert bool(doubts[2]) == (longer > STEADY)
+    assert doubts[2] in ("", "what runs of one method took differs by up to 1.6 times")
 
 
 def test_what_a_method_needs_is_what_its_runs_say(tmp_path: Path) -> None:
