@@ -16,6 +16,7 @@ TABLES = [
     ("docs/comparison.md", 240, "curricula", 20),
     ("docs/first_order.md", 240, "curricula", 8),
     ("docs/choice.md", 240, "curricula", 8),
+    ("docs/replay.md", 240, "sampled", 11),
     ("README.md", 400, "medium", 5),
     ("docs/comparison.md", 400, "medium", 5),
 ]
