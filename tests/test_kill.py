@@ -19,8 +19,9 @@ from tests.same_run import assert_same_run
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.checkpoint_seconds=1e-6"]
 SMOKE += ["proposer.meta_episode_length=5"]
 # At any time; before any write; in the middle of a checkpoint's temporary file; before it gets its
-# name. Each method meets two of them, and methods that follow one another the other two.
+# name. Methods that follow one another meet others of them, every third one after another.
 MOMENTS = ["", "", "fsync .step_", "replace .step_"]
+KINDS = [[0, 2], [1], [3]]
 
 
 def factory(method: str) -> str:
@@ -58,7 +59,7 @@ def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
     command = [f"+method={method}", *SMOKE, f"checkpoint={learnt}"]
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
-    kinds, attempt = [[0, 2], [1, 3]][METHODS.index(method) % 2], 0
+    kinds, attempt = [*KINDS[METHODS.index(method) % len(KINDS)]], 0
     while kinds:
         folder = tmp_path / str(attempt)
         options = moment(draw, kinds[-1], whole)

@@ -66,7 +66,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(archive, folder / "site")
 
 
-def test_it_trains_and_reports_from_an_empty_folder(installed: Installed, tmp_path: Path) -> None:
+def test_it_trains_and_is_watched_from_an_empty_folder(installed: Installed, tmp_path: Path) -> None:
     said = installed("proposer-train", "+method=target", "+scale=smoke", folder=tmp_path)
     assert "target, seed 0: " in said
     (run,) = tmp_path.glob("outputs/target/*")
@@ -74,15 +74,15 @@ def test_it_trains_and_reports_from_an_empty_folder(installed: Installed, tmp_pa
     hydra = yaml.safe_load((run / ".hydra" / "hydra.yaml").read_text())["hydra"]
     sources = {source["provider"]: source["path"] for source in hydra["runtime"]["config_sources"]}
     assert sources["main"] == str(installed.site / "proposer_rl" / "conf")
-    installed("proposer-report", "outputs", "-o", "report", folder=tmp_path)
-    assert (tmp_path / "report" / "report.html").is_file()
+    said = installed("proposer-watch", "outputs", "--once", folder=tmp_path)
+    assert "target, seed 0" in said and "finished" in said
 
 
 def test_a_sweep_finds_its_configuration(installed: Installed, tmp_path: Path) -> None:
-    arguments = ["+sweep=quick", "+method=perf_gain", "+scale=smoke", "seed=0"]
+    arguments = ["+sweep=quick", "+method=target", "+scale=smoke", "seed=0"]
     installed("proposer-train", *arguments, folder=tmp_path)
     (summary,) = tmp_path.glob("sweeps/quick/*/summary.json")
-    assert summary.parent.name == "perf_gain-none-seed_0"
+    assert summary.parent.name == "target-none-seed_0"
 
 
 def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -> None:
