@@ -66,7 +66,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(archive, folder / "site")
 
 
-def test_it_trains_and_is_watched_from_an_empty_folder(installed: Installed, tmp_path: Path) -> None:
+def test_it_trains_and_is_watched_from_an_empty_folder(
+    installed: Installed, tmp_path: Path
+) -> None:
     said = installed("proposer-train", "+method=target", "+scale=smoke", folder=tmp_path)
     assert "target, seed 0: " in said
     (run,) = tmp_path.glob("outputs/target/*")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
 from PIL import Image
 
 from proposer_rl.cli.instruments import evaluate as evaluate_main
@@ -56,6 +57,10 @@ def smallest(arguments: list[str]) -> list[str]:
     """The same command at the smallest scale: it is the words that are tested here."""
     small = [re.sub(r"^\+scale=.*", "+scale=smoke", word) for word in arguments]
     small = [re.sub(r"^(seed=\d+),.*", r"\1", word) for word in small]
+    for sweep in (word.partition("=")[2] for word in arguments if word.startswith("+sweep=")):
+        own = OmegaConf.load(CONFIG_FOLDER / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
+        if "task" in own and "," not in own.task:
+            small += [f"task={own.task}", "schedule.updates=2"]
     tasks = [word.removesuffix("_quick") for word in small if word.startswith("task=")]
     if not tasks:  # scales are of mazes
         small = [*small, "+scale=smoke"] if "+scale=smoke" not in small else small

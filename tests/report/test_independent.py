@@ -19,12 +19,7 @@ from proposer_rl.report.studies import read_studies
 from tests.report.folders import write_run
 
 RESULTS = Path(__file__).parents[2] / "results"
-# Tables of the present form; some older ones have no primary outcome.
-COMMITTED = [
-    folder.parent
-    for folder in sorted(RESULTS.glob("*/tables/methods.csv"))
-    if "mean over" in folder.read_text(encoding="utf-8").partition("\n")[0]
-]
+COMMITTED = sorted(RESULTS.glob("*/tables"))
 
 
 def outcomes_of(metrics: pd.DataFrame, columns: pd.Index) -> pd.DataFrame:
