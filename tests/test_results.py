@@ -22,6 +22,7 @@ TABLES = [
     ("README.md", 400, "medium", "ID success", 5),
     ("docs/comparison.md", 400, "medium", "ID success", 5),
     (GYMNASIUM, 40, "cartpole", "target success", 4),
+    (GYMNASIUM, 80, "lunar_lander", "target success", 4),
     (GYMNASIUM, 60, "minigrid", "target success", 3),
 ]
 
