@@ -23,7 +23,7 @@ TABLES = [
     ("docs/comparison.md", 400, "medium", "ID success", 5),
     (GYMNASIUM, 40, "cartpole", "target success", 4),
     (GYMNASIUM, 80, "lunar_lander", "target success", 4),
-    (GYMNASIUM, 60, "minigrid", "target success", 3),
+    (GYMNASIUM, 60, "minigrid", "target success", 4),
 ]
 
 
