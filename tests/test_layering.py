@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -198,3 +199,18 @@ def test_circles_are_found(tmp_path: Path, files: dict[str, str], expected: set 
 )
 def test_mentions_are_found(source: str, count: int) -> None:
     assert len(mentions(ast.parse(source), "maze")) == count
+
+
+def test_the_readme_shows_the_rooms() -> None:
+    readme = (ROOT.parent / "README.md").read_text(encoding="utf-8").partition("## Layout")[2]
+    cells = [line.split("|")[1::2] for line in readme.splitlines() if line.startswith("| `")]
+    shown = {
+        name.removesuffix("/").removesuffix(".py"): set(re.findall("`(.*?)`", line[1]))
+        for line in cells
+        for name in re.findall("`(.*?)`", line[0])
+    }
+    found = rooms(ROOT)
+    assert shown.keys() - {"api"} == found.keys()
+    # The command line is told of by what it does not know.
+    assert shown.pop("cli") == found.keys() - found.pop("cli") - {"cli"}
+    assert {room: shown[room] for room in found} == found
