@@ -66,7 +66,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(archive, folder / "site")
 
 
-def test_it_trains_and_is_watched_from_an_empty_folder(
+def test_it_trains_is_watched_and_reports_from_an_empty_folder(
     installed: Installed, tmp_path: Path
 ) -> None:
     said = installed("proposer-train", "+method=target", "+scale=smoke", folder=tmp_path)
@@ -78,6 +78,8 @@ def test_it_trains_and_is_watched_from_an_empty_folder(
     assert sources["main"] == str(installed.site / "proposer_rl" / "conf")
     said = installed("proposer-watch", "outputs", "--once", folder=tmp_path)
     assert "target, seed 0" in said and "finished" in said
+    installed("proposer-report", "outputs", "-o", "report", folder=tmp_path)
+    assert (tmp_path / "report" / "report.html").is_file()
 
 
 def test_a_sweep_finds_its_configuration(installed: Installed, tmp_path: Path) -> None:
