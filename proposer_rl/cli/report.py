@@ -18,7 +18,7 @@ examples:
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
-  bin/report sweeps/medium --pages docs/findings   the two pages of the docs
+  bin/report sweeps/medium --pages docs/findings/medium   the two pages of the docs
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).

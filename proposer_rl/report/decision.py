@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from proposer_rl.report.comparisons import (
-    TOO_FEW,
     Decision,
     Outcome,
     between,
@@ -79,7 +78,8 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
     for axis, cost in COSTS.items():
         budget = min(float(cost(run)[-1]) for run in whole)
         value = partial(Run.mean_until, measurement=name, budget=budget, cost=cost)
-        found[axis] = Outcome(f"{words(name)}, mean over {budget:.2g} {UNITS[axis]}", value)
+        told = f"{float(f'{budget:.2g}'):,g}"  # 370, where .2g alone says 3.7e+02
+        found[axis] = Outcome(f"{words(name)}, mean over {told} {UNITS[axis]}", value)
     return found
 
 
@@ -126,6 +126,8 @@ def choose(
 ) -> Choice | None:
     """The best of some methods by an outcome; None where none has a value.
 
+    It is looked for among those with enough seeds, if there are any.
+
     Args:
         study: the runs.
         usable: the methods.
@@ -140,11 +142,11 @@ def choose(
     )
     if not ranked:
         return None
-    best, *others = ranked
+    best, *others = [group for group in ranked if len(means[group.label]) >= FEWEST] or ranked
     pairs = [between(found, best, other) for other in others]
     level = [other.label for other, decision in pairs if decision.winner != best.label]
     doubt = ""
-    if len(means[best.label]) < FEWEST or any(each.verdict == TOO_FEW for _, each in pairs):
+    if len(means[best.label]) < FEWEST:
         doubt = f"it takes {FEWEST} seeds of each to decide"
     elif not learnt(best, study.headline, study.horizon):
         doubt = "it is not shown to have learnt"

@@ -164,11 +164,13 @@ def _digest(script: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
-def report_command(folders: Sequence[Path], threshold: float | None, baseline: str | None) -> str:
+def report_command(
+    folders: Sequence[Path], threshold: float | None, baseline: str | None, *more: str
+) -> str:
     """What writes this report again, without the places of this machine."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [] if baseline is None else [f"--baseline={baseline}"]
-    return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked]))
+    return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked, *more]))
 
 
 def _commands(group: Group) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -77,9 +76,9 @@ def write_pages(
         titles = "; ".join(study.title for study in studies)
         raise OutputError(f"--pages: the runs were not measured alike ({titles}); give fewer")
     (study,) = studies
-    asked = shlex.split(page.report_command(folders, threshold, baseline))
-    asked += [] if scores is None else ["--scores", str(scores)]
-    command = shlex.join([*asked, "--pages", "docs/findings"])
+    more = [] if scores is None else ["--scores", str(scores)]
+    more += ["--pages", str(output)]
+    command = page.report_command(folders, threshold, baseline, *more)
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
     pages = {CHOICE: _choice(study, needs, files), CLAIMS: _claims(study, needs, others, files)}
@@ -100,7 +99,7 @@ def _choice(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
     left = [group for group in study.compared if group.label not in kept]
     table = ranking(study, needs)
     parts = [
-        "# Which curriculum should I use?",
+        f"# Which curriculum should I use? {_where(study)}",
         f"From {_runs(study)}. By what there is, and by what is scarce: the method with the "
         f"highest mean of {words(study.headline)} along training, over a budget of it.",
         _picture(curves.cost_curves(shown)._replace(name="recommended"), files),
@@ -112,6 +111,11 @@ def _choice(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
         parts.append(
             "Not chosen from, because they take something else, too, but in the table below: "
             f"{escape_markdown(', '.join(also))}."
+        )
+    thin = [g.label for g in study.compared if 0 < len(primary(study).values(g)) < FEWEST]
+    if thin and len(thin) < len(study.compared):
+        parts.append(
+            f"Not chosen from for want of {FEWEST} seeds: {escape_markdown(', '.join(thin))}."
         )
     return [*parts, f"## {table.title}", table.to_markdown().strip(), table.note]
 
@@ -160,7 +164,7 @@ def _claims(study: Study, needs: Needs, others: Table, files: dict[str, bytes]) 
         "What the Solver trained on, and its success there": "difficulty",
     }
     parts = [
-        "# What the paper claims and what we found",
+        f"# What the paper claims and what we found {_where(study)}",
         f"From {_runs(study)}.",
         *(text for name in ("learning_curves", "cost") for text in (figures[name], told[name])),
         "## The paper's claims",
@@ -197,13 +201,16 @@ def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
     return f"![{escape_markdown(drawing.title)}]({path})"
 
 
+def _where(study: Study) -> str:
+    return f"({escape_markdown(study.title)})"
+
+
 def _runs(study: Study) -> str:
     seeds = sorted({len(group.runs) for group in study.groups})
     count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     return (
-        f"{len(study.runs)} runs ({escape_markdown(study.title)}): {len(study.groups)} methods or "
-        f"variants, {count} seeds of each, {study.horizon} updates of the Solver, compared by "
-        f"{primary(study).name}"
+        f"{len(study.runs)} runs: {len(study.groups)} methods or variants, {count} seeds of each, "
+        f"{study.horizon} updates of the Solver, compared by {primary(study).name}"
     )
 
 
@@ -216,8 +223,7 @@ def _origin(study: Study, command: str, notes: Sequence[str]) -> str:
     return "\n\n".join(
         [
             f"```bash\n{command}\n```",
-            "writes both pages from the folders of these runs; given `sweeps/medium`, which "
-            "`bin/train +sweep=medium` makes, from those. The runs were made by",
+            "writes both pages from the folders of these runs, which were made by",
             f"```bash\n{made}\n```",
             "\n".join(facts),
         ]

@@ -146,6 +146,17 @@ def test_thin_evidence_chooses_nothing(curves, seeds: int, doubt: str, tmp_path:
     assert ("[" in choice.value) == (seeds >= 5)
 
 
+def test_a_method_with_few_seeds_is_not_chosen_and_hinders_none(tmp_path: Path) -> None:
+    write_methods(tmp_path / "runs", {"plr": FASTEST}, seeds=2)
+    write_methods(tmp_path / "runs", {"accel": SLOW, "robust_plr": FAST})
+    choice = choices(study_of(tmp_path / "runs"), NEEDS)["no target, episodes alone"]["updates"]
+    assert choice is not None and choice.best.label == "robust_plr" and not choice.doubt
+    assert choice.others == 1
+    main([str(tmp_path / "runs"), "--pages", str(tmp_path / "pages")])
+    text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
+    assert "Not chosen from for want of 5 seeds: plr." in text
+
+
 @pytest.mark.parametrize("longer", [1.4, 1.6])
 def test_seconds_decide_nothing_where_the_machine_did_other_things(
     longer: float, tmp_path: Path
@@ -214,7 +225,7 @@ def test_the_same_runs_give_the_same_pages(
 ) -> None:
     monkeypatch.setattr("proposer_rl.report.pages.DRAWINGS", [learning_curves, cost_curves])
     folders = sorted(map(str, runs.iterdir()), reverse=True)
-    command = f"bin/report {runs.name} --pages docs/findings"
+    command = f"bin/report {runs.name} --pages {pages.name}"
     before = contents(pages)
     assert set(before) >= {CHOICE, CLAIMS, "figures/cost.png", "figures/proposals.png"}
     main([*folders, "--pages", str(tmp_path / "again")])
