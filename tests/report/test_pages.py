@@ -293,9 +293,10 @@ def table(lines: Sequence[str], title: str) -> list[dict[str, str]]:
     return [dict(zip(names, row, strict=True)) for row in cells]
 
 
-def test_the_committed_pages_tell_the_committed_results() -> None:
+@pytest.mark.parametrize("pages", [PAGES, PAGES / "medium"], ids=["quick", "medium"])
+def test_the_committed_pages_tell_the_committed_results(pages: Path) -> None:
     """Of each method the primary outcome, as the table of some folder of results has it."""
-    shown = table((PAGES / CHOICE).read_text(encoding="utf-8").splitlines(), "## The methods")
+    shown = table((pages / CHOICE).read_text(encoding="utf-8").splitlines(), "## The methods")
     (primary,) = (name for name in shown[0] if re.search(r"mean over \d+ updates", name))
     told = {row["method"].replace("\\", ""): row[primary].replace("\\", "") for row in shown}
     results = []
@@ -304,7 +305,7 @@ def test_the_committed_pages_tell_the_committed_results() -> None:
         if primary in rows[0]:
             results.append({row["method"]: cell(row, primary) for row in rows})
     assert told in results
-    pictures = [path.stat().st_size for path in (PAGES / "figures").iterdir()]
+    pictures = [path.stat().st_size for path in (pages / "figures").iterdir()]
     assert sum(pictures) < 1.5e6
 
 
