@@ -237,13 +237,19 @@ def _choice(task: Task, choose: Choose) -> Choice | None:
 
     ``choose`` has ``score``, ``source`` and ``rollouts`` of :class:`Scorer`, ``times`` and
     ``temperature`` of :class:`Choice`; None for all.
+
+    Raises:
+        ValueError: if it has not these, or a value is wrong.
     """
     if choose is None:
         return None
-    numbers = dict(choose)
+    scored, drawn = ("score", "source", "rollouts"), ("times", "temperature")
+    if not isinstance(choose, Mapping) or {*choose} != {*scored, *drawn}:
+        keys = ", ".join((*drawn, *scored))
+        raise ValueError(f"choose must be null or have {keys}, and nothing else, got {choose!r}")
     try:
-        scorer = Scorer(task, *(numbers.pop(name) for name in ("score", "source", "rollouts")))
-        return Choice(scorer, **numbers)
+        scorer = Scorer(task, *(choose[name] for name in scored))
+        return Choice(scorer, **{name: choose[name] for name in drawn})
     except ValueError as error:
         raise ValueError(f"choose.{error}") from error
 

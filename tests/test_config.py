@@ -259,6 +259,10 @@ WRONG_COMMANDS = [
         "curriculum: ReplayCurriculum has no setting 'choose'",
     ),
     (
+        ["+method=target", *SMOKE, "curriculum.choose={times: 4}"],
+        "curriculum: choose must be null or have times, temperature, score, source, rollouts",
+    ),
+    (
         ["+method=target", *SMOKE, "+choose=learnability", "curriculum.choose.times=1"],
         "curriculum: choose.times must be a whole number from 2 to 1,000,000, got 1",
     ),
