@@ -112,8 +112,9 @@ def _choice(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
             "Not chosen from, because they take something else, too, but in the table below: "
             f"{escape_markdown(', '.join(also))}."
         )
-    thin = [g.label for g in study.compared if 0 < len(primary(study).values(g)) < FEWEST]
-    if thin and len(thin) < len(study.compared):
+    seeds = {g.label: len(primary(study).values(g)) for g in study.compared if g.label in kept}
+    thin = [label for label, count in seeds.items() if count < FEWEST]
+    if 0 < len(thin) < len(seeds):
         parts.append(
             f"Not chosen from for want of {FEWEST} seeds: {escape_markdown(', '.join(thin))}."
         )
