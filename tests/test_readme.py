@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -114,17 +115,15 @@ def test_the_commands_about_runs_run(
     monkeypatch.setattr("proposer_rl.report.style._render", lambda *_: picture.getvalue())
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [cost_curves])
     monkeypatch.setattr("proposer_rl.report.pages.DRAWINGS", [learning_curves, cost_curves])
-    monkeypatch.chdir(tmp_path)
-    for folder in {arguments[0] for arguments in found}:
-        write_run(tmp_path / folder / "run")
-    for arguments in found:
+    for number, arguments in enumerate(found):
+        for folder in takewhile(lambda word: not word.startswith("-"), arguments):
+            write_run(tmp_path / str(number) / folder / "run")
+        monkeypatch.chdir(tmp_path / str(number))
         if "--scores" in arguments:
             scores = Path(arguments[arguments.index("--scores") + 1])
             scores.parent.mkdir(parents=True, exist_ok=True)
             scores.write_bytes(write_scores([]))
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
-        if "--scores" in arguments:  # no report goes into a folder with other files in it
-            scores.unlink()
 
 
 def test_the_commands_about_levels_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,8 @@ examples:
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
   bin/report sweeps/medium --pages docs/findings/medium   the two pages of the docs
+  bin/report sweeps/medium --publish results/medium/runs   the runs, for others to go on from
+  bin/report outputs results/medium/runs   your runs beside published ones
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -32,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.scores is not None and options.pages is None:
         parser.error("--scores: only the pages of the docs take them up; give --pages, too")
+    if options.publish is not None and (options.threshold, options.baseline) != (None, None):
+        parser.error("--publish: copies runs, so neither --threshold nor --baseline has a meaning")
     command(partial(_run, options))
 
 
@@ -45,6 +49,12 @@ def _run(options: argparse.Namespace) -> None:
         asked = (options.threshold, options.baseline, options.scores)
         for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
             print(f"Page: {page}")
+        return
+    if options.publish is not None:
+        from proposer_rl.report.publish import publish
+
+        copies, left_out = publish(options.folder, options.publish)
+        print(*left_out, f"Runs: {len(copies)} in {options.publish}", sep="\n")
         return
     from proposer_rl.report.build import write_report
 
@@ -79,6 +89,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="write two pages of the docs there instead: which curriculum to use, and which claims "
         "hold",
+    )
+    where.add_argument(
+        "--publish",
+        type=Path,
+        metavar="FOLDER",
+        help="copy the finished runs there instead, without checkpoints and pictures of levels: "
+        "small enough for a repository, and read as any runs are",
     )
     parser.add_argument(
         "--threshold",

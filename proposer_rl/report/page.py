@@ -6,7 +6,6 @@ import base64
 import gzip
 import hashlib
 import json
-import re
 import shlex
 from collections.abc import Sequence
 from importlib.resources import files
@@ -17,7 +16,7 @@ from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
 from proposer_rl.report.answer import Meanings, meaning
-from proposer_rl.report.records import level_text, words
+from proposer_rl.report.records import anywhere, level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import DPI, Drawing, Drawn, Look, in_few_colours
@@ -142,7 +141,7 @@ def commands(study: Study) -> list[str]:
 def configs(study: Study) -> list[tuple[str, str]]:
     """The settings of each group's first run."""
     return [
-        (group.label, _anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
+        (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
         for group in study.groups
     ]
 
@@ -170,7 +169,7 @@ def report_command(
     """What writes this report again, without the places of this machine."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [] if baseline is None else [f"--baseline={baseline}"]
-    return _anywhere(shlex.join(["bin/report", *map(str, folders), *asked, *more]))
+    return anywhere(shlex.join(["bin/report", *map(str, folders), *asked, *more]))
 
 
 def _commands(group: Group) -> list[str]:
@@ -198,15 +197,10 @@ def _command(run: Run) -> str | None:
         for word in (*words, paths or "", config or "")
     ):
         return None
-    before = [f"PYTHONPATH={shlex.quote(_anywhere(paths))}"] if paths else []
+    before = [f"PYTHONPATH={shlex.quote(anywhere(paths))}"] if paths else []
     options = ["--config-dir", config, "-m"] if config else ["-m"]
-    quoted = [shlex.quote(_anywhere(word)) for word in [*options, *words]]
+    quoted = [shlex.quote(anywhere(word)) for word in [*options, *words]]
     return " ".join([*before, "bin/train", *quoted])
-
-
-def _anywhere(text: str) -> str:
-    """Text without the folders of the machine it comes from: of a whole path the last part."""
-    return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
 
 
 def _versions(run: Run) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+import re
 import warnings
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
@@ -117,6 +118,11 @@ def checked(kind: type[T], value: Any, where: str) -> T:
 def printable(text: str) -> str:
     """A text as one line that can do nothing to a terminal."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def anywhere(text: str) -> str:
+    """Text without the folders of the machine it comes from: of a whole path the last part."""
+    return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
 
 
 def picture(encoded: Any) -> NDArray[np.uint8] | None:

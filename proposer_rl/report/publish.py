@@ -1,0 +1,97 @@
+"""Runs without what no table or curve needs: small enough to publish, and read as any run is."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from proposer_rl.report.build import OutputError
+from proposer_rl.report.records import anywhere
+from proposer_rl.report.runs import find_runs, read_run
+from proposer_rl.runs.folder import read_jsonl, storage, write_atomically
+
+UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
+
+
+def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str]]:
+    """Copy finished runs, without checkpoints, pictures of levels and this machine's folders.
+
+    Tables, and figures without levels in them, come out of the copies as they do of the runs.
+
+    Args:
+        folders: of runs, or with runs in them.
+        output: folder to write to; of the runs in it those of the same names are replaced.
+
+    Returns:
+        The folders that were written, and a line for each run that was left out.
+
+    Raises:
+        UnreadableRun: if a folder has no run, or one cannot be read.
+        OutputError: if the output folder holds something else, or two runs have the same name.
+    """
+    found = find_runs(folders)
+    _check(found, output)
+    light, notes = {}, []
+    for folder in found:
+        if all(run.finished for run in read_run(folder)):
+            light[folder.name] = _light(folder)
+        else:
+            notes.append(f"left out: {folder.name}: not finished")
+    for name, files in light.items():
+        _replace(output / name, files)
+    return [output / name for name in light], notes
+
+
+def _check(found: Sequence[Path], output: Path) -> None:
+    named: dict[str, Path] = {}
+    for folder in found:
+        other = named.setdefault(folder.name, folder)
+        if other != folder:
+            raise OutputError(f"--publish: two runs are called {folder.name}: {other}, {folder}")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output}: is a file; give a folder for the runs")
+    others = sorted(output.iterdir()) if output.is_dir() else []
+    for path in others:
+        if not (path / "config.json").is_file():
+            raise OutputError(f"{output}: has {path.name} in it, which is no run; give another")
+
+
+def _light(folder: Path) -> dict[str, bytes]:
+    """Contents of the files, by name."""
+    run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    run["task"].pop("samples", None)
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    files = {name: (folder / name).read_bytes() for name in UNCHANGED if (folder / name).exists()}
+    files |= {"run.json": _json(run), "config.json": _json(config)}
+    for name in ("cycles.jsonl", "levels.jsonl"):
+        if (folder / name).exists():
+            rows = map(_without_bulk, read_jsonl(folder / name))
+            files[name] = "".join(f"{json.dumps(row)}\n" for row in rows).encode()
+    return files
+
+
+def _without_bulk(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without pictures of levels; without returns where success is what is shown."""
+    dropped = {"levels", "return"} if "success" in row else {"levels"}
+    return {key: value for key, value in row.items() if key not in dropped}
+
+
+def _json(value: Any) -> bytes:
+    return (anywhere(json.dumps(value, indent=1)) + "\n").encode()
+
+
+def _replace(folder: Path, files: Mapping[str, bytes]) -> None:
+    """All of it or nothing: a crash leaves a folder whose name begins with a dot."""
+    temporary = folder.with_name(f".{folder.name}.tmp")
+    with storage(folder):
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        for name, content in files.items():
+            write_atomically(temporary / name, content)
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.rename(temporary, folder)

@@ -1,0 +1,137 @@
+"""Published runs: small, of no machine, and read as the runs that they were copied from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from proposer_rl.cli.report import main
+from proposer_rl.report.curves import learning_curves
+from tests.report.folders import LEVEL, cycle, write_run
+
+SECRET = "/home/somebody/code"
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Five seeds of two methods, with pictures wherever there can be any."""
+    told = {"levels": {"the best": [LEVEL] * 2}}
+    cycles = [{**cycle(i, [0.1, 0.2], [[8 - i, 1, 1], [1, 1, 1 + i]]), **told} for i in range(2)]
+    curves = {"perf_gain": [0.0, 0.8, 0.9], "target": [0.0, 0.3, 0.6]}
+    arguments = {"config_dir": f"{SECRET}/conf", "pythonpath": SECRET}
+    for method, curve in curves.items():
+        for seed in range(5):
+            write_run(
+                tmp_path / "runs" / f"{method}_{seed}",
+                method,
+                [seed],
+                [value - 0.01 * seed for value in curve],
+                cycles=cycles if method == "perf_gain" else (),
+                levels=[0.1 * seed, *curve[1:]],
+                facts={"arguments": arguments},
+                checkpoint=f"{SECRET}/runs/5/checkpoints",
+            )
+    return tmp_path / "runs"
+
+
+def published(runs: Path, output: Path) -> Path:
+    main([str(runs), "--publish", str(output)])
+    return output
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_tables_of_the_copies_are_those_of_the_runs(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [learning_curves])
+    light = published(runs, tmp_path / "light")
+    tables = {}
+    for name, folder in {"before": runs, "after": light}.items():
+        main([str(folder), "-o", str(tmp_path / name), "-q"])
+        tables[name] = contents(tmp_path / name / "tables") | contents(tmp_path / name / "figures")
+    assert {"levels.csv", "cycles.csv", "metrics.csv"} < tables["before"].keys()
+    assert tables["after"] == tables["before"]
+
+
+def test_a_copy_has_no_pictures_and_names_no_folder_of_the_machine(
+    runs: Path, tmp_path: Path
+) -> None:
+    found = contents(published(runs, tmp_path / "light"))
+    everything = b"".join(found.values()).decode()
+    assert SECRET not in everything and "somebody" not in everything
+    assert str(LEVEL["picture"]) not in everything
+    assert not any("curriculum.jsonl" in name or "checkpoint" in name for name in found)
+    config = json.loads(found["target_0/config.json"])
+    assert config["checkpoint"] == "checkpoints"
+
+
+def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: Path) -> None:
+    rows = {"a": {"success": [0.5], "return": [0.4]}, "b": {"return": [0.4]}}
+    for name, row in rows.items():
+        folder = write_run(tmp_path / "runs" / name)
+        head = {"seed": 0, "updates": 20, "distribution": "id"}
+        (folder / "levels.jsonl").write_text(json.dumps({**head, **row}) + "\n")
+    found = contents(published(tmp_path / "runs", tmp_path / "light"))
+    kept = [json.loads(found[f"{name}/levels.jsonl"]) for name in rows]
+    assert [set(row) - {"seed", "updates", "distribution"} for row in kept] == [
+        {"success"},
+        {"return"},
+    ]
+
+
+def test_published_runs_are_added_to_and_replaced(runs: Path, tmp_path: Path) -> None:
+    light = published(runs, tmp_path / "light")
+    before = contents(light)
+    assert contents(published(light, light)) == before  # of themselves nothing changes
+    shutil.rmtree(runs)
+    write_run(runs / "target_0", "target", [0], [0.0, 0.1])
+    write_run(runs / "new", "plr", [0])
+    after = contents(published(runs, light))
+    assert {name.partition("/")[0] for name in after} == {
+        *(name.partition("/")[0] for name in before),
+        "new",
+    }
+    changed = {name.partition("/")[0] for name in before if after.get(name) != before[name]}
+    assert changed == {"target_0"}
+    assert "target_0/levels.jsonl" not in after  # nothing of the former run is left
+
+
+def test_a_run_that_goes_on_is_left_out_and_named(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_run(runs / "short", "plr", [0], finished=False)
+    light = published(runs, tmp_path / "light")
+    assert "left out: short: not finished" in capsys.readouterr().out
+    assert not (light / "short").exists() and (light / "target_0").is_dir()
+
+
+def test_what_cannot_be_published_is_one_line_and_changes_nothing(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    write_run(other / "target_0", "target", [7])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit) as end:
+        main([str(runs), "--publish", "new", "--threshold", "0.5"])
+    assert end.value.code == 2 and "--publish: copies runs" in capsys.readouterr().err
+    wrong = {
+        "--publish: two runs are called target_0: ": [str(runs), str(other), "new"],
+        "has thesis.tex in it, which is no run": [str(runs), str(tmp_path / "mine")],
+        "is a file; give a folder": [str(runs), str(tmp_path / "file")],
+    }
+    for message, (*folders, output) in wrong.items():
+        before = contents(tmp_path)
+        with pytest.raises(SystemExit) as end:
+            main([*folders, "--publish", str(output)])
+        assert end.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: ") and message in line
+        assert contents(tmp_path) == before and not Path("new").exists()
