@@ -11,7 +11,7 @@ from typing import Any
 
 from proposer_rl.report.build import OutputError
 from proposer_rl.report.records import anywhere
-from proposer_rl.report.runs import find_runs, read_run
+from proposer_rl.report.runs import begun, find_runs, read_run
 from proposer_rl.runs.folder import read_jsonl, storage, write_atomically
 
 UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
@@ -24,39 +24,46 @@ def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str
 
     Args:
         folders: of runs, or with runs in them.
-        output: folder to write to; of the runs in it those of the same names are replaced.
+        output: folder to write to, laid out as they are below the folders named; of the runs in it
+            those in the same places are replaced.
 
     Returns:
         The folders that were written, and a line for each run that was left out.
 
     Raises:
         UnreadableRun: if a folder has no run, or one cannot be read.
-        OutputError: if the output folder holds something else, or two runs have the same name.
+        OutputError: if the output folder holds something else, or two runs have one place.
     """
-    found = find_runs(folders)
-    _check(found, output)
+    found = _places(folders)
+    _check(output)
     light, notes = {}, []
-    for folder in found:
+    for place, folder in found.items():
         if all(run.finished for run in read_run(folder)):
-            light[folder.name] = _light(folder)
+            light[place] = _light(folder)
         else:
-            notes.append(f"left out: {folder.name}: not finished")
-    for name, files in light.items():
-        _replace(output / name, files)
-    return [output / name for name in light], notes
+            notes.append(f"left out: {place}: not finished")
+    for place, files in light.items():
+        _replace(output / place, files)
+    return [output / place for place in light], notes
 
 
-def _check(found: Sequence[Path], output: Path) -> None:
-    named: dict[str, Path] = {}
-    for folder in found:
-        other = named.setdefault(folder.name, folder)
-        if other != folder:
-            raise OutputError(f"--publish: two runs are called {folder.name}: {other}, {folder}")
+def _places(folders: Sequence[Path]) -> dict[Path, Path]:
+    """The runs by where they are to lie: as they do below the folder that was named."""
+    found: dict[Path, Path] = {}
+    for folder in map(Path.resolve, folders):
+        for run in find_runs([folder]):
+            place = Path(folder.name) if run == folder else run.relative_to(folder)
+            other = found.setdefault(place, run)
+            if other != run:
+                raise OutputError(f"--publish: two runs are called {place}: {other}, {run}")
+    return found
+
+
+def _check(output: Path) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the runs")
-    others = sorted(output.iterdir()) if output.is_dir() else []
-    for path in others:
-        if not (path / "config.json").is_file():
+    for path in sorted(output.iterdir()) if output.is_dir() else ():
+        if not path.is_dir() or not any(begun(path)):
             raise OutputError(f"{output}: has {path.name} in it, which is no run; give another")
 
 

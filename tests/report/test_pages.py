@@ -30,7 +30,8 @@ from proposer_rl.report.pages import CHOICE, CLAIMS
 from proposer_rl.report.runs import UnreadableRun
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
-from proposer_rl.report.tables import write
+from proposer_rl.report.style import Drawing
+from proposer_rl.report.tables import escape_markdown, write
 from tests.report.folders import cycle, write_rockets, write_run
 
 ROOT = Path(__file__).parents[2]
@@ -307,6 +308,30 @@ def test_the_committed_pages_tell_the_committed_results(pages: Path) -> None:
     assert told in results
     pictures = [path.stat().st_size for path in (pages / "figures").iterdir()]
     assert sum(pictures) < 1.5e6
+
+
+def test_the_committed_pages_come_out_of_the_published_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Word for word, in a clean clone; pictures are not drawn again."""
+
+    def named(drawing: Drawing, files: object) -> str:
+        return f"![{escape_markdown(drawing.title)}](figures/{drawing.name}.png)"
+
+    monkeypatch.setattr("proposer_rl.report.pages._picture", named)
+    monkeypatch.chdir(ROOT)
+    medium = Path("results", "medium")
+    folders = [str(medium / "runs"), "--scores", str(medium / "scores.csv")]
+    main([*folders, "--pages", str(tmp_path / "again")])
+    for name in (CHOICE, CLAIMS):
+        before, after = (
+            (folder / name).read_text(encoding="utf-8").splitlines()
+            for folder in (PAGES / "medium", tmp_path / "again")
+        )
+        assert f"bin/report {' '.join(folders)} --pages docs/findings/medium" in before
+        assert [line for line in after if "--pages" not in line] == [
+            line for line in before if "--pages" not in line
+        ]
 
 
 def cell(row: Mapping[str, str], name: str) -> str:

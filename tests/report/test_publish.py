@@ -102,6 +102,17 @@ def test_published_runs_are_added_to_and_replaced(runs: Path, tmp_path: Path) ->
     assert "target_0/levels.jsonl" not in after  # nothing of the former run is left
 
 
+def test_runs_lie_as_they_did_below_the_folder_that_was_named(tmp_path: Path) -> None:
+    """Solvers of several lifetimes have folders of the same names; a lone run keeps its own."""
+    for seed in range(2):
+        write_run(tmp_path / "lives" / str(seed) / "lifetime_0", seeds=[seed])
+    light = published(tmp_path / "lives", tmp_path / "light")
+    published(write_run(tmp_path / "alone"), light)
+    places = {str(path.parent.relative_to(light)) for path in light.rglob("config.json")}
+    assert places == {"0/lifetime_0", "1/lifetime_0", "alone"}
+    assert contents(published(light, light)) == contents(light)
+
+
 def test_a_run_that_goes_on_is_left_out_and_named(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
