@@ -91,6 +91,7 @@ def difficulty(study: Study) -> Drawing | None:
     names = list(dict.fromkeys(name for run in study.runs for name in run.statistics))
     if not names:
         return None
+    told = [group for group in study.groups if any(run.statistics for run in group.runs)]
     return Drawing(
         "difficulty",
         "What the Solver trained on",
@@ -98,7 +99,7 @@ def difficulty(study: Study) -> Drawing | None:
         "says so standard deviations (sd). Lines and bands as above.",
         [_curve_panel(study, name, "training") for name in names[:MOST_PANELS]],
         3,
-        study.legend,
+        {group.label: group.look for group in told},
     )
 
 
@@ -181,7 +182,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
             va="center",
             fontsize=8,
         )
-    axes.set_yticks(range(len(groups)), [fill(group.label, 24) for group in groups])
+    axes.set_yticks(range(len(groups)), [fill(group.label, 32) for group in groups], fontsize=8)
     axes.set_xlim(0, horizon * 1.42)
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")

@@ -64,6 +64,7 @@ def worst_curves(study: Study) -> Drawing | None:
     if not names:
         return None
     levels = study.example.task.levels
+    tellers = [g for g in study.groups if any(study.tellers(g, name) for name in names)]
     return Drawing(
         "worst_share",
         f"The worst share of the {levels} at the end (CVaR)",
@@ -77,7 +78,7 @@ def worst_curves(study: Study) -> Drawing | None:
             )
             for name in names
         ],
-        legend=study.legend,
+        legend={group.label: group.look for group in tellers},
     )
 
 

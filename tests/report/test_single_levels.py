@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.report.charts import charts
+from proposer_rl.report.curves import difficulty
 from proposer_rl.report.outcomes import group_table
 from proposer_rl.report.single_levels import (
     level_by_level,
@@ -135,3 +136,15 @@ def test_without_single_levels_there_is_no_figure(tmp_path: Path) -> None:
     assert worst_curves(study) is None and level_by_level(study) is None
     assert worst_table(study)[1] == [] and level_table(study)[1] == []
     assert not any("IQM" in name for name in group_table(study).columns)
+
+
+def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
+    """Not those whose runs keep no levels, or no table of what the Solver trained on."""
+    write_run(tmp_path / "full", "target", levels=[0.5])
+    write_run(tmp_path / "bare", "plr")
+    (tmp_path / "bare" / "training.csv").unlink()
+    study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
+    assert set(study.legend) == {"target", "plr"}
+    for draw in (worst_curves, difficulty):
+        drawing = draw(study)
+        assert drawing is not None and drawing.legend == {"target": study.legend["target"]}
