@@ -69,7 +69,7 @@ class Training:
             stream = Streams(0, "update", self.count)
             levels = self.curriculum.propose(self.learner, self.count, [stream]).levels
             self.learner.env.set_levels(levels)
-            update = self.learner.update([stream.generator("actions", device=self.task.device)])
+            update = self.learner.update([stream.generator("actions")])
             self.learner.check()
             self.curriculum.observe(self.learner, levels, update)
             self.count += 1

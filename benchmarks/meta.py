@@ -77,7 +77,7 @@ class StepParts:
         self.solvers = env.solvers
         self.task = env.view.task
         self.streams = [Streams(copy, "bench") for copy in range(env.batch_size[0])]
-        self.generators = [stream.generator(device=self.task.device) for stream in self.streams]
+        self.generators = [stream.generator() for stream in self.streams]
         self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
 
     def __call__(self) -> None:

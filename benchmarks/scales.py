@@ -109,9 +109,7 @@ class Solvers:
 
     def __init__(self, task: MazeTask, copies: int = 1, batches: int = 3) -> None:
         self.ppo: PPO = task.learner([Streams(copy, "solver") for copy in range(copies)])
-        self._generators = [
-            Streams(copy, "actions").generator(device=task.device) for copy in range(copies)
-        ]
+        self._generators = [Streams(copy, "actions").generator() for copy in range(copies)]
         shape = torch.Size([copies, task.batch_size])
         drawn = [
             task.target.sample(shape.numel(), Streams(batch, "levels").generator()).reshape(shape)

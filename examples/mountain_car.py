@@ -182,8 +182,9 @@ class MountainCarTask:
         places = [[float(level["start"])] for level in levels]
         if rollout is not None:
             seen = 0.9 * rollout["next", "observation"][..., 0]
-            ends = rollout["next", "terminated"].squeeze(-1).long().cumsum(-1) <= 1
-            places = [p + s[e].tolist() for p, s, e in zip(places, seen, ends, strict=True)]
+            done = rollout["next", "done"].squeeze(-1).long()
+            first = done.cumsum(-1) - done == 0
+            places = [p + s[e].tolist() for p, s, e in zip(places, seen, first, strict=True)]
         return [
             {
                 "picture": png(draw_valley(where)),

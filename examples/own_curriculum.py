@@ -25,20 +25,21 @@ from proposer_rl import PPO, Curriculum, Proposal, SamplingCurriculum, Streams
 from proposer_rl.learning import Update, first_episode_success
 from proposer_rl.mazes import Level
 from proposer_rl.methods import Parts
+from proposer_rl.task import Distribution
 
 
 class Again(Curriculum):
     """Levels of another curriculum, and those of the last update that were failed on.
 
     Args:
-        fresh: proposes the new ones.
+        fresh: draws the new ones.
         probability: with which a failed level takes the place of a new one.
     """
 
-    def __init__(self, fresh: Curriculum, probability: float) -> None:
+    def __init__(self, fresh: Distribution, probability: float) -> None:
         if not 0 <= probability <= 1:
             raise ValueError(f"probability must be from 0 to 1, got {probability}")
-        self._fresh = fresh
+        self._fresh = SamplingCurriculum(fresh)
         self._probability = probability
         self.begin()
 
@@ -54,14 +55,15 @@ class Again(Curriculum):
             return proposal
         problems = levels.batch_size[1]
         draws = torch.stack([torch.rand(problems, generator=s.generator("again")) for s in streams])
-        again = self._last["failed"] & (draws < self._probability).to(self._last["failed"].device)
-        last = TensorDict(self._last["levels"], levels.batch_size)
+        device = levels.walls.device  # what was remembered is on the CPU, as after a checkpoint
+        again = (self._last["failed"] & (draws < self._probability)).to(device)
+        last = TensorDict(self._last["levels"], levels.batch_size).to(device)
         return proposal._replace(levels=Level.from_tensordict(last).where(again, levels))
 
     def observe(self, learner: PPO, levels: Level, update: Update) -> None:
         """Remember the levels and on which of them the first episode failed."""
-        failed = ~first_episode_success(update.rollout)
-        self._last = {"levels": levels.to_tensordict().to_dict(), "failed": failed}
+        failed = ~first_episode_success(update.rollout).cpu()
+        self._last = {"levels": levels.cpu().to_tensordict().to_dict(), "failed": failed}
 
     def state_dict(self) -> dict[str, Any]:
         """The last update's levels and failures."""
@@ -74,13 +76,13 @@ class Again(Curriculum):
 
 def again(parts: Parts, probability: float) -> Curriculum:
     """The factory that the configuration names: from a run's parts to its curriculum."""
-    return Again(SamplingCurriculum(parts.task.target), probability)
+    return Again(parts.task.target, probability)
 
 
 def main(updates: int = 60) -> None:
     """Train a Solver on the target, half of the failed levels once more."""
     task = small_task()
-    report(train(task, Again(SamplingCurriculum(task.target), 0.5), updates))
+    report(train(task, Again(task.target, 0.5), updates))
 
 
 if __name__ == "__main__":

@@ -74,6 +74,7 @@ class Experiment:
         self.folder = folder
         self.updates = 0
         self.cycles = 0
+        self._advances = False  # whether the Solver becomes a copy in place of training itself
         self.curriculum_frames = 0
         self.evaluations = 0
         self._log = log
@@ -204,8 +205,9 @@ class Experiment:
             self.folder.append("cycles.jsonl", {**place, **outcome.metrics})
             self._tell("cycles", outcome.metrics)
         self.cycles += 1
+        self._advances = outcome.advance is not None
         if outcome.advance is not None:
-            self.updates = min(self.updates + outcome.advance.updates, self.schedule.updates)
+            self.updates += outcome.advance.updates
             self._measure()
             self._record(outcome.advance.levels, outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
@@ -220,10 +222,7 @@ class Experiment:
             self.curriculum_frames += frames
             self.evaluations += evaluations
             self.learner.env.set_levels(levels)
-            device = self.learner.env.device
-            update = self.learner.update(
-                [stream.generator("actions", device=device) for stream in streams]
-            )
+            update = self.learner.update([stream.generator("actions") for stream in streams])
             self.learner.check()
         self.curriculum.observe(self.learner, levels, update)
         self.updates += 1
@@ -239,7 +238,7 @@ class Experiment:
         left = updates - self.updates
         self._status.plan(
             {
-                TRAINING: left,
+                TRAINING: 0 if self._advances else left,
                 IMPROVING: -(-updates // length) - self.cycles,
                 MEASURING: -(-left // self.schedule.evaluate_every),
             }

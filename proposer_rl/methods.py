@@ -293,15 +293,21 @@ def learnability(
 
 
 def first_order_proposer(
-    parts: Parts, target_levels: int, copies: int = 0, choose: Choose = None, **numbers: Any
+    parts: Parts,
+    target_levels: int,
+    measure: str = "log_success",
+    copies: int = 0,
+    choose: Choose = None,
+    **numbers: Any,
 ) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
 
     Args:
         parts: the task, whose performance must have gradients, and the Proposer's settings: of
-            them the probes, the network and PPO's other numbers, and with copies the length of
-            their episode.
+            them the probes, the network, of PPO how far a step goes (``adam_eps``,
+            ``clip_epsilon``, ``max_grad_norm``), and with copies the length of their episode.
         target_levels: see :class:`FirstOrderProposer`.
+        measure: the same.
         copies: the same.
         choose: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
@@ -315,6 +321,7 @@ def first_order_proposer(
         probe_levels=parts.proposer.probe_levels,
         choice=_choice(parts.task, choose),
         target_levels=target_levels,
+        measure=measure,
         copies=copies,
         copy_updates=parts.proposer.meta_episode_length,
         on_update=parts.on_update or (lambda done: None),
@@ -353,8 +360,10 @@ def _problem_policy(
     """
     _one_solver(parts)
     task, chosen = parts.task, parts.proposer
+    drawn = isinstance(chosen.action, ProblemSettings)
+    action = chosen.action if drawn else ProblemSettings()
     with Streams(parts.seeds[0], "proposer").as_default("weights"):
-        agent = proposer_agent(task, replace(chosen, observes=[], action=ProblemSettings()))
+        agent = proposer_agent(task, replace(chosen, observes=[], action=action))
     numbers = replace(
         chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )

@@ -44,11 +44,12 @@ class Streams:
         """The streams below a further scope."""
         return Streams(self._seed, *self._scope, *scope)
 
-    def generator(
-        self, *key: str | int, device: torch.device | str | None = None
-    ) -> torch.Generator:
-        """A fresh generator for ``key``; equal keys give generators in equal states."""
-        generator = torch.Generator(device or "cpu")
+    def generator(self, *key: str | int) -> torch.Generator:
+        """A fresh generator on the CPU for ``key``; equal keys give generators in equal states.
+
+        Numbers are drawn there for every device: generators of other devices draw others.
+        """
+        generator = torch.Generator()
         generator.manual_seed(self._seed_of(*key))
         return generator
 

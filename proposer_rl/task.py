@@ -119,7 +119,7 @@ class Task(Protocol):
 
         ``return`` float [K, E] is the expected return of an episode or an estimate of it,
         ``success`` the probability of success, where that has a meaning. An exact evaluation has no
-        use for the generator, which is one of the device.
+        use for the generator, which is on the CPU.
         """
 
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:

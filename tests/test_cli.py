@@ -63,6 +63,16 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> Non
     assert tables(Path("run")) == before
 
 
+def test_a_damaged_summary_is_named(train, capsys) -> None:
+    arguments = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
+    assert train(*arguments) == 0
+    for content in ("{", "[]", "{}"):
+        Path("run/summary.json").write_text(content)
+        capsys.readouterr()
+        assert train(*arguments) == 2
+        assert "summary.json: is damaged; remove it" in capsys.readouterr().err
+
+
 def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkeypatch) -> None:
     command = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*command) == 0

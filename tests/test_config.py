@@ -280,6 +280,22 @@ WRONG_COMMANDS = [
         "schedule.cycle_length=5 must equal proposer.meta_episode_length=3",
     ),
     (
+        ["+method=perf_gain", *SMOKE, "+ablation=advance_best", "schedule.updates=7"],
+        "schedule.updates=7 must be a multiple of proposer.meta_episode_length=3",
+    ),
+    (
+        ["+method=first_order_gain", *SMOKE, "curriculum.measure=luck"],
+        "curriculum: measure must be log_success or return, got 'luck'",
+    ),
+    (
+        ["+method=plr", *SMOKE, "curriculum.new_levels=3"],
+        "curriculum: must be values by the names of axes ['obstacle fraction', ",
+    ),
+    (
+        ["+method=first_order_proposer", *SMOKE, "curriculum.epochs=0"],
+        "curriculum: epochs must be a whole number from 1",
+    ),
+    (
         ["+method=perf_gain", *SMOKE, "proposer.action_repeat=2"],
         "action_repeat=2 must divide meta_episode_length=3",
     ),
@@ -297,7 +313,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],
-        "'abacus': must",
+        "compute.worker_devices='abacus': must be auto, cpu or a usable one",
     ),
     (["--experimental-rerun", "x.pickle"], "--experimental-rerun: not supported"),
 ]

@@ -304,7 +304,7 @@ def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
 def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> None:
     learnt, solver = proposer(own_action=own), learners(1)
     learnt.improve(solver, 0, cycle(0))
-    # Another network with its weights, as from a checkpoint, and the very same one.
+    # Another network with its weights, as from a checkpoint.
     agent = proposer_agent(mix=False)
     load_agent(agent, weights(learnt))
     env = meta_env()
@@ -312,11 +312,10 @@ def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> N
         agent, env.view, env.actions, meta_episode_length=L, action_repeat=1, own_action=own
     )
     before = weights(learnt)
-    for frozen in (learnt.frozen(), loaded):
-        assert frozen.improve(solver, 0, cycle(0)) == Improvement()
-        for number in range(3):
-            expected = learnt.propose(solver, number, update(number)).levels
-            assert (frozen.propose(solver, number, update(number)).levels == expected).all()
+    assert loaded.improve(solver, 0, cycle(0)) == Improvement()
+    for number in range(3):
+        expected = learnt.propose(solver, number, update(number)).levels
+        assert (loaded.propose(solver, number, update(number)).levels == expected).all()
     assert (weights(learnt) == before).all()
 
 
@@ -333,7 +332,17 @@ def test_a_frozen_one_sees_the_next_solver_through_levels_of_its_life() -> None:
     """As one that has seen no other Solver."""
     lives = [[Streams(0, *scope)] for scope in ((), ("lifetime", 1))]
     first, second = learners(1), TASK.learner([Streams(1, "solver")])
-    old, fresh = (proposer(**HELD).frozen() for _ in range(2))
+    old, fresh = (
+        ProposerCurriculum(
+            learnt.agent,
+            learnt.view,
+            learnt.actions,
+            meta_episode_length=4,
+            action_repeat=2,
+            own_action="sample",
+        )
+        for learnt in (proposer(**HELD), proposer(**HELD))
+    )
     old.improve(first, 5, lives[0])
     for updates in (5, 6, 7):  # the last begins an action that is to hold for one more
         old.propose(first, updates, update(updates))

@@ -130,7 +130,10 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
         (["nowhere"], "nowhere: there is no such file or folder"),
         (["."], ".: holds no checkpoints; give a run's folder or a checkpoint"),
         (["{run}/metrics.csv"], "metrics.csv"),
-        (["{run}", "--levels", "mazes"], "--levels mazes: must be a file that ends in .txt or "),
+        (
+            ["{run}", "--levels", "mazes"],
+            "--levels mazes: must be one of: shapes, small, a file ",
+        ),
         (["{run}", "--levels", "none.txt"], "--levels none.txt: there is no such file"),
         (["{run}", "--levels", "bad.json"], "bad.json: is no JSON"),
         (["{run}", "--levels", "small.txt"], "level 'small': its 3x5 cells are halved to nothing"),
@@ -213,7 +216,7 @@ def test_several_runs_are_compared_by_their_means(
         (["{run}", "{run}"], "--levels: name the sets"),
         (["{run}", "--levels", "small", "shapes", "--pictures", "x.png"], "--pictures: give one"),
         (["{run}", "--levels", "small", "shapes", "-o", "x.json"], "are written as .csv"),
-        (["{run}", "{run}", "--levels", "nothing"], "must be a file that ends in"),
+        (["{run}", "{run}", "--levels", "nothing"], "must be one of: "),
         (["{run}", "--levels", "id@1x2"], "--levels id@1x2: "),
     ],
 )

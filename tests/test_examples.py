@@ -16,7 +16,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.curricula import SamplingCurriculum
 from proposer_rl.mazes import Level
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
@@ -93,12 +92,12 @@ def failures(probability: float, example: Load) -> tuple[Level, Tensor, Level]:
     task = example("small_mazes").small_task()
     solver = task.learner([Streams(0, "solver")])
     make = example("own_curriculum").Again
-    curriculum = make(SamplingCurriculum(task.target), probability)
+    curriculum = make(task.target, probability)
     levels = curriculum.propose(solver, 0, [Streams(0)]).levels
     solver.env.set_levels(levels)
     update = solver.update([torch.Generator().manual_seed(0)])
     curriculum.observe(solver, levels, update)
-    resumed = make(SamplingCurriculum(task.target), probability)
+    resumed = make(task.target, probability)
     resumed.load_state_dict(curriculum.state_dict())
     following = [c.propose(solver, 1, [Streams(1)]).levels for c in (curriculum, resumed)]
     assert (following[0] == following[1]).all()

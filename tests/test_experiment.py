@@ -192,9 +192,9 @@ class Jumps(SamplingCurriculum):
 def test_an_advance_takes_the_updates_of_its_cycle(tmp_path: Path) -> None:
     run = experiment(tmp_path, 0, curriculum=Jumps())
     summary = run.run()
-    assert [row["updates"] for row in read_csv(tmp_path / "metrics.csv")] == [0, 2, 4, 5]
-    assert [row["updates"] for row in read_csv(tmp_path / "training.csv")] == [2, 4, 5]
-    assert summary["updates"] == 5 and run.cycles == 3
+    assert [row["updates"] for row in read_csv(tmp_path / "metrics.csv")] == [0, 2, 4, 6]
+    assert [row["updates"] for row in read_csv(tmp_path / "training.csv")] == [2, 4, 6]
+    assert summary["updates"] == 6 and run.cycles == 3
     assert all((entry["step"] == 2 * 3).all() for entry in run.learner.snapshot().values())
 
 

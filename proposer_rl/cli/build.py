@@ -201,6 +201,12 @@ def _check_cycle(config: RunConfig) -> None:
             f"schedule.cycle_length={length} must equal proposer.meta_episode_length={episode} "
             f"where proposer.advance={config.proposer.advance}"
         )
+    if config.schedule.updates % episode:
+        raise ConfigError(
+            f"schedule.updates={config.schedule.updates} must be a multiple of "
+            f"proposer.meta_episode_length={episode} where proposer.advance="
+            f"{config.proposer.advance}: a Solver that becomes a copy has all of its updates"
+        )
 
 
 def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
@@ -232,14 +238,14 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
     available = torch.cuda.device_count() if on_gpus else available_cores()
     count = compute.workers or min(copies, available)
     shares(copies, count)
+    devices = compute.worker_devices or _devices(compute, task.device)
     if compute.collector == "multiprocess":
-        for name in compute.worker_devices or []:
-            _device(name)
+        devices = [str(_device(name, "worker_devices")) for name in devices]
     cores = compute.cores or max(1, available_cores() // count)
     settings = WorkerSettings(
         engine=compute.collector,
         workers=count,
-        devices=compute.worker_devices or _devices(compute, task.device),
+        devices=devices,
         cores=cores,
         ray_address=compute.ray_address,
     )
@@ -257,7 +263,7 @@ def _devices(compute: ComputeSettings, device: torch.device) -> list[str]:
     return [device.type]
 
 
-def _device(name: str) -> torch.device:
+def _device(name: str, key: str = "device") -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -267,5 +273,5 @@ def _device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         reason = one_line(error)[:120]
         raise ConfigError(
-            f"compute.device={name!r}: must be auto, cpu or a usable one: {reason}"
+            f"compute.{key}={name!r}: must be auto, cpu or a usable one: {reason}"
         ) from error

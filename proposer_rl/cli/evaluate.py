@@ -31,6 +31,7 @@ from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
 from proposer_rl.report.generalisation import Score as RunScore
 from proposer_rl.report.generalisation import (
+    check_names,
     generalisation_table,
     read_scores,
     scored,
@@ -120,18 +121,19 @@ def _compare(options: argparse.Namespace) -> None:
         raise ConfigError("--levels: name the sets of levels on which several runs are compared")
     if output is not None and output.suffix != ".csv":
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
-    if options.max_steps is not None and output is not None and output.exists():
-        raise ConfigError(
-            f"--output {output}: holds scores with a step limit that it does not tell"
-        )
+    if options.max_steps is not None and output is not None:
+        raise ConfigError(f"--max-steps: --output {output} would not tell it; leave one out")
     studies, notes = read_studies(find_runs(options.checkpoint), None)
     scores = read_scores(output) if output is not None and output.exists() else []
-    for run in tqdm(
-        whole(group for study in studies for group in study.groups), leave=False, disable=None
-    ):
+    runs = whole(group for study in studies for group in study.groups)
+    check_names(runs)
+    failures = 0
+    for run in tqdm(runs, leave=False, disable=None):
         try:
             scores += _missing(run, names, scores, options.max_steps)
         except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
+            if len(runs) == (failures := failures + 1):
+                raise
             notes.append(f"left out: {error}")
         if output is not None:
             write_atomically(output, write_scores(scores))
@@ -236,7 +238,7 @@ def _on_distribution(
         raise ConfigError("--max-steps: the step limit of this task's levels is fixed")
     streams = Streams(0, "eval", name)
     levels = task.distributions[name].sample(DRAWN, streams.generator())
-    performance = task.performance(agent, levels, streams.generator(device=task.device)).cpu()
+    performance = task.performance(agent, levels, streams.generator()).cpu()
     copies, count = performance.batch_size
     return [
         Score(

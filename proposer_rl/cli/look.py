@@ -56,7 +56,7 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     task = make_task(config)
     frozen = frozen_proposer(Parts(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
-    stages = _stages(task, frozen, checkpoints(solvers))
+    stages = _stages(task, frozen, checkpoints(solvers), len(config.seeds))
     rows = []
     for stage in stages:
         shares = _shares(frozen, stage.seen, task.batch_size)
@@ -71,12 +71,12 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     return rows
 
 
-def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path]) -> list[Stage]:
+def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path], solvers: int) -> list[Stage]:
     learner = task.learner([Streams(0)])
     stages = []
     for file in files:
         _, state = load_checkpoint(file)
-        learner.restore(TensorDict(state["solver"], [1]))
+        learner.restore(TensorDict(state["solver"], [solvers])[:1])
         stages.append(Stage(state["updates"], frozen.view.observe(learner.agent, 0.0)))
     return stages
 
@@ -89,7 +89,7 @@ def _shares(frozen: ProposerCurriculum, seen: TensorDict, batch_size: int) -> Te
         action = distribution.mode
     else:
         # One generator for all: the same numbers for whatever is seen, so that only that differs.
-        generator = Streams(0, "look").generator(device=seen.device)
+        generator = Streams(0, "look").generator()
         shape = torch.Size([1, *distribution.batch_shape, *distribution.event_shape])
         action = draw(distribution, uniform_noise(shape, 1, [generator], seen.device)[0, 0])
     generators = [Streams(0, "look", k).generator() for k in range(SAMPLES)]

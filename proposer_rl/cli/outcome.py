@@ -19,6 +19,7 @@ from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
+from proposer_rl.report.records import is_rate, level_text
 from proposer_rl.report.terminal import screen
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import processor
@@ -99,13 +100,15 @@ def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, pictu
 
 
 def _outcome_text(result: dict[str, Any], reached: int | None, final: dict[str, float]) -> str:
-    level = f"{result['threshold']:.0%} {result['headline'].replace('_', ' ')}"
+    headline = result["headline"]
+    level = f"{level_text(headline, result['threshold'])} {headline.replace('_', ' ')}"
+    end = f"{final[headline]:.1%}" if is_rate(headline) else f"{final[headline]:.3g}"
     outcome = (
         f"{level} after {reached} updates"
         if reached is not None
         else f"{level} not reached in {result['updates']} updates (censored)"
     )
-    return f"{outcome}; {final[result['headline']]:.1%} at the end."
+    return f"{outcome}; {end} at the end."
 
 
 def _cost_text(result: dict[str, Any], seeds: int) -> str:

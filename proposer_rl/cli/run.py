@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import RunConfig, overrides
+from proposer_rl.cli.config import ConfigError, RunConfig, overrides
 from proposer_rl.cli.errors import SIGNALLED, one_line
 from proposer_rl.cli.outcome import announce, identity, run_name
 from proposer_rl.cli.same_run import check_same_run
@@ -125,8 +125,15 @@ def _value(result: dict[str, Any], config: RunConfig) -> float:
 def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
     """The summary of a run that is already at the end of its schedule."""
     file = folder / "summary.json"
-    summary: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"updates": 0}
-    return summary if summary["updates"] >= config.schedule.updates else None
+    if not file.exists():
+        return None
+    try:
+        summary: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return summary if summary["updates"] >= config.schedule.updates else None
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError(
+            f"{file}: is damaged; remove it to go on from the last checkpoint"
+        ) from error
 
 
 def _how_to_go_on(folder: RunFolder) -> str:

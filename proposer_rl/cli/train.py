@@ -25,6 +25,8 @@ from proposer_rl.cli.sweep import forget_failure, record_failure
 from proposer_rl.cli.traces import remove_traces
 from proposer_rl.runs.signals import StopSignals
 
+BEGUN: list[Path] = []  # folders of this process's runs: what comes after is no matter of overrides
+
 
 def main() -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
@@ -35,13 +37,14 @@ def main() -> None:
 
 def _compose_and_run() -> None:
     _refuse_pickles(sys.argv)
+    BEGUN.clear()
     try:
         _main()
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
     except ValueError as error:
-        if HydraConfig.initialized():
+        if BEGUN:
             raise
         remove_traces()
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
@@ -49,7 +52,7 @@ def _compose_and_run() -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
-    path = Path(HydraConfig.get().runtime.output_dir)
+    BEGUN.append(path := Path(HydraConfig.get().runtime.output_dir))
     signals = StopSignals()
     try:
         forget_failure(path)

@@ -106,7 +106,7 @@ class MixtureCurriculum(Curriculum):
         self._asked = {"points": points, "tasks": places[choices]}
         if self._source == "episodes":
             return Proposal(levels)
-        draws = streams[0].generator("performance", device=self.task.device)
+        draws = streams[0].generator("performance")
         with torch.no_grad():
             reached = self.task.performance(learner.agent, levels, draws)["return"]
         self._asked["returns"] = reached.double().cpu()

@@ -31,9 +31,15 @@ class SomeBins:
     """
 
     def __init__(self, space: Space, values: Mapping[str, Sequence[float]]) -> None:
+        if not isinstance(values, Mapping):
+            raise ValueError(
+                f"must be values by the names of axes {list(space.axes)}, got {values!r}"
+            )
         counts = []
         for name, wanted in values.items():
             known = list(space.axes.get(name, ()))
+            if not isinstance(wanted, Sequence):
+                raise ValueError(f"{name!r}: must be a list of values, got {wanted!r}")
             if not wanted or any(value not in known for value in wanted):
                 axes = {axis: list(all_) for axis, all_ in space.axes.items()}
                 raise ValueError(f"{name!r}: {list(wanted)} must be among the space's axes {axes}")

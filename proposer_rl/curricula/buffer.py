@@ -228,7 +228,7 @@ def rescore(
         best: float [K, P], the highest returns, of which the highest ever is kept.
         solved: bool [K, P], whether there was a success, of which one is enough for ever.
     """
-    mean = _means(_alike(slots), score.where(score.isfinite(), torch.nan))
+    mean = _means(_alike(slots), score)
     old = buffer["score"].gather(1, slots)
     scores = buffer["score"].scatter(1, slots, mean.where(mean.isfinite(), old))
     seen = {
@@ -291,8 +291,9 @@ def _alike(group: Tensor) -> Tensor:
 
 
 def _means(same: Tensor, score: Tensor) -> Tensor:
-    """Means of scores [K, M] over what is the same, bool [K, M, M]; those that are nan left out."""
-    return score.double().unsqueeze(-2).where(same, torch.nan).nanmean(-1)
+    """Means of the finite scores [K, M] over what is the same, bool [K, M, M]; else nan."""
+    counts = same & score.isfinite().unsqueeze(-2)
+    return score.double().unsqueeze(-2).where(counts, torch.nan).nanmean(-1)
 
 
 def _shares(weight: Tensor) -> Tensor:

@@ -50,6 +50,17 @@ def part(name: str, value: Any, *, below_one: bool = False, above_zero: bool = F
     return float(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """The value, if it is true or false.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be true or false, got {value!r}")
+    return value
+
+
 def one_of(name: str, value: Any, known: tuple[str, ...]) -> str:
     """The value, if it is among the known ones.
 

@@ -10,15 +10,16 @@ from torch import Tensor
 
 from proposer_rl.curricula.base import Improvement
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
-from proposer_rl.curricula.checks import part, real
+from proposer_rl.curricula.checks import one_of, part, real, whole
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO, Update
 from proposer_rl.meta.first_order import (
-    advantages,
+    MEASURES,
     alignment,
     bin_scores,
     exact_alignment,
     exact_direction,
+    ppo_advantages,
     surrogate,
     target_direction,
 )
@@ -99,18 +100,13 @@ class FirstOrderCurriculum(_AlignedBins):
         choice: Choice | None = None,
     ) -> None:
         exact = require_gradients(task)
-        if min(target_levels, candidates) < 1:
-            raise ValueError(
-                "target_levels and candidates must be at least 1, got "
-                f"{target_levels}, {candidates}"
-            )
         super().__init__(
             task, every=every, temperature=temperature, smoothing=smoothing, choice=choice
         )
         self._exact = exact
-        self._target_levels = target_levels
-        self._candidates = candidates
-        self._measure = measure
+        self._target_levels = whole("target_levels", target_levels, 1)
+        self._candidates = whole("candidates", candidates, 1)
+        self._measure = one_of("measure", measure, MEASURES)
 
     def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
         """Score every bin."""
@@ -192,11 +188,9 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         task = self.task
         levels = [task.target.sample(task.batch_size, s.generator("target")) for s in streams]
         learner.env.set_levels(torch.stack(levels))
-        rollout = learner.collect(
-            [s.generator("target_actions", device=task.device) for s in streams]
-        )
+        rollout = learner.collect([s.generator("target_actions") for s in streams])
         with torch.enable_grad():
-            worth = surrogate(learner.agent, rollout, advantages(learner, rollout)).mean(1)
+            worth = surrogate(learner.agent, rollout, ppo_advantages(learner, rollout)).mean(1)
             found = target_direction(learner, worth)
         old = self.smoothing if self._direction else 0.0
         before = self._direction or found
@@ -208,7 +202,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
     def observe(self, learner: PPO, levels: Any, update: Update) -> None:
         """Score the bins that were trained on."""
         rollout, score = update.rollout, self.scores["score"]
-        advantage = advantages(learner, rollout)
+        advantage = ppo_advantages(learner, rollout)
         found = alignment(
             learner.agent,
             self._direction,

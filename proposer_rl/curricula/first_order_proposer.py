@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from proposer_rl.curricula.base import Improvement
-from proposer_rl.curricula.checks import whole
+from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.first_order import require_gradients
 from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
 from proposer_rl.learning import PPO, located
-from proposer_rl.meta.first_order import exact_alignment, exact_direction
+from proposer_rl.meta.first_order import MEASURES, exact_alignment, exact_direction
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
@@ -57,7 +57,8 @@ class FirstOrderProposer(ProblemProposer):
     ) -> None:
         self._exact = require_gradients(task)
         super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
-        self._target_levels, self._measure = target_levels, measure
+        self._target_levels = whole("target_levels", target_levels, 1)
+        self._measure = one_of("measure", measure, MEASURES)
         self._copy_updates, self._on_update = copy_updates, on_update
         count = whole("copies", copies, 0)
         self._copies = task.learner([Streams(0)] * count) if count else None
@@ -79,7 +80,7 @@ class FirstOrderProposer(ProblemProposer):
             _, proposal = self.draw_and_learn(copies, each)
             copies.env.set_levels(proposal.levels)
             with located(f"update {update} of the Solver's copies"):
-                copies.update([s.generator("actions", device=self.task.device) for s in each])
+                copies.update([s.generator("actions") for s in each])
                 copies.check()
             told.frames += count * (proposal.frames + batch_size * copies.settings.horizon)
             told.evaluations += count * proposal.evaluations

@@ -48,12 +48,13 @@ class PairedProposer(ProblemProposer):
         probe_levels: int = 16,
         choice: Choice | None = None,
     ) -> None:
-        super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
         self.antagonist = task.learner([streams])
         self._newborn = self.antagonist.snapshot()
+        super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
 
     def begin(self) -> None:
         """The antagonist begins anew, too."""
+        super().begin()
         self.antagonist.restore(self._newborn)
 
     def worth(self, learner: PPO, levels: Levels, streams: Sequence[Streams]) -> Worth:
@@ -62,14 +63,12 @@ class PairedProposer(ProblemProposer):
         (stream,) = streams
         with torch.no_grad():
             returns = [
-                task.performance(
-                    student.agent, levels, stream.generator("regret", device=task.device)
-                )["return"]
+                task.performance(student.agent, levels, stream.generator("regret"))["return"]
                 for student in both
             ]
         regret = (returns[0] - returns[1]).clamp_min(0)
         told = {"regret": float(regret.mean()), "regret_sd": float(regret.std())}
-        self._draws = stream.generator("antagonist", device=task.device)
+        self._draws = stream.generator("antagonist")
         frames = task.batch_size * self.antagonist.settings.horizon
         return Worth(regret, told, frames=frames, evaluations=2 * regret.shape[1])
 

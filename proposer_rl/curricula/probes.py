@@ -70,7 +70,7 @@ class Probes:
             bins = torch.arange(size).repeat_interleave(self._count)
             own = [Streams(*address).generator("probes") for address in self._drawn_from]
             self._levels = self._task.space.generate(bins.expand(len(own), -1), own)
-        draws = streams[0].generator("probe_episodes", device=self._task.device)
+        draws = streams[0].generator("probe_episodes")
         found = self._task.performance(learner.agent, self._levels, draws)
         if self.measure not in found.keys():
             raise NoSuccessError(

@@ -1,4 +1,4 @@
-"""The paper's Proposer, paid for each problem by itself, without copies of the Solver."""
+"""The paper's Proposer, paid for each problem by itself."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.curricula.checks import real, whole
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO
 from proposer_rl.models import ActorCritic, draw
@@ -53,6 +54,9 @@ class ProblemProposer(Curriculum):
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
         choice: of the levels that are trained on, among several times as many draws; None for all.
+
+    Raises:
+        ValueError: if a number is out of range.
     """
 
     def __init__(
@@ -65,6 +69,9 @@ class ProblemProposer(Curriculum):
         choice: Choice | None = None,
     ) -> None:
         self.agent, self.task = agent, task
+        whole("epochs", settings.epochs, 1)
+        real("learning_rate", settings.learning_rate, above=0)
+        real("entropy_coeff", settings.entropy_coeff)
         self._settings = settings
         self._choice = choice
         self._probe_levels = probe_levels
@@ -76,13 +83,17 @@ class ProblemProposer(Curriculum):
             entropy_coeff=settings.entropy_coeff,
             normalize_advantage=True,
             functional=False,
-        )
+        ).to(task.device)  # its numbers are tensors
         self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
         self._parameters = [p for p in agent.parameters() if p.requires_grad]
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
-        self._proposed = torch.zeros(task.space.size, dtype=torch.int64)
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing of the last Solver's cycle is told of the next one."""
+        self._proposed = torch.zeros(self.task.space.size, dtype=torch.int64)
         self._told: dict[str, float] = {}
 
     @abstractmethod
@@ -167,7 +178,11 @@ class ProblemProposer(Curriculum):
         for name, parameter in self.agent.named_parameters():
             entry = dict(state["proposer"][name])
             parameter.data.copy_(entry.pop("value"))
-            self._adam.state[parameter] = {key: value.clone() for key, value in entry.items()}
+            # Adam counts its steps on the CPU, whatever the device.
+            self._adam.state[parameter] = {
+                key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
+                for key, value in entry.items()
+            }
         self._proposed = state["proposed"].clone()
         self._told = dict(state["told"])
 

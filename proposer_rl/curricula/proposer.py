@@ -60,17 +60,6 @@ class ProposerCurriculum(Curriculum):
         self._began = 0  # the Solver's updates at the start of this cycle
         self._action: Tensor | None = None
 
-    def frozen(self) -> ProposerCurriculum:
-        """The Proposer as it is, proposing without learning; it shares network and view."""
-        return ProposerCurriculum(
-            self.agent,
-            self.view,
-            self.actions,
-            meta_episode_length=self.meta_episode_length,
-            action_repeat=self.action_repeat,
-            own_action=self.own_action,
-        )
-
     def begin(self) -> None:
         """Forget the last Solver's cycle."""
         self._began, self._action = 0, None
@@ -121,15 +110,15 @@ class ProposerCurriculum(Curriculum):
             self.trainer.copies.close()
 
     def _act(self, learner: PPO, updates: int, stream: Streams) -> Tensor:
-        progress, device = updates / self.meta_episode_length, self.view.task.device
-        # -1: an episode's number that no rollout of the copies has.
+        progress = updates / self.meta_episode_length
+        # -1: before all episodes of the copies, whose numbers begin at 0.
         state = self.view.observe(learner.agent, progress, -1, updates)
         distribution = self.agent.distribution(self.agent(state))
         if self.own_action == "mode":
             return distribution.mode
-        generator = stream.generator("proposals", device=device)
+        generator = stream.generator("proposals")
         shape = (1, *distribution.batch_shape[1:], *distribution.event_shape)
-        return draw(distribution, torch.rand(shape, generator=generator, device=device))
+        return draw(distribution, torch.rand(shape, generator=generator).to(self.view.task.device))
 
 
 class ProposerTrainer:
@@ -188,7 +177,9 @@ class ProposerTrainer:
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         copies = len(rewards)
-        frames = copies * env.batch_of_levels * env.solvers.settings.horizon
+        # A copy that the Solver becomes is the Solver's own training.
+        trained = copies - (self.advance != "train")
+        frames = trained * env.batch_of_levels * env.solvers.settings.horizon
         return Improvement(
             self._metrics(rollout, rewards, training),
             frames * env.meta_episode_length,

@@ -40,7 +40,7 @@ from proposer_rl.curricula.buffer import (
     replay_weights,
     rescore,
 )
-from proposer_rl.curricula.checks import one_of, part, real, whole
+from proposer_rl.curricula.checks import flag, one_of, part, real, whole
 from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
@@ -91,6 +91,10 @@ class ReplayCurriculum(Curriculum):
         renew: bool = False,
         co_learnability: float = 0.0,
     ) -> None:
+        for name, value in (
+            ("synchronous", synchronous), ("train_on_new", train_on_new), ("renew", renew)
+        ):  # fmt: skip
+            flag(name, value)
         if train_on_new and synchronous:
             raise ValueError(
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
@@ -231,7 +235,9 @@ class ReplayCurriculum(Curriculum):
         """Do what is left to be done of the last update: exact scores, and children."""
         last, self._last = self._last, None
         assert last is not None
-        if not self.scorer.from_episodes and not self._renew:
+        # Where all scores are renewed, those of levels of the buffer need not be taken.
+        known = self._renew and bool(last["replayed"].all())
+        if not self.scorer.from_episodes and not known:
             self._take(last, self._score(learner, last["level"], streams, "trained"))
         replayed = last["replayed"][:, 0]
         if self._edits and bool(replayed.any()):
@@ -256,7 +262,7 @@ class ReplayCurriculum(Curriculum):
         if bool(replayed.any()):
             after = rescore(old, slots, *scored)
             if self._co_learnability:
-                after = self._credit(old, after, slots)
+                after = self._credit(old, after, slots, replayed)
             self.buffer = old.clone()
             self.buffer[replayed] = after[replayed]
         if not bool(replayed.all()):
@@ -264,18 +270,18 @@ class ReplayCurriculum(Curriculum):
             self.buffer = insert(self.buffer, new, self._rule, ~replayed)
             self._scored += slots.shape[1]
 
-    def _credit(self, old: TensorDictBase, after: TensorDict, slots: Tensor) -> TensorDict:
+    def _credit(
+        self, old: TensorDictBase, after: TensorDict, slots: Tensor, replayed: Tensor
+    ) -> TensorDict:
         """Credit the levels that were trained on before with how far the present scores fell."""
         fell = (old["score"] - after["score"]).gather(1, slots).mean(1, keepdim=True)
-        before = self._before
-        self._before = TensorDict(
-            {"slot": slots, "key": after["key"].gather(1, slots)}, slots.shape
-        )
-        if before is None:
-            return after
+        now = {"slot": slots, "key": after["key"].gather(1, slots)}
+        none = {"slot": torch.zeros_like(slots), "key": torch.full_like(slots, -1)}
+        before = TensorDict(none, slots.shape) if self._before is None else self._before
         there = after["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
         credited = torch.zeros_like(after["filled"]).scatter(1, before["slot"], there)
         after["score"] = after["score"] + self._co_learnability * fell * credited
+        self._before = TensorDict(now, slots.shape).where(replayed.unsqueeze(-1), before)
         return after
 
     def _fresh(self, streams: Sequence[Streams], *purpose: str | int) -> Levels:

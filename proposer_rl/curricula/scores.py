@@ -205,13 +205,11 @@ class Scorer:
             The scores, and the frames that they cost each Solver.
         """
         scored, frames = [], 0
-        device = learner.env.device
         for batch, some in enumerate(levels.split(self.task.batch_size, 1)):
             played = []
             for again in range(self.rollouts):
                 learner.env.set_levels(some)
-                place = (*purpose, batch, again)
-                draws = [s.generator("score", *place, device=device) for s in streams]
+                draws = [s.generator("score", *purpose, batch, again) for s in streams]
                 played.append(learner.collect(draws))
                 frames += played[-1][0].numel()
             scored.append(self.of_rollouts(learner, played, *unseen(some.batch_size)))
@@ -234,7 +232,7 @@ class Scorer:
         """
         found = []
         for batch, some in enumerate(levels.split(AT_ONCE, 1)):
-            generator = streams[0].generator("score", *purpose, batch, device=self.task.device)
+            generator = streams[0].generator("score", *purpose, batch)
             found.append(self._exact(learner, some, generator).double().cpu())
         score = torch.cat(found, 1)
         return Scored(score, *unseen(score.shape)), score.shape[1]

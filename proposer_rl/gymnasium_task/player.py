@@ -191,12 +191,14 @@ def set_attribute(environment: Any, path: str, value: float) -> None:
     setattr(place, last, value)
 
 
-def imported(name: str) -> Callable[..., Any]:
+def imported(name: str | None) -> Callable[..., Any]:
     """What a dotted name stands for.
 
     Raises:
         ValueError: if there is no such thing.
     """
+    if name is None:
+        raise ValueError("missing: which function, as module.name")
     module, _, last = name.rpartition(".")
     try:
         found = getattr(import_module(module), last)

@@ -24,7 +24,7 @@ class ParameterSettings:
             of the constructor (the environment is then built anew where it changes), as an option
             of the reset, or by a function that is called with the environment and the number.
         name: of the attribute (dots lead to parts of the environment), argument, option or
-            function; None for the parameter's own name.
+            function (which must be given); None for the parameter's own name.
         values: rising; whole numbers, if all are.
         low, high, bins: of a range.
         target: what is to be mastered: a number; of ``values`` also several, equally likely; of a

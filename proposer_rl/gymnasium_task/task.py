@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -47,6 +48,8 @@ SAMPLES = 6  # levels of each distribution that a reader is shown
 CPU = torch.device("cpu")
 KINDS = ("success", "return")
 
+RESERVED = (SEED, "updates")  # columns of tables, which parameters are, too
+
 
 class GymnasiumTask:
     """An environment of Gymnasium some of whose numbers make a level; a Task.
@@ -65,7 +68,7 @@ class GymnasiumTask:
         reward_scale: what rewards are multiplied with in training; returns are told without it.
         network: of the Solver.
         evaluation: measurements.
-        vectorization: of the environments that Solvers act in: ``"sync"``, or ``"async"`` for a
+        vectorization: of the environments that Solvers train in: ``"sync"``, or ``"async"`` for a
             process each.
         extra: of this package, that the environment needs; None for none.
         solver: the Solver's training.
@@ -251,7 +254,8 @@ class GymnasiumTask:
             self._parameters,
             success=self._rule,
             reward_scale=self._reward_scale,
-            vectorization=self._vectorization,
+            # Of the levels of evaluations a process each would be too many.
+            vectorization="sync" if once else self._vectorization,
             once=once,
         )
 
@@ -263,15 +267,31 @@ class GymnasiumTask:
 
         Each end of each parameter is tried, the others being as in the target.
         """
-        target = plays(self._measured_on["target"][:1])[0]
-        player = LevelPlayer(self._make, self._parameters, target)
-        for settings in self._parameters.values():
+        functions: list[tuple[str, str | None]] = [("wrappers", one) for one in self._make.wrappers]
+        for name, settings in self._parameters.items():
             if settings.set == "call":
-                imported(settings.name or "")
+                functions.append((f"parameters.{name}.name", settings.name))
+        for key, function in functions:
+            try:
+                imported(function)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from error
+        target = plays(self._measured_on["target"][:1])[0]
+        try:
+            player = LevelPlayer(self._make, self._parameters, target)
+        except RefusedLevelError as error:
+            raise ValueError(f"arguments and parameters: {error}") from error
+        shown = player.observation_space, player.action_space
         for name, bins in self.space.bins.items():
             for value in (bins.low[0].item(), bins.high[-1].item()):
                 player.play = Play({**target.values, name: value}, target.seed)
                 player.reset()
+                now = player.observation_space, player.action_space
+                if now != shown:
+                    raise ValueError(
+                        f"parameters.{name}: all levels must show and take the same, but {value:g} "
+                        f"changes {shown} to {now}"
+                    )
         limit = self._make.max_steps or (player.spec and player.spec.max_episode_steps)
         if not limit:
             raise ValueError("max_steps: missing: the environment has no time limit of its own")
@@ -288,8 +308,10 @@ def _spaces(
     bins, target = {}, {}
     for name, settings in parameters.items():
         try:
-            if name == SEED:
+            if name in RESERVED:
                 raise ValueError("is what every level has anyway; choose another name")
+            if not re.fullmatch(r"\w[\w .-]*", name):
+                raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = space_bins(settings), target_bins(settings)
         except ValueError as error:
             raise ValueError(f"parameters.{name}: {error}") from error

@@ -128,7 +128,7 @@ class RolloutEvaluator:
         episodes: Episodes played in each maze.
         greedy: Whether the policy takes the most probable action (of equal ones the first) or
             samples.
-        generator: Source of randomness, on the levels' device; None for the default one.
+        generator: Source of randomness, on the CPU; None for the default one.
     """
 
     max_steps: int = 25
@@ -150,7 +150,7 @@ class RolloutEvaluator:
         Args:
             levels: Levels ``[*B]``.
             cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
-            generator: Source of randomness, on the levels' device; None for the evaluator's own.
+            generator: Source of randomness, on the CPU; None for the evaluator's own.
 
         Returns:
             ``"return"`` and ``"success"``, float32 ``[*B]`` each.
@@ -164,7 +164,7 @@ class RolloutEvaluator:
         cumulative = policy.cumsum(-1).expand(self.episodes, *policy.shape)
         shared = [1] * (len(batch) - 2)
         noise = (self.max_steps, self.episodes, *shared, *levels.batch_size[-1:])
-        uniform = torch.rand(noise, generator=generator, device=levels.walls.device)
+        uniform = torch.rand(noise, generator=generator).to(levels.walls.device)
         state = env.reset()
         playing = torch.ones(batch, dtype=torch.bool, device=levels.walls.device)
         returns = torch.zeros_like(playing, dtype=torch.float32)
@@ -256,7 +256,7 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
 
 
 def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
-    """Action probabilities ``[*B, 4, H, W]``: float64 of float64 logits, else float32."""
+    """Action probabilities ``[*B, 4, H, W]``; of a policy that samples as precise as its logits."""
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)
         return torch.zeros(cell_logits.shape, device=best.device).scatter_(-3, best, 1.0)

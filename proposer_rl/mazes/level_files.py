@@ -23,6 +23,7 @@ L = TypeVar("L", bound=Level)
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
 _RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
+TOO_MUCH = (OverflowError, RecursionError)  # a number, brackets
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -43,7 +44,7 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
     _check_suffix(path, (*SUFFIXES, RECORD))
     content = read_content(path)
     try:
-        text = content.decode()
+        text = content.decode("utf-8-sig")  # some editors begin a file with a mark
         if path.suffix == ".json":
             return levels_from_json(text, kind)
         if path.suffix == RECORD:
@@ -106,6 +107,7 @@ def chosen_levels(
     suffixes: Sequence[str],
     read: Callable[[str], dict[str, L]],
     shipped: Callable[[str], dict[str, L]],
+    known: str,
 ) -> tuple[dict[str, L], bool]:
     """The levels that a user names, and whether they are those of a distribution.
 
@@ -115,6 +117,7 @@ def chosen_levels(
         suffixes: Of files.
         read: Reads a file.
         shipped: Reads a set that comes along.
+        known: What there is, in words.
 
     Raises:
         ValueError: If there is no such thing.
@@ -130,10 +133,7 @@ def chosen_levels(
             return {f"{distribution}_{i:03}": levels[i].cpu() for i in range(len(levels))}, True
     if name in shipped_sets():
         return shipped(name), False
-    known = ", ".join([*distributions, *shipped_sets()])
-    raise ValueError(
-        f"--levels {name}: must be a file that ends in {' or '.join(suffixes)}, or one of: {known}"
-    )
+    raise ValueError(f"--levels {name}: must be one of: {known}")
 
 
 def levels_from_text(
@@ -212,7 +212,7 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
             for nth, level in enumerate(row["levels"], 1):
                 drawn = "\n".join(recorded_drawing(level))
                 found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
-        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, *TOO_MUCH) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
     if not found:
         raise ValueError("holds no levels")

@@ -147,8 +147,13 @@ def _refuse(bad: Tensor, fault: str) -> None:
         raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
 
 
+def drawn_rows(drawing: str) -> list[str]:
+    """The rows of a drawing, without blank lines and what stands before or after a row."""
+    return [row for row in map(str.strip, drawing.splitlines()) if row]
+
+
 def _parse(drawing: str) -> Level:
-    rows = drawing.split()
+    rows = drawn_rows(drawing)
     flat = "".join(rows)
     if not rows or any(len(row) != len(rows[0]) for row in rows):
         raise ValueError(f"a level is a rectangle of characters, got\n{drawing}")

@@ -9,7 +9,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import first_episode_success
-from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.levels import FREE, Level
 from proposer_rl.mazes.rendering import draw_level
 from proposer_rl.runs.pictures import png
@@ -17,7 +16,9 @@ from proposer_rl.runs.pictures import png
 EPISODE = "•"  # a free cell that the Solver's episode went through
 
 
-def level_statistics(levels: Level, rollout: TensorDictBase, solvable: Tensor) -> TensorDict:
+def level_statistics(
+    levels: Level, rollout: TensorDictBase, length: Tensor, solvable: Tensor
+) -> TensorDict:
     """What Solvers trained on and how they fared there, each [K] from [K, P].
 
     - ``obstacle_fraction``: obstacles per cell;
@@ -29,9 +30,9 @@ def level_statistics(levels: Level, rollout: TensorDictBase, solvable: Tensor) -
     Args:
         levels: Levels ``[K, P]``.
         rollout: of Solvers on them, ``[K, P, T]``.
+        length: Moves on the shortest paths, int64 ``[K, P]``; negative where there is none.
         solvable: bool ``[K, P]``.
     """
-    length = shortest_path_length(levels)
     mean, deviation = _moments(length.float(), length >= 0)
     return TensorDict(
         {

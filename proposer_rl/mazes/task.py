@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -64,7 +64,7 @@ LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 TEXT_KEY = f"S start, G goal, {EPISODE} the Solver's episode"
-_ON_A_GRID = re.compile(r"(\w+)@(\d{1,3})x(\d{1,3})")
+_ON_A_GRID = re.compile(r"(.+)@(\d{1,3})x(\d{1,3})")
 KEY = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
 
 
@@ -104,13 +104,18 @@ class MazeTask:
         make_network: Any = None,
     ) -> None:
         check_names(distributions, target, evaluation.distributions)
-        _check_network(maze, network)
-        _check_target(maze, target, distributions[target])
+        _check_grid(maze)
+        if make_network is None:
+            _check_network(maze, network)
+        _check_paths(maze, distributions, {target, *evaluation.distributions})
         self.maze = maze
         self.solver = solver
         self.batch_size = solver.batch_size
         self.device = torch.device(place.device)
-        self.precision = _precision(place, network)
+        self.precision = place.precision
+        if place.precision == "auto":
+            own = make_network is not None
+            self.precision = "fp32" if own else faster_precision(network.channels, self.device)
         self.cores = place.cores
         self._network = network
         self._make_network = make_network or self._unet
@@ -232,6 +237,9 @@ class MazeTask:
 
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
+        if not levels.numel():
+            shown = planes(levels.expand(agent.copies, 0))
+            return shown.new_zeros(*shown.shape[:2], PLANES + ACTIONS, *shown.shape[-2:])
         copies, logits = _with_logits(agent, levels)
         return torch.cat([planes(copies), logits], -3)
 
@@ -268,7 +276,7 @@ class MazeTask:
         """What the Solvers trained on; see :func:`~proposer_rl.mazes.records.level_statistics`."""
         length = shortest_path_length(levels)
         solvable = (length >= 0) & (length <= self.maze.max_steps)
-        return level_statistics(levels, rollout, solvable)
+        return level_statistics(levels, rollout, length, solvable)
 
     def record(self, levels: Level, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
         """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
@@ -283,12 +291,16 @@ class MazeTask:
         """
         drawn = {d: partial(self.evaluation_levels, d) for d in self.distributions}
         asked = _ON_A_GRID.fullmatch(name)
-        if asked and asked[1] in self.distributions:
-            size = map(int, asked.group(2, 3))
-            grid = named(f"--levels {name}", self.distributions[asked[1]].on_grid, *size)
-            drawn[name] = partial(self._fixed, name, grid)
+        if asked:
+            for known, distribution in self.distributions.items():
+                if known.casefold() == asked[1].casefold():
+                    size = map(int, asked.group(2, 3))
+                    grid = named(f"--levels {name}", distribution.on_grid, *size)
+                    drawn[name] = partial(self._fixed, name, grid)
         files = (*SUFFIXES, RECORD)
-        levels, of_distribution = chosen_levels(name, drawn, files, read_levels, shipped_levels)
+        levels, of_distribution = chosen_levels(
+            name, drawn, files, read_levels, shipped_levels, self.levels_help
+        )
         slack = 0 if of_distribution else SLACK
         for named_level in levels.items():
             self._check_size(*named_level)
@@ -301,13 +313,20 @@ class MazeTask:
         )
 
     def _check_size(self, name: str, level: Level) -> None:
-        """Refuse a level that the Solver's network cannot see."""
+        """Refuse a level that the U-Net cannot see; what another network sees, nobody knows."""
+        if self._make_network != self._unet:
+            return
         least = 2 ** (len(self._network.channels) - 1)
         height, width = level.walls.shape
         if min(height, width) < least:
             raise ValueError(
                 f"level {name!r}: its {height}x{width} cells are halved to nothing by this "
                 f"Solver; it sees levels of {least}x{least} cells and more"
+            )
+        if _normalises_single_numbers(height, width, self._network):
+            raise ValueError(
+                f"level {name!r}: of its {height}x{width} cells a single number is left to this "
+                "Solver in a group of channels; give a larger one"
             )
 
     def _limit(self, length: int, slack: int = SLACK) -> int:
@@ -350,45 +369,52 @@ def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 
-def _precision(place: Place, network: NetworkSettings) -> str:
-    if place.precision == "auto":
-        return faster_precision(network.channels, torch.device(place.device))
-    return place.precision
+def _check_paths(
+    maze: MazeSettings, distributions: Mapping[str, DistributionSettings], measured: Iterable[str]
+) -> None:
+    for name in sorted(measured):
+        longest = max(length for _, length in distributions[name].specifications)
+        if longest > maze.max_steps:
+            raise ValueError(
+                f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
+                f"distributions.{name}, which is measured on: nobody could reach the goal"
+            )
 
 
-def _check_target(maze: MazeSettings, name: str, target: DistributionSettings) -> None:
-    longest = max(length for _, length in target.specifications)
-    if longest > maze.max_steps:
+def _check_grid(maze: MazeSettings) -> None:
+    if maze.height * maze.width > LARGEST_GRID:
         raise ValueError(
-            f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
-            f"distributions.{name}, which is the target"
+            f"maze.height={maze.height}, maze.width={maze.width}: must be at most "
+            f"{LARGEST_GRID:,} cells together"
         )
 
 
 def _check_network(maze: MazeSettings, network: NetworkSettings) -> None:
     """Refuse a grid that the U-Net of the settings cannot see."""
     size, channels = f"{maze.height}x{maze.width}", network.channels
-    if maze.height * maze.width > LARGEST_GRID:
-        raise ValueError(
-            f"maze.height={maze.height}, maze.width={maze.width}: must be at most "
-            f"{LARGEST_GRID:,} cells together"
-        )
     if min(maze.height, maze.width) >> (len(channels) - 1) < 1:
         raise ValueError(
             f"network.channels={channels} halve a {size} maze to nothing; give fewer channels or a "
             "larger maze"
         )
-    for halvings, width in enumerate(channels):
-        if width % network.groups:
-            raise ValueError(
-                f"network.channels={channels} must be multiples of network.groups={network.groups}"
-            )
-        if (maze.height >> halvings) * (maze.width >> halvings) * width == network.groups:
-            raise ValueError(
-                f"network.channels={channels} leave a group of {width} channels with a single "
-                f"number on a {size} maze: give more channels, a larger maze or fewer than "
-                f"network.groups={network.groups}"
-            )
+    if any(width % network.groups for width in channels):
+        raise ValueError(
+            f"network.channels={channels} must be multiples of network.groups={network.groups}"
+        )
+    if _normalises_single_numbers(maze.height, maze.width, network):
+        raise ValueError(
+            f"network.channels={channels} leave a group of channels with a single number on a "
+            f"{size} maze: give more channels, a larger maze or fewer than "
+            f"network.groups={network.groups}"
+        )
+
+
+def _normalises_single_numbers(height: int, width: int, network: NetworkSettings) -> bool:
+    """Whether there is nothing left of a group of channels of the U-Net but its sign."""
+    return any(
+        (height >> halvings) * (width >> halvings) * channels == network.groups
+        for halvings, channels in enumerate(network.channels)
+    )
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:

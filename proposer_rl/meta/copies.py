@@ -63,7 +63,7 @@ class CopiesHere:
         env = self._env
         env.fork(solver, streams)
         copies = range(env.batch_size[0])
-        return self._proposer.collect(action_generators(streams, copies, env.device))
+        return self._proposer.collect(action_generators(streams, copies))
 
     def trained(self, copy: int) -> Trained:
         """See :meth:`Copies.trained`."""

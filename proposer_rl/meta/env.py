@@ -136,7 +136,7 @@ class SolverTrainingEnv(EnvBase):
         streams = [self.streams.within(self._episode, self._updates, k) for k in self._copies]
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)
-        generators = [stream.generator("actions", device=self.device) for stream in streams]
+        generators = [stream.generator("actions") for stream in streams]
         # A collector steps its environment without gradients; this one learns inside.
         place = f"update {self._updates} of the episode of the Solver's copies"
         with torch.enable_grad(), located(place):
@@ -181,11 +181,9 @@ class SolverTrainingEnv(EnvBase):
         self.done_spec = Composite({key: flag.clone() for key in flags}, shape=self.batch_size)
 
 
-def action_generators(
-    streams: Streams, copies: range, device: torch.device | None
-) -> list[torch.Generator]:
+def action_generators(streams: Streams, copies: range) -> list[torch.Generator]:
     """Of the Proposer's actions on copies of a cycle, each of which has its number."""
-    return [streams.generator("proposals", copy, device=device) for copy in copies]
+    return [streams.generator("proposals", copy) for copy in copies]
 
 
 def _count(choices: Tensor, size: int) -> Tensor:

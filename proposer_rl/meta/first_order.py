@@ -38,9 +38,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives.value import GAE
 
 from proposer_rl.learning import PPO
+from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import DivergedError
 from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
@@ -50,6 +50,8 @@ SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 
 Direction = Mapping[str, Tensor]
 """By the parameters' names, [K, ...]: a direction in which K Solvers can be moved."""
+
+MEASURES = ("log_success", "return")
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
@@ -67,8 +69,8 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     """
     if measure == "return":
         return mean_return(performance)
-    if measure != "log_success":
-        raise ValueError(f"measure must be log_success or return, got {measure!r}")
+    if measure not in MEASURES:
+        raise ValueError(f"measure must be {' or '.join(MEASURES)}, got {measure!r}")
     success = performance["success"]
     hopeless = (success <= 0).all(1)
     if bool(hopeless.any()):
@@ -202,15 +204,14 @@ def exact_alignment(
     )
 
 
-def advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
+def ppo_advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
     """GAE of a rollout [K, P, T] with the learner's numbers, float [K, P, T].
 
     Standardised over each Solver's batch where PPO does so.
     """
     settings = learner.settings
-    gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None, vectorized=False)
-    gae.set_keys(value=learner.agent.value_key)
-    advantage = gae(rollout.copy())["advantage"].squeeze(-1)
+    estimate = gae(settings.gamma, settings.lmbda, learner.agent.value_key)
+    advantage = estimate(rollout.copy())["advantage"].squeeze(-1)
     if not settings.normalize_advantage:
         return advantage
     batch = tuple(range(1, advantage.ndim))

@@ -26,25 +26,24 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ExactTask, Levels, Task
 
+AT_ONCE = 16
+"""Levels: as many networks, their gradients and their activations are in memory."""
+
 Worth = Callable[[ActorCritic, int, Tensor], Tensor]
 """Of m agents in a population, a Solver and the places of m of its levels, int64 [m]: float [m]."""
 
 
-def squared_gradients(task: ExactTask, chunk: int = 16) -> Callable[[PPO, Levels], Tensor]:
+def squared_gradients(task: ExactTask) -> Callable[[PPO, Levels], Tensor]:
     """Makes the function that scores levels by the gradient of their exact return.
 
     Args:
         task: of the Solvers and levels.
-        chunk: see :func:`level_gradients`.
 
     Returns:
         A function of a learner of K Solvers, which it leaves as it is, and levels [K, n], each to
         be scored for its Solver: float [K, n], without gradients.
-
-    Raises:
-        ValueError: if ``chunk`` is less than 1.
     """
-    lengths = level_gradients(task, chunk)
+    lengths = level_gradients(task)
 
     def score(learner: PPO, levels: Levels) -> Tensor:
         def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
@@ -57,7 +56,7 @@ def squared_gradients(task: ExactTask, chunk: int = 16) -> Callable[[PPO, Levels
 
 
 def squared_policy_gradients(
-    task: Task, chunk: int = 16
+    task: Task,
 ) -> Callable[[PPO, TensorDictBase, Tensor], Tensor]:
     """Makes the function that scores levels by the policy gradient of episodes on them.
 
@@ -66,17 +65,13 @@ def squared_policy_gradients(
 
     Args:
         task: of the Solvers.
-        chunk: see :func:`level_gradients`.
 
     Returns:
         A function of a learner of K Solvers, a rollout [K, n, T] of theirs and its advantages,
         float [K, n, T]: float [K, n], the squared length of the gradient of the mean over the steps
         of A_t log pi(a_t | s_t).
-
-    Raises:
-        ValueError: if ``chunk`` is less than 1.
     """
-    lengths = level_gradients(task, chunk)
+    lengths = level_gradients(task)
 
     def score(learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
         def gained(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
@@ -88,28 +83,21 @@ def squared_policy_gradients(
     return score
 
 
-def level_gradients(task: Task, chunk: int) -> Callable[[PPO, Worth, int, int], Tensor]:
+def level_gradients(task: Task) -> Callable[[PPO, Worth, int, int], Tensor]:
     """Makes what takes the gradient of each level by itself, and a population for it to work with.
 
-    The population has ``chunk`` Solvers. All of them become copies of one whose levels are to be
-    scored, and each gets one level of its own. So the sum of what they are worth, differentiated
+    The population has :data:`AT_ONCE` Solvers. All of them become copies of one whose levels are to
+    be scored, and each gets one level of its own. So the sum of what they are worth, differentiated
     once, gives each the gradient of its level.
 
     Args:
         task: that makes Solvers.
-        chunk: levels at once, at least 1. As many networks, their gradients and their activations
-            are in memory; where a Solver has fewer levels, the others are computed for nothing.
 
     Returns:
         A function of a learner of K Solvers, what a level is worth, K, and the number n of levels
         of each: the squared lengths of its gradients, float [K, n].
-
-    Raises:
-        ValueError: if ``chunk`` is less than 1.
     """
-    if chunk < 1:
-        raise ValueError(f"chunk must be at least 1, got {chunk}")
-    agent = task.learner([Streams(0)] * chunk).agent
+    agent = task.learner([Streams(0)] * AT_ONCE).agent
     parameters = dict(agent.named_parameters())
 
     def become(learner: PPO, solver: int) -> None:
@@ -121,9 +109,11 @@ def level_gradients(task: Task, chunk: int) -> Callable[[PPO, Worth, int, int], 
         found = []
         for solver in range(solvers):
             become(learner, solver)
-            for start in range(0, count, chunk):
+            for start in range(0, count, AT_ONCE):
                 # Filled up with the last one.
-                which = torch.arange(start, start + chunk, device=task.device).clamp_(max=count - 1)
+                which = torch.arange(start, start + AT_ONCE, device=task.device).clamp_(
+                    max=count - 1
+                )
                 with torch.enable_grad():
                     gradients = torch.autograd.grad(
                         worth(agent, solver, which).sum(),

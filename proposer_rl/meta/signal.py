@@ -123,7 +123,7 @@ def performance_at(
     task = env.view.task
 
     def measured() -> TensorDictBase:
-        generator = streams.generator("gain", device=task.device)
+        generator = streams.generator("gain")
         performance = task.performance(env.solvers.agent, levels, generator)
         return performance.clone().unflatten(0, (groups, replicates))
 

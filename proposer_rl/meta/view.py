@@ -51,7 +51,7 @@ class SolverView:
             place: what distinguishes this evaluation from others of the cycle, for a task that
                 plays episodes.
         """
-        generator = self.streams.generator("evaluation", *place, device=self.task.device)
+        generator = self.streams.generator("evaluation", *place)
         return self.task.performance(agent, self.validation, generator)
 
     @torch.no_grad()

@@ -174,10 +174,11 @@ def uniform_noise(
 ) -> Tensor:
     """Uniform numbers ``[T, *shape]`` for T steps; slice [:, k] comes from the k-th generator.
 
-    Without generators all of it comes from torch's default one.
+    They are drawn on the CPU, so that they are the same for every device, and handed on without
+    waiting for it. Without generators all of it comes from torch's default one.
     """
     if generators is None:
-        return torch.rand(steps, *shape, device=device)
-    return torch.stack(
-        [torch.rand(steps, *shape[1:], generator=g, device=device) for g in generators], 1
-    )
+        drawn = torch.rand(steps, *shape)
+    else:
+        drawn = torch.stack([torch.rand(steps, *shape[1:], generator=g) for g in generators], 1)
+    return (drawn.pin_memory() if device.type == "cuda" else drawn).to(device, non_blocking=True)

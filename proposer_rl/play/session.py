@@ -154,12 +154,11 @@ class Session:
         distribution = self._task.distributions[question.name]
         levels = distribution.sample(batch, streams.generator("levels"))
         learner.env.set_levels(levels.expand(copies, batch))
-        device = learner.env.device
-        actions = [streams.generator("actions", k, device=device) for k in range(copies)]
+        actions = [streams.generator("actions", k) for k in range(copies)]
         some, solver = slice(SHOWN), question.solver
         with torch.no_grad():
             rollout = learner.collect(actions)[solver, some]
-            generator = streams.generator("performance", device=device)
+            generator = streams.generator("performance")
             reached = self._task.performance(learner.agent, levels[some], generator)[solver].cpu()
         records = self._task.record(levels[some], rollout)
         return {

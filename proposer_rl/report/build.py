@@ -98,21 +98,23 @@ def write_report(
         OutputError: if the output folder holds something that is no report, or there is no such
             threshold or baseline.
     """
-    check_output(output)
+    check_output(output, PAGE, f"{TABLES}/runs.csv")
     studies, notes = read_studies(find_runs(folders), threshold, baseline)
-    labels = sorted({group.label for study in studies for group in study.groups})
+    labels = sorted({group.label for study in studies for group in study.compared})
     if baseline not in (None, *labels):
         raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
     for study in studies:
         if threshold is not None and is_rate(study.headline) and not 0 < threshold <= 1:
             raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
     files: dict[str, bytes] = {}
-    sections = []
+    sections: list[page.Section] = []
     with tqdm(
         total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
     ) as bar:
         for study in studies:
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
+            if f"{TABLES}/{prefix}runs.csv" in files:  # of one title, but measured otherwise
+                prefix += f"{len(sections) + 1}_"
             sections.append(_section(study, prefix, files, bar, meanings or {}))
     title = "Curricula: what the runs show"
     command = page.report_command(folders, threshold, baseline)
@@ -121,24 +123,25 @@ def write_report(
         for section in sections:
             section["figures"] = [one for one in section["figures"] if not one["charted"]]
         html = page.render(title=title, command=command, sections=sections, notes=notes)
-    files["report.md"] = _markdown(title, command, sections).encode()
+    files["report.md"] = _markdown(title, command, sections, notes).encode()
     write_files(output, files, (FIGURES, TABLES))
     write_atomically(output / PAGE, html.encode())
     return output / PAGE
 
 
-def check_output(output: Path, page: str = PAGE) -> None:
+def check_output(output: Path, *signs: str) -> None:
     """Refuse a folder with files of somebody else.
 
     Raises:
-        OutputError: if it is none, or has files but not that page.
+        OutputError: if it is none, or has files but none of those by which ours are known.
     """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the report")
     occupied = output.is_dir() and any(output.iterdir())
-    if occupied and not (output / page).is_file():
+    if occupied and not any((output / sign).is_file() for sign in signs):
         raise OutputError(
-            f"{output}: has files in it but no {page}; give a new folder or one of a report"
+            f"{output}: has files in it but no {' or '.join(signs)}; give a new folder or one that "
+            "was written before"
         )
 
 
@@ -205,14 +208,19 @@ def write_files(output: Path, files: Mapping[str, bytes], folders: Sequence[str]
         write_atomically(output / name, content)
 
 
-def _markdown(title: str, command: str, sections: Sequence[page.Section]) -> str:
+def _markdown(
+    title: str, command: str, sections: Sequence[page.Section], notes: Sequence[str]
+) -> str:
     """The report in short, for where HTML is not shown."""
     parts = [f"# {title}\n", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
     parts += ["It is written by\n", f"```bash\n{command}\n```\n"]
+    parts += [f"- Left out: {escape_markdown(note)}" for note in notes]
     for section in sections:
         parts += [f"## {escape_markdown(section['study'].title)}\n"]
         parts += [f"{escape_markdown(' '.join(section['answer']))}\n"]
         facts = section["facts"] + section["origin"]
+        if section["unfinished"]:
+            facts = [*facts, ("Unfinished, and not compared", ", ".join(section["unfinished"]))]
         parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in facts]
         parts.append(f"\n![Learning curves and updates to the threshold]({section['picture']})\n")
         for table in filter(lambda table: table.rows, (section["claims"], section["methods"])):

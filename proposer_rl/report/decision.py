@@ -113,7 +113,9 @@ def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[s
     said = about.get("needs") if isinstance(about, Mapping) else None
     known = set(needs.get(run.method, unknown))
     found = set(filter(None, said.split(", "))) if isinstance(said, str) else known
-    asked = any(run.metrics["evaluations"][-1] > 0 for run in group.runs)
+    # Where performance is played, an evaluation is episodes.
+    exact = [each for each in group.runs if each.task.exact is not False]
+    asked = any(each.metrics["evaluations"][-1] > 0 for each in exact)
     return found | {EXACT} if asked else found - {EXACT, GRADIENTS}
 
 

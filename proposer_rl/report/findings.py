@@ -64,6 +64,10 @@ class Finding(NamedTuple):
     evidence: str
 
 
+# Axes of a space along which levels become harder, whatever else they have.
+HARDER = {"obstacle fraction", "walls", "path length"}
+
+
 def findings(study: Study) -> list[Finding]:
     """The paper's findings whose methods are there, then whether each beats the baseline."""
     beats, baseline = beats_in(study), study.baseline
@@ -201,7 +205,8 @@ def _alike(study: Study) -> Evidence | None:
         if all(learnt(group, names[0], study.horizon) for group in groups):
             return "supported", text
         return "undecided", f"{text}; not all have learnt"
-    smallest = min(holm([each.p for each in found]))
+    known = [each.p for each in found if not math.isnan(each.p)]
+    smallest = min(holm(known), default=math.nan)
     text += f"; the smallest p of a difference is {smallest:.2g} after correction"
     return _either(math.nan, smallest), text
 
@@ -215,13 +220,16 @@ def _slightly(study: Study, beats: Test) -> Evidence | None:
         return verdict, text
     if verdict != "undecided":
         return "contradicted", f"{text}; the difference is significant"
-    slight = is_rate(study.headline) and difference(primary(study), *groups).within(ALIKE)
+    found = difference(primary(study), *groups)
+    slight = is_rate(study.headline) and found.value > 0 and found.within(ALIKE)
     if slight and all(learnt(group, study.headline, study.horizon) for group in groups):
         return "supported", f"{text}; it is shown to be within ±{ALIKE}"
-    return "undecided", f"{text}; it is not shown to be small either"
+    return "undecided", f"{text}; it is not shown to be small and positive either"
 
 
 def _grow_harder(study: Study) -> Evidence | None:
+    if not set(study.example.task.space) <= HARDER:
+        return None
     parts: list[str] = []
     verdict: Verdict = "undecided"
     for group in study.groups:

@@ -72,8 +72,24 @@ def read_scores(file: Path) -> list[Score]:
             )
             for row in rows
         ]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableRun(f"{file}: holds no scores of runs as bin/eval writes them") from error
+
+
+def check_names(runs: Iterable[Run]) -> None:
+    """Scores know runs by the names of their folders: refuse two that they would take for one.
+
+    Raises:
+        UnreadableRun: naming both.
+    """
+    found: dict[tuple[str, int, int], Path] = {}
+    for run in runs:
+        other = found.setdefault((run.folder.name, run.seed, run.updates), run.folder)
+        if other != run.folder:
+            raise UnreadableRun(
+                f"{run.folder}: scores could not tell it from {other}, which has its name; give "
+                "one of their folders at a time"
+            )
 
 
 def scored(run: Run, scores: Sequence[Score], levels: str) -> Score | None:

@@ -66,10 +66,11 @@ def group_table(study: Study) -> Table:
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         runs = group.runs
+        ended = [run for run in runs if run.updates >= horizon]
         reached = sum(run.reached for run in group.waiting(headline, threshold))
         row: dict[str, Cell] = {
             "method": group.label,
-            "seeds": len(runs),
+            "seeds": len(ended) if len(ended) == len(runs) else f"{len(ended)} of {len(runs)}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
             waiting: updates_needed(study, group),
             primary(study).name: _mean(primary(study).values(group)),
@@ -85,7 +86,10 @@ def group_table(study: Study) -> Table:
             "evaluations": lambda run: run.metrics["evaluations"][-1],
             "seconds per run": lambda run: run.own_seconds[-1],
         }
-        row |= {name: float(np.mean([paid(run) for run in runs])) for name, paid in cost.items()}
+        row |= {
+            name: float(np.mean([paid(run) for run in ended or runs]))
+            for name, paid in cost.items()
+        }
         rows.append(row)
     note = (
         f"Updates: mean of min(updates, {horizon}) over the runs of full length; measured every "

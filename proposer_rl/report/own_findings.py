@@ -60,9 +60,10 @@ def _beats_all(study: Study, needs: Needs) -> Evidence | None:
         for group in study.compared
         if group is not one and TARGET not in needs_of(group, needs, {TARGET})
     ]
-    others = [group for group in (_compared(study, NONE),) if group] + untold
-    if one is None or not others:
+    even, none = _compared(study, EVEN), _compared(study, NONE)
+    if one is None or even is None or none is None:
         return None
+    others = [none, *untold]
     found = decisions(study)
     pairs = [between(found, one, other) for other in others]
     text = "; ".join(_against(study, one, *pair) for pair in pairs)

@@ -14,6 +14,7 @@ from proposer_rl.report.records import anywhere
 from proposer_rl.report.runs import begun, find_runs, read_run
 from proposer_rl.runs.folder import read_jsonl, storage, write_atomically
 
+BULK = ("checkpoints", "curriculum.jsonl")  # what no copy has
 UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
 
 
@@ -42,6 +43,10 @@ def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str
             light[place] = _light(folder)
         else:
             notes.append(f"left out: {place}: not finished")
+    for place in light:
+        for name in BULK:
+            if (output / place / name).exists():
+                raise OutputError(f"--publish: {output / place} has {name}, so it is no copy")
     for place, files in light.items():
         _replace(output / place, files)
     return [output / place for place in light], notes

@@ -174,4 +174,4 @@ def words(name: str) -> str:
 
 def level_text(name: str, value: float) -> str:
     """A value of a column as a reader wants it: 80% of a success, 0.8 of anything else."""
-    return f"{value:.0%}" if is_rate(name) else f"{value:g}"
+    return f"{100 * value:g}%" if is_rate(name) else f"{value:g}"

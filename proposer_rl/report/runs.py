@@ -31,7 +31,6 @@ from proposer_rl.report.records import (
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
-DEEPEST = 4  # folders between the one that was named and a run's
 MOST_FOLDERS = 20_000
 FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
@@ -237,7 +236,7 @@ def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
         path = Path(root)
         names.sort()
-        if "config.json" in files or len(path.relative_to(folder).parts) >= DEEPEST:
+        if "config.json" in files:
             names.clear()
         if {"config.json", FAILURE} & set(files):
             yield path, set(files)
@@ -327,7 +326,8 @@ def _read_config(folder: Path) -> dict[str, Any]:
     config = _read_json(folder, "config.json")
     if config is None:
         raise ValueError("there is no config.json")
-    for name in ("method", "scale", "ablation"):
+    checked(Name, config["method"], "config.json: method")
+    for name in ("scale", "ablation"):
         checked(Name, config.get(name, "none"), f"config.json: {name}")
     checked(Name, config["schedule"]["headline"], "config.json: schedule.headline")
     if math.isnan(number(config["schedule"]["threshold"])):

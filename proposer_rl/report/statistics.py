@@ -17,6 +17,7 @@ from scipy import special, stats
 
 CONFIDENCE = 0.95
 ERROR = 1 - CONFIDENCE  # how often a test may be wrong
+MOST_SEEDS = 1_000_000  # more say that there is no difference to be found
 FEWEST = 5  # runs for an interval
 QUARTER = 0.25
 POWER = 0.8
@@ -192,4 +193,6 @@ def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
 
     quantiles = special.ndtri([1 - level / 2, POWER])
     least = math.floor(seeds * (float(quantiles.sum()) / effect) ** 2)  # of a normal distribution
+    if least > MOST_SEEDS:
+        return None
     return next(count for count in itertools.count(max(least, seeds + 1)) if enough(count))

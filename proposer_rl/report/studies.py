@@ -117,9 +117,12 @@ class Study:
 
     @property
     def baseline(self) -> Group:
-        """What the others are measured against: the chosen one, the usual one, or the first."""
+        """What the others are measured against: the chosen one, the usual one, or the first.
+
+        Of those that are compared: another has no run that is long enough.
+        """
         found = [self.group(label) for label in (self.chosen, USUAL_BASELINE) if label]
-        return next((group for group in found if group), (self.compared or self.groups)[0])
+        return next((group for group in found if group in self.compared), self.compared[0])
 
     def scores(self, group: Group, name: str) -> Column | None:
         """What a group's runs of full length reach on each level, [runs, levels].

@@ -252,6 +252,8 @@ def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
         assert int(buffer["filled"].sum()) == 2
         seven = buffer[buffer["level", "a"] == 7]
         assert float(seven["score"]) == pytest.approx(0.4) and bool(seven["solved"])
+    unfinished = filled([7, 8, 7], [-torch.inf, 0.9, 0.6], 5, RANK)  # as of no complete episode
+    assert float(unfinished["score"][unfinished["level", "a"] == 7]) == pytest.approx(0.6)
 
 
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:

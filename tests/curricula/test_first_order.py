@@ -216,7 +216,7 @@ def test_a_task_without_gradients_is_refused() -> None:
         ({"every": 0}, "every must be a whole number from 1 to 1,000,000, got 0"),
         ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
         ({"smoothing": 1.0}, "smoothing must be from 0 to below 1, got 1.0"),
-        ({"candidates": 0}, "target_levels and candidates must be at least 1, got 8, 0"),
+        ({"candidates": 0}, "candidates must be a whole number from 1 to 1,000,000, got 0"),
     ],
 )
 def test_numbers_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
@@ -246,7 +246,7 @@ def test_sampled_scores_are_inner_products_with_the_sampled_direction() -> None:
     rollout = solvers.collect([s.generator("actions") for s in own])
     curriculum.observe(solvers, levels, Update(rollout, TensorDict()))
     found = curriculum.state_dict()["scores"]["score"]
-    advantage = exact.advantages(solvers, rollout)
+    advantage = exact.ppo_advantages(solvers, rollout)
     fraction = levels.walls.double().mean((-2, -1))
     length = shortest_path_length(levels)
     for n, (wanted, moves) in enumerate(Mazes().space.specifications):
@@ -270,7 +270,7 @@ def test_the_sampled_direction_is_the_policy_gradient_of_the_targets_episodes() 
     target = torch.stack([Mazes().target.sample(P, s.generator("target")) for s in own])
     solvers.env.set_levels(target)
     rollout = solvers.collect([s.generator("target_actions") for s in own])
-    value = exact.surrogate(solvers.agent, rollout, exact.advantages(solvers, rollout)).mean(1)
+    value = exact.surrogate(solvers.agent, rollout, exact.ppo_advantages(solvers, rollout)).mean(1)
     expected = exact.target_direction(solvers, value)
     found = curriculum.state_dict()["direction"]
     for name, entry in expected.items():

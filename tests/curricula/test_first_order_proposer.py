@@ -167,6 +167,34 @@ def test_a_resumed_proposer_goes_on_bit_by_bit() -> None:
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
+def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
+    """The bounds of TorchRL's clipping, and Adam's moments after a checkpoint, read to the CPU."""
+    begun, task = proposer(Seen(1, WANTED)), Seen(1, WANTED)
+    begun.propose(task, 0, [Streams(0)])
+    task.device = torch.device("meta")
+    elsewhere = FirstOrderProposer(task, agent().to("meta"), PPOSettings())
+    elsewhere.load_state_dict(begun.state_dict())
+    assert all(bound.is_meta for bound in elsewhere._loss.buffers())
+    moments = [
+        entry
+        for state in elsewhere._adam.state.values()
+        for key, entry in state.items()
+        if key != "step"  # which Adam counts on the CPU
+    ]
+    assert moments and all(moment.is_meta for moment in moments)
+
+
+def test_a_new_life_tells_nothing_of_the_last_one() -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task)
+    curriculum.propose(task, 0, [Streams(0)])
+    learnt = copy.deepcopy(curriculum.agent.state_dict())
+    curriculum.begin()
+    assert curriculum.improve(task, 0, [Streams(0)]).metrics == {}
+    after = curriculum.agent.state_dict()
+    assert all(torch.equal(after[name], learnt[name]) for name in learnt)
+
+
 def test_a_proposer_that_has_not_begun_resumes_too() -> None:
     task = Seen(1, WANTED)
     one, other = proposer(task), proposer(task)
@@ -180,6 +208,14 @@ def test_several_solvers_are_refused() -> None:
     task = Seen(2, WANTED)
     with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
         proposer(task).propose(task, 0, [Streams(0), Streams(1)])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"epochs": 0}, {"learning_rate": 0.0}, {"entropy_coeff": float("nan")}]
+)
+def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be"):
+        proposer(Seen(1, WANTED), **wrong)
 
 
 def test_a_task_without_gradients_is_refused() -> None:

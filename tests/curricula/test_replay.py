@@ -77,6 +77,12 @@ MADE = {
     "easy": lambda: accel(parents="easy"),
     "regret": lambda: replay("regret", "exact"),
     "plr of regret": lambda: replay("regret", "exact", train_on_new=True, synchronous=False),
+    "plr of regret, renewed": lambda: replay(
+        "regret", "exact", train_on_new=True, synchronous=False, renew=True
+    ),
+    "plr of regret, credited": lambda: replay(
+        "regret", "exact", train_on_new=True, synchronous=False, co_learnability=0.5
+    ),
     "ncc": ncc,
     "traced": traced,
     "gradients": lambda: replay("gradient_norm", "exact"),
@@ -108,8 +114,9 @@ def test_every_step_of_training_is_on_the_proposed_level() -> None:
         assert (seen == planes(levels).unsqueeze(2)).all() and seen.shape[2] == T
 
 
-def test_plr_trains_on_new_levels_and_on_old_ones() -> None:
-    curriculum = plr()
+@pytest.mark.parametrize("name", ["plr", "plr of regret", "plr of regret, renewed"])
+def test_plr_trains_on_new_levels_and_on_old_ones(name: str) -> None:
+    curriculum = MADE[name]()
     lived = live(curriculum, solvers([0]), [0], range(12))
     seen: set[int] = set()
     old = []
@@ -252,7 +259,9 @@ def test_credit_goes_to_the_levels_trained_on_before() -> None:
     curriculum._before = type(old)({"slot": before, "key": keys}, (1, P))
     after = old.clone()
     after["score"][0, :3] -= torch.tensor([0.4, 0.8, 0.2])
-    credited = curriculum._credit(old, after.clone(), slots)
+    curriculum._credit(old, after.clone(), slots, torch.tensor([False]))  # trained on new ones
+    credited = curriculum._credit(old, after.clone(), slots, torch.tensor([True]))
+    assert curriculum._before["slot"].equal(slots)
     fell = (0.4 + 0.8 + 0.2 + 0.2) / 4
     expected = after["score"][0].clone()
     expected[4:7] += 0.5 * fell
@@ -303,6 +312,7 @@ def test_some_bins_are_those_of_the_values() -> None:
         ({"replay_probability": 1.5}, "replay_probability must be above 0 to 1, got 1.5"),
         ({"edits": -1}, "edits must be a whole number from 0"),
         ({"train_on_new": True}, "train_on_new=true, synchronous=true"),
+        ({"renew": "no"}, "renew must be true or false, got 'no'"),
         ({"parents": "hard"}, "parents must be batch or easy, got 'hard'"),
         ({"renew": True, "capacity": 15}, "capacity=15 must be a multiple of the 4 levels"),
     ],

@@ -66,9 +66,26 @@ def picture(record: dict[str, Any]) -> np.ndarray:
                     "a": ParameterSettings(set="call", name="nowhere.f", values=[1], target=1)
                 }
             },
-            "'nowhere.f': cannot be imported",
+            "parameters.a.name: 'nowhere.f': cannot be imported",
         ),
-        ({"wrappers": ["nowhere.Wrapper"]}, "'nowhere.Wrapper': cannot be imported"),
+        (
+            {"parameters": {"a": ParameterSettings(set="call", values=[1], target=1)}},
+            "parameters.a.name: missing",
+        ),
+        (
+            {"parameters": {"updates": PARAMETERS["width"]}},
+            "parameters.updates: is what every level has anyway",
+        ),
+        ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
+        ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
+        ({"arguments": {"foo": 1}}, "arguments and parameters: .*unexpected keyword"),
+        (
+            {
+                "env_id": "tests.gymnasium_task.test_task:Grown-v0",
+                "parameters": {"size": ParameterSettings(set="argument", values=[3, 5], target=3)},
+            },
+            "parameters.size: all levels must show and take the same, but 5 changes",
+        ),
         (
             {"wrappers": ["tests.gymnasium_task.test_task.as_dictionary"]},
             "observation space Dict.*FlattenObservation",
@@ -91,6 +108,20 @@ def as_dictionary(env: Any) -> Any:
 gymnasium.register("Endless-v0", Walk)
 
 
+class Grown(gymnasium.Env[Any, Any]):
+    """Shows as many numbers as it is asked for."""
+
+    def __init__(self, size: int, render_mode: str | None = None) -> None:
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (size,))
+        self.action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, **_: object) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(self.observation_space.shape, np.float32), {}
+
+
+gymnasium.register("Grown-v0", Grown, max_episode_steps=5)
+
+
 def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def make(*_: object, **__: object) -> None:
         raise gymnasium.error.DependencyNotInstalled("Box2D is not installed")
@@ -100,6 +131,13 @@ def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(ValueError) as caught:
         walk_task(extra="box2d")
     assert line in str(caught.value) and "Box2D is not installed" in str(caught.value)
+
+
+def test_evaluations_take_no_process_for_each_level() -> None:
+    task = walk_task(vectorization="async")
+    levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
+    kinds = [type(task._env(levels, once=once)._vector) for once in (True, False)]
+    assert kinds == [gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv]
 
 
 def test_what_the_environment_needs_can_be_put_around_it() -> None:
@@ -131,14 +169,17 @@ def test_statistics_and_returns_are_those_of_the_environment() -> None:
     assert float(told["speed"][0]) == pytest.approx(float(levels["speed"].mean()))
 
 
-@pytest.mark.parametrize("drawn", [True, False])
+@pytest.mark.parametrize(
+    "failure", [None, gymnasium.error.DependencyNotInstalled("pygame"), RuntimeError("no OpenGL")]
+)
 def test_pictures_show_the_level_and_the_episode(
-    drawn: bool, monkeypatch: pytest.MonkeyPatch
+    failure: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not drawn:  # as without pygame
+    drawn = failure is None
+    if failure is not None:
 
         def render(self: object) -> None:
-            raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+            raise failure
 
         monkeypatch.setattr(pictures.LevelPlayer, "render", render)
     task: Any = make_task(composed("task=cartpole", "+method=target", *TINY))
@@ -201,7 +242,7 @@ def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: i
 METHODS = [
     "perf_gain", "target", "domain_randomization", "hand_made", "plr", "robust_plr", "alp_gmm",
     "learning_progress curriculum.source=episodes", "first_order_sampled", "currot", "paired",
-    "sfl +score=sampled",
+    "sfl +score=sampled", "ncc +score=sampled", "regret +score=sampled", "pace +score=sampled",
 ]  # fmt: skip
 
 

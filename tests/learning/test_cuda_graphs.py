@@ -12,8 +12,10 @@ from proposer_rl.learning.ppo import PPO
 from proposer_rl.mazes import Level, planes
 from proposer_rl.mazes.evaluation import ExactEvaluator
 from proposer_rl.models import ActorCritic, cell_logits
+from proposer_rl.streams import Streams
 from tests.graphs import HostRead, NoHostReads, Tapes
 from tests.learning.test_ppo import learner, levels, train
+from tests.tiny import tiny_view_task
 
 
 class Counter:
@@ -163,6 +165,20 @@ def test_replayed_updates_train_as_plain_ones(copies: int, observe_agent: bool) 
         assert (one == other).all()
     assert (plain.snapshot() == replayed.snapshot()).all()
     assert tapes.recorded == 2  # a rollout and the training on it
+
+
+def test_a_solver_with_memory_is_replayed_too() -> None:
+    task, tapes = tiny_view_task(), Tapes()
+    streams = [Streams(0)]
+    plain, replayed = task.learner(streams), recorded(task, tapes).learner(streams)
+    for number in range(5):
+        draw = Streams(1, number)
+        levels = task.target.sample(task.batch_size, draw.generator("levels")).unsqueeze(0)
+        for solver in (plain, replayed):
+            solver.env.set_levels(levels)
+            solver.update([draw.generator("actions")])
+    assert (plain.snapshot() == replayed.snapshot()).all()
+    assert tapes.recorded == 2
 
 
 def test_replays_follow_a_restored_snapshot_and_leave_older_rollouts_alone() -> None:

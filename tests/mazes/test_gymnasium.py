@@ -232,6 +232,9 @@ def test_gymnasiums_wrappers_take_the_batch() -> None:
         ({"obstacle_fraction": 1.5}, "obstacle_fraction must be at least 0 and below 1, got 1.5"),
         ({"obstacle_fraction": "0.4"}, "obstacle_fraction must be one number or several"),
         ({"obstacle_fraction": []}, "obstacle_fraction must be one number or several"),
+        ({"obstacle_fraction": None}, "obstacle_fraction must be a finite number, got None"),
+        ({"step_penalty": "x"}, "step_penalty must be a finite number, got 'x'"),
+        ({"observe_agent": 2}, "observe_agent must be one of"),
         ({"path_length": 0}, "path_length must be a whole number of at least 1, got 0"),
         ({"path_length": 2.5}, "path_length must be a whole number of at least 1, got 2.5"),
         ({"path_length": 30}, "max_steps=25: must be at least the path length 30"),
@@ -262,6 +265,7 @@ def test_unknown_arguments_are_refused() -> None:
         ({"lvl": ROOM}, r"options must be among \['level'.*\], got 'lvl'"),
         ({"level": ROOM}, "must be of the environment's grid 4x5, got 2x3"),
         ({"level": "S.X"}, "a level holds only"),
+        ({"level": 5}, r"options\['level'\] must be a Level or drawings, got 5"),
         ({"level": ["S...G\n.....\n.....\n....."] * 3}, r"got batch shape \[3\]"),
     ],
 )
@@ -279,6 +283,8 @@ def test_bad_calls_of_a_batch_are_refused() -> None:
     for actions in ([0], [0, 4], [0.5, 1.0], [[0, 1]]):
         with pytest.raises(ValueError, match="actions must be 2 whole numbers from 0 to 3"):
             envs.step(np.array(actions))
+    with pytest.raises(ValueError, match=r"seed must be a whole number or several, got 1\.5"):
+        envs.reset(seed=1.5)
     with pytest.raises(ValueError, match="seed must be one or 2 of them, got 3"):
         envs.reset(seed=[1, 2, 3])
     for mask in ([False, False], [True], [1, 0]):

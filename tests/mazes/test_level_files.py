@@ -51,6 +51,11 @@ def test_reads_the_documented_text() -> None:
     assert all(level.batch_size == torch.Size([]) for level in levels.values())
 
 
+def test_a_mark_of_the_encoding_is_no_part_of_a_level(tmp_path: Path) -> None:
+    (tmp_path / "bom.txt").write_text("S.G\n", encoding="utf-8-sig")
+    assert list(read_levels(tmp_path / "bom.txt")) == ["bom"]
+
+
 def test_a_drawing_alone_has_the_name_of_its_file(tmp_path: Path) -> None:
     (tmp_path / "hall.txt").write_text("S.G\n")
     assert list(read_levels(tmp_path / "hall.txt")) == ["hall"]
@@ -247,6 +252,7 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
         "[" * 10_000,
         '{"seed": 0, "levels": []}',
         '{"seed": 0, "updates": "x", "levels": []}',
+        '{"seed": 0, "updates": Infinity, "levels": []}',
         '{"seed": 0, "updates": 1, "levels": [{}]}',
         '{"seed": 0, "updates": 1, "levels": [{"text": [3]}]}',
         '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',

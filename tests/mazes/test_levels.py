@@ -39,7 +39,7 @@ def test_text_of_two_batch_dimensions_is_nested() -> None:
 
 
 @pytest.mark.parametrize(
-    "drawing", ["", "S.\nG", "S.", "SG\nS.", "S?G", ["SG", "S.G"], []], ids=repr
+    "drawing", ["", "S.\nG", "S.", "SG\nS.", "S?G", "S . G", ["SG", "S.G"], []], ids=repr
 )
 def test_text_that_is_no_level_is_refused(drawing: str | list[str]) -> None:
     with pytest.raises(ValueError):

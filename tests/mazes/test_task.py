@@ -23,7 +23,7 @@ from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import EditableTask, OptimalTask
+from proposer_rl.task import EditableTask, OptimalTask, Place
 from tests.graphs import NoHostReads
 from tests.tiny import TASK, evaluate, learners, tiny_task
 
@@ -66,12 +66,15 @@ def test_another_network_takes_the_unets_place() -> None:
             maps = super().forward(planes.flatten(0, -4)).unflatten(0, planes.shape[:-3])
             return maps.split([4, 1], -3)
 
-    own = tiny_task(make_network=Convolution)
+    unused = NetworkSettings(channels=[64, 128, 256, 512])
+    own = tiny_task(make_network=Convolution, network=unused, place=Place(precision="auto"))
+    assert own.precision == "fp32" and named(own, "shapes")
     solvers = own.learner([Streams(0), Streams(1)])
     assert sum(p.numel() for p in solvers.agent.parameters()) == 2 * (3 * 9 + 1) * 5
     before = own.measure(solvers.agent)
     levels = own.target.sample(5, Streams(0).generator())
     probes = own.probe(solvers.agent, levels)
+    assert own.probe(solvers.agent, levels[:0]).shape == (2, 0, *probes.shape[2:])
     assert not torch.equal(probes[0], probes[1])
     solvers.update()
     assert (before["id_return"] != own.measure(solvers.agent)["id_return"]).all()
@@ -186,6 +189,17 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
             "maze.max_steps=3 must be at least 4, the path length of distributions.id",
         ),
         (
+            {
+                "distributions": {
+                    "id": DistributionSettings(specifications=[(0.2, 4)]),
+                    "far": DistributionSettings(specifications=[(0.0, 8)]),
+                },
+                "maze": MazeSettings(height=5, width=5, max_steps=7),
+                "evaluation": EvaluationSettings(distributions=["id", "far"], levels=2),
+            },
+            "maze.max_steps=7 must be at least 8, the path length of distributions.far",
+        ),
+        (
             {"network": NetworkSettings(channels=[12], groups=8)},
             r"network.channels=\[12\] must be multiples of network.groups=8",
         ),
@@ -219,9 +233,13 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
     file = str(tmp_path / "halls.txt")
     assert named(TASK, file) == {"long": 10} and named(TASK, file, 4) == {"long": 4}
     assert set(named(TASK, "ID").values()) == {8}
+    assert list(named(TASK, "ID@6x6").values()) == list(named(TASK, "id@6x6").values())
     shapes = named(TASK, "shapes")
     assert shapes["corridor_8"] == 2 * 34 and min(shapes.values()) >= 8
-    with pytest.raises(ValueError, match=r"--levels mazes: must be a file that ends in .txt or"):
+    with pytest.raises(
+        ValueError,
+        match="--levels mazes: must be one of: shapes, small, a file ",
+    ):
         named(TASK, "mazes")
 
 

@@ -17,10 +17,10 @@ from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes import Level, MazeEnv, generate_levels, planes
 from proposer_rl.mazes.evaluation import ExactEvaluator
 from proposer_rl.meta.first_order import (
-    advantages,
     alignment,
     bin_scores,
     moved,
+    ppo_advantages,
     root_mean_square,
     surrogate,
     target_direction,
@@ -206,7 +206,7 @@ def first_episodes(ppo: PPO, generators: list[torch.Generator]) -> tuple[TensorD
     """A rollout and its advantages, of which those behind the first episode do not count."""
     rollout = ppo.collect(generators)
     done = rollout["next", "done"].squeeze(-1).long()
-    return rollout, advantages(ppo, rollout) * (done.cumsum(-1) - done == 0)
+    return rollout, ppo_advantages(ppo, rollout) * (done.cumsum(-1) - done == 0)
 
 
 def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -> None:
@@ -239,7 +239,7 @@ def test_alignments_of_problems_add_up_to_the_batchs() -> None:
     levels = some_levels(2, 6)
     ppo = learner(levels)
     rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
-    advantage = advantages(ppo, rollout)
+    advantage = ppo_advantages(ppo, rollout)
     direction = exact_direction(ppo, levels)
     each = alignment(ppo.agent, direction, 1e-4, lambda: surrogate(ppo.agent, rollout, advantage))
     batch = surrogate(ppo.agent, rollout, advantage).mean(1).sum()
@@ -253,7 +253,7 @@ def test_advantages_are_those_that_training_uses(standardised: bool) -> None:
     ppo = learner(some_levels(2, 6))
     ppo.settings = PPOSettings(horizon=8, gamma=1.0, lmbda=1.0, normalize_advantage=standardised)
     rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
-    found = advantages(ppo, rollout)
+    found = ppo_advantages(ppo, rollout)
     assert "advantage" not in rollout.keys()
     ppo.optimise(rollout)
     expected = rollout["advantage"].squeeze(-1).numpy()

@@ -153,9 +153,17 @@ def test_a_foreign_folder_is_not_written_to(runs: Path, tmp_path: Path, capsys) 
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     before = contents(tmp_path)
-    assert refused(capsys, str(runs), "-o", str(tmp_path / "mine")).endswith("one of a report")
+    assert refused(capsys, str(runs), "-o", str(tmp_path / "mine")).endswith("was written before")
     assert refused(capsys, str(runs), "-o", str(runs / "a" / "run.json")).endswith("the report")
     assert contents(tmp_path) == before
+
+
+def test_the_tables_of_a_report_are_known_as_one(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "kept" / "tables").mkdir(parents=True)
+    (tmp_path / "kept" / "tables" / "runs.csv").write_text("old")
+    main([str(runs), "-q", "-o", str(tmp_path / "kept")])
+    assert (tmp_path / "kept" / "report.html").exists()
+    assert (tmp_path / "kept" / "tables" / "runs.csv").read_text() != "old"
 
 
 def test_wrong_folders_get_one_line(tmp_path: Path, capsys) -> None:

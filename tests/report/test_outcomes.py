@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from proposer_rl.report.answer import answer
 from proposer_rl.report.comparisons import comparisons
 from proposer_rl.report.findings import findings
 from proposer_rl.report.outcomes import (
@@ -22,7 +23,7 @@ from proposer_rl.report.outcomes import (
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.tables import Table, to_csv, write
-from tests.report.folders import cycle, write_run
+from tests.report.folders import TASK, cycle, write_run
 
 SEEDS = 6
 SLOW = [0.0, 0.0, 0.05, 0.3, 0.5, 0.6]
@@ -118,7 +119,8 @@ def test_a_short_run_does_not_count_whether_it_got_there_or_not(tmp_path: Path) 
     write_run(tmp_path / "short_slow", "hand_made", [99], [0.0, 0.0], finished=False)
     study = study_of(tmp_path, hand_made=FAST, target=SLOW)
     (row,) = (row for row in group_table(study).rows if row["method"] == "hand_made")
-    assert row["seeds"] == SEEDS + 2
+    assert row["seeds"] == f"{SEEDS} of {SEEDS + 2}"
+    assert row["frames (M)"] == pytest.approx(100 * 50 / 1e6)  # of whole runs
     assert row["updates to 80% ID success (at most 50)"].estimate == 30
 
 
@@ -189,7 +191,7 @@ def test_findings_that_fail_are_contradicted(tmp_path: Path) -> None:
 
 
 def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Path) -> None:
-    names = ("perf_gain", "task_difficulty", "target")
+    names = ("task_difficulty", "perf_gain", "target")  # the second is the best by a little
     for folder, factor, expected in (("a", 1.0, "supported"), ("b", 0.05, "undecided")):
         for number, name in enumerate(names):
             for seed in range(SEEDS):  # each method with small chances of its own
@@ -198,6 +200,43 @@ def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Pat
         (study,), _ = read_studies(sorted((tmp_path / folder).iterdir()), None)
         found = verdicts(study)
         assert found[ALIKE] == expected and found[SLIGHTLY] == expected, folder
+
+
+def test_a_method_that_is_slightly_worse_is_not_slightly_better(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name, end in (("perf_gain", 0.895), ("task_difficulty", 0.9)):
+        for seed in range(SEEDS):
+            curve = [0.0, end / 2, end + 0.02 * rng.normal()]
+            write_run(tmp_path / f"{name}{seed}", name, [seed], curve)
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert verdicts(study)[SLIGHTLY] == "undecided"
+
+
+def test_a_pair_without_any_spread_does_not_hide_the_others(tmp_path: Path) -> None:
+    ends = {"perf_gain": [0.9] * SEEDS, "task_difficulty": [0.9] * SEEDS}
+    ends["target"] = [0.3 + 0.01 * seed for seed in range(SEEDS)]
+    for name, values in ends.items():
+        for seed, end in enumerate(values):
+            write_run(tmp_path / f"{name}{seed}", name, [seed], [0.0, end / 2, end])
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert verdicts(study)[ALIKE] == "contradicted"
+
+
+def test_a_baseline_that_is_not_finished_is_none(tmp_path: Path) -> None:
+    for seed in range(SEEDS):
+        write_run(tmp_path / f"dr{seed}", "domain_randomization", [seed], [0.0], finished=False)
+    study = study_of(tmp_path, plr=FAST, target=SLOW)
+    assert study.baseline.label == "plr" and findings(study)
+    assert len(answer(study)) == 2
+
+
+def test_a_space_in_which_more_need_not_be_harder_has_no_such_finding(tmp_path: Path) -> None:
+    task = {**TASK, "space": {"force": [1.0, 2.0], "mass": [1.0, 2.0, 3.0]}}
+    for seed in range(SEEDS):
+        cycles = [cycle(i, [0.1, 0.1], [[8 - i, 1, 1], [1, 1, 1 + i]]) for i in range(8)]
+        write_run(tmp_path / f"p{seed}", "perf_gain", [seed], cycles=cycles, task=task)
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert HARDER not in verdicts(study)
 
 
 def test_badge_and_text_tell_the_same(tmp_path: Path) -> None:

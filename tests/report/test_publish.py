@@ -133,7 +133,12 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     with pytest.raises(SystemExit) as end:
         main([str(runs), "--publish", "new", "--threshold", "0.5"])
     assert end.value.code == 2 and "--publish: copies runs" in capsys.readouterr().err
+    deep = tmp_path / "deep"
+    write_run(deep / "target_0", "target", [7])
+    (deep / "target_0" / "checkpoints").mkdir()
     wrong = {
+        "has curriculum.jsonl, so it is no copy": [str(runs), str(runs)],
+        "has checkpoints, so it is no copy": [str(runs), str(deep)],
         "--publish: two runs are called target_0: ": [str(runs), str(other), "new"],
         "has thesis.tex in it, which is no run": [str(runs), str(tmp_path / "mine")],
         "is a file; give a folder": [str(runs), str(tmp_path / "file")],

@@ -62,7 +62,7 @@ def test_a_run_made_longer_is_unfinished_until_its_new_end(tmp_path: Path) -> No
 
 
 def test_runs_are_found_at_any_depth_once_and_not_through_links(tmp_path: Path) -> None:
-    one, two = write_run(tmp_path / "x" / "y" / "one"), write_run(tmp_path / "two")
+    one, two = write_run(tmp_path / "a/b/c/d/e/f/one"), write_run(tmp_path / "two")
     elsewhere = write_run(tmp_path.parent / f"{tmp_path.name}_elsewhere" / "run")
     os.symlink(elsewhere, tmp_path / "link")
     assert find_runs([tmp_path, two]) == sorted([one.resolve(), two.resolve()])
@@ -116,6 +116,7 @@ def in_cycle(value: object):
         ("config.json", lambda text: "[" * 100_000, "recursion"),
         ("config.json", lambda text: text[:-5], "Unterminated"),
         ("config.json", set_key("schedule", value={}), "'headline' is missing"),
+        ("config.json", lambda text: text.replace('"method"', '"m"'), "'method' is missing"),
         ("config.json", set_key("method", value="x" * 1000), "method: String should have at most"),
         ("config.json", set_key("method", value="a\nb"), "method: Value error, must be printable"),
         ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),

@@ -137,6 +137,13 @@ def test_a_majority_is_that_of_the_binomial_law() -> None:
         assert majority(count, 7) == pytest.approx(tail)
 
 
+def test_no_number_of_seeds_finds_a_difference_of_rounding() -> None:
+    one = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    assert (
+        seeds_needed(difference_of(one, one + 1e-17 * np.arange(5) + 2e-17, False), 5, 0.05) is None
+    )
+
+
 @pytest.mark.parametrize("paired", [False, True])
 def test_seeds_needed_have_the_power_in_a_simulation(paired: bool) -> None:
     rng = np.random.default_rng(0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -34,7 +36,7 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
 
     Observations, rewards, ends, levels and autoresets are those of Gymnasium's ``SyncVectorEnv``
     over as many :class:`~proposer_rl.mazes.gymnasium.env.MazeGymnasiumEnv`, with the same seeds.
-    What a maze plays depends on its own seed and on how many episodes it has begun, on nothing
+    What a maze plays depends on its own seed and on how many levels it has drawn, on nothing
     else: not on the other mazes, and not on how many there are.
 
     Args:
@@ -86,6 +88,13 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
         ):
             if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}")
+        for name, number in (
+            ("step_penalty", step_penalty),
+            *(("obstacle_fraction", fraction) for fraction in fractions),
+        ):
+            if isinstance(number, bool) or not isinstance(number, Real) or not isfinite(number):
+                raise ValueError(f"{name} must be a finite number, got {number!r}")
+        _check_choice("observe_agent", observe_agent, [False, True])
         if max(lengths) > max_steps:
             raise ValueError(
                 f"max_steps={max_steps}: must be at least the path length {max(lengths)}, "
@@ -145,6 +154,8 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
         if seed is not None:
             if isinstance(seed, int | np.integer):
                 seed = range(seed, seed + self.num_envs)
+            if not isinstance(seed, Sequence | np.ndarray):
+                raise ValueError(f"seed must be a whole number or several, got {seed!r}")
             seeds = list(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed must be one or {self.num_envs} of them, got {len(seeds)}")
@@ -242,6 +253,9 @@ class MazeVectorEnv(VectorEnv[Any, Any, Any]):
     def _given(self, level: Level | str | Sequence[str]) -> Level:
         """Levels ``[n]`` that a user gave, one for all mazes or one for each, or drawings."""
         if not isinstance(level, Level):
+            drawings = [level] if isinstance(level, str) else level
+            if not isinstance(drawings, Sequence) or {*map(type, drawings)} != {str}:
+                raise ValueError(f"options['level'] must be a Level or drawings, got {level!r}")
             level = Level.from_text(level)
         validate_levels(level)
         size, own = tuple(level.walls.shape[-2:]), tuple(self._drawn.walls.shape[-2:])

@@ -70,8 +70,8 @@ class ViewBoard(Drawings):
         limit = max_steps or max(self._max_steps, SLACK * int(fewest_actions(level)))
         goal, following = level.goal.tolist(), _following(level)
         placed = level.to(self._device).expand(self._episodes)
-        generator = self._streams.generator("drawn", device=self._device)
-        noise = torch.rand(limit, self._episodes, generator=generator, device=self._device)
+        generator = self._streams.generator("drawn")
+        noise = torch.rand(limit, self._episodes, generator=generator).to(self._device)
         went, steps = (each[solver] for each in walks(agent, placed, limit, noise))
         best, number = (each[solver, 0] for each in walks(agent, placed[:1], limit))
         sampled = [one[: n + 1].tolist() for one, n in zip(went, steps.tolist(), strict=True)]

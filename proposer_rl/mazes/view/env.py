@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -79,8 +81,7 @@ class ViewMazeEnv(LevelEnv):
     def _tabulate(self, levels: ViewLevel) -> None:
         """Takes levels up as one line of objects, of all grids with their rims one after another.
 
-        A place is a number of a cell in that line. ``_ahead`` [4] are the changes of place on
-        moving forward, ``_seen`` [4, 25] those from the agent to the cells that it sees.
+        A place is a number of a cell in that line.
         """
         device, count = self.device, self.batch_size.numel()
         rows, width = (side + 2 * RIM for side in self._grid)
@@ -90,16 +91,7 @@ class ViewMazeEnv(LevelEnv):
         goal = cell_index(levels.goal + RIM, width).reshape(count, 1)
         self._objects = objects.scatter_(1, goal, GOAL).flatten()
         self._origin = torch.arange(count, device=device).view(self.batch_size) * (rows * width)
-        ahead = torch.tensor(AHEAD, device=device)  # [4, 2]
-        right = ahead.roll(-1, 0)
-        across, along = torch.meshgrid(
-            torch.arange(VIEW, device=device) - AGENT[0],
-            AGENT[1] - torch.arange(VIEW, device=device),
-            indexing="ij",
-        )
-        seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
-        self._moves, self._ahead = ahead, cell_index(ahead, width)
-        self._seen = cell_index(seen, width).flatten(1).int()  # half the memory to go through
+        self._moves, self._ahead, self._seen = _directions(width, device)
         self._first_view = self._view(self._place(levels.start), levels.direction)
 
     def _first(self) -> dict[str, Tensor]:
@@ -144,5 +136,26 @@ class ViewMazeEnv(LevelEnv):
         seen = self._seen.index_select(0, direction.flatten())  # [N, 25]
         cells = (seen + place.reshape(-1, 1).int()).flatten()
         view = self._objects.index_select(0, cells).view(*place.shape, VIEW, VIEW)
-        view[..., AGENT[0], AGENT[1]] = EMPTY
+        view[..., AGENT[0], AGENT[1]].fill_(EMPTY)
         return view
+
+
+@cache
+def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """What a direction means in a line of grids of some width, of each of the four.
+
+    Made once: from numbers of the host, which a recorded reset must not ask for.
+
+    Returns:
+        The move forward [4, 2], the change of place that it makes [4], and the changes of place
+        from the agent to the cells that it sees, int32 [4, 25].
+    """
+    ahead = torch.tensor(AHEAD)
+    right = ahead.roll(-1, 0)
+    across, along = torch.meshgrid(
+        torch.arange(VIEW) - AGENT[0], AGENT[1] - torch.arange(VIEW), indexing="ij"
+    )
+    seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
+    # int32: half the memory to go through.
+    tables = ahead, cell_index(ahead, width), cell_index(seen, width).flatten(1).int()
+    return tuple(table.to(device) for table in tables)  # type: ignore[return-value]

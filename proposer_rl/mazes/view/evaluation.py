@@ -49,7 +49,7 @@ def play(
         levels: Levels ``[E]``, or ``[K, E]``, each Solver's own.
         max_steps: Step limit of an episode.
         episodes: Played on each level.
-        generator: Source of randomness, on the levels' device.
+        generator: Source of randomness, on the CPU.
 
     Returns:
         ``"return"`` and ``"success"``, float32 ``[K, E]``.
@@ -57,7 +57,7 @@ def play(
     count, device = levels.batch_size[-1], levels.walls.device
     each = levels.expand(agent.copies, count)
     every: ViewLevel = torch.cat([each] * episodes, 1)  # type: ignore[assignment]
-    noise = torch.rand(max_steps, every.batch_size[1], generator=generator, device=device)
+    noise = torch.rand(max_steps, every.batch_size[1], generator=generator).to(device)
     returns, success = torch.zeros(2, *every.batch_size, device=device)
     for place, state, counts in _episodes(agent, every, max_steps, noise):
         returns[:, place] += state["reward"].squeeze(-1) * counts

@@ -20,7 +20,7 @@ from proposer_rl.mazes.level_files import (
     read_levels,
     shipped_levels,
 )
-from proposer_rl.mazes.levels import FREE, WALL
+from proposer_rl.mazes.levels import FREE, WALL, drawn_rows
 from proposer_rl.mazes.levels import GOAL as GOAL_MARK
 from proposer_rl.mazes.view.env import EMPTY, GOAL
 from proposer_rl.mazes.view.env import WALL as WALL_NUMBER
@@ -84,13 +84,13 @@ def _assigned(content: bytes) -> dict[str, list[str]]:
     except (SyntaxError, RecursionError, MemoryError):
         raise ValueError("is no Python module") from None
     return {
-        target.id: statement.value.value.split()
+        target.id: drawn_rows(statement.value.value)
         for statement in body
-        if isinstance(statement, ast.Assign)
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
         and isinstance(statement.value, ast.Constant)
         and isinstance(statement.value.value, str)
         and _is_drawing(statement.value.value)
-        for target in statement.targets
+        for target in getattr(statement, "targets", [getattr(statement, "target", None)])
         if isinstance(target, ast.Name)
     }
 
@@ -107,8 +107,10 @@ def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
             array: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
         else:
             array = np.array(json.loads(content))
-    except (ValueError, EOFError, RecursionError):
+    except (ValueError, EOFError, RecursionError, MemoryError):
         raise ValueError("is no array of numbers") from None
+    if not isinstance(array, np.ndarray) or not array.size:
+        raise ValueError("is no array of numbers")
     if array.ndim not in (3, 4) or array.shape[-1] != 3 or array.dtype.kind not in "iu":
         raise ValueError(
             "must be MiniGrid's encoding of grids, whole numbers [W, H, 3] or [n, W, H, 3], got "

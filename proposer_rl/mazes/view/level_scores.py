@@ -56,7 +56,7 @@ def score_view_levels(
     scores: list[Score] = []
     for names, limit in alike(levels, limits, lambda _: AT_ONCE // episodes):
         batch: Any = torch.stack([levels[name] for name in names]).to(device)
-        generator = streams.generator(names[0], device=device)
+        generator = streams.generator(names[0])
         found = play(agent, batch, limit, episodes, generator).cpu()
         height, width = batch.walls.shape[-2:]
         about = {"height": height, "width": width, "max_steps": limit}
@@ -95,8 +95,8 @@ def _picture(
     """A level, and one episode of one Solver there."""
     env = ViewMazeEnv(level.expand(agent.copies, 1), max_steps=limit)
     policy = RolloutPolicy(agent)
-    generator = streams.generator("picture", device=level.walls.device)
-    noise = torch.rand(limit, 1, 1, generator=generator, device=level.walls.device)
+    generator = streams.generator("picture")
+    noise = torch.rand(limit, 1, 1, generator=generator).to(level.walls.device)
     policy.begin(noise.expand(limit, *env.batch_size))
     rollout = env.rollout(limit, policy, break_when_any_done=False)
     return draw_level(level, first_path(rollout[solver, 0])).numpy()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.checks import check_names, named
+from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.edits import edit_levels
 from proposer_rl.mazes.level_files import chosen_levels, shipped_sets
 from proposer_rl.mazes.level_scores import SLACK
@@ -104,7 +105,7 @@ class ViewMazeTask:
         self.target = self.distributions[target]
         self.space = named("space", ViewSpace, space, *grid)
         self.levels_help = (
-            f"{shipped_sets()[0]}, a file that ends in {' or '.join(SUFFIXES)}, "
+            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
             f"or a distribution: {', '.join(distributions)}"
         )
         scoring = Streams(evaluation.seed, "scores")
@@ -214,7 +215,7 @@ class ViewMazeTask:
         """What was measured, on each of the fixed levels."""
         streams = Streams(self._evaluation.seed, "episodes")
         return {
-            name: self.performance(agent, levels, streams.generator(name, device=self.device))
+            name: self.performance(agent, levels, streams.generator(name))
             for name, levels in self._measured_on.items()
         }
 
@@ -222,7 +223,7 @@ class ViewMazeTask:
         """What the Solvers trained on; see :func:`~proposer_rl.mazes.records.level_statistics`."""
         actions = fewest_actions(levels)
         solvable = (actions >= 0) & (actions <= self.maze.max_steps)
-        return level_statistics(levels, rollout, solvable)
+        return level_statistics(levels, rollout, shortest_path_length(levels), solvable)
 
     def record(self, levels: ViewLevel, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
         """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
@@ -236,7 +237,7 @@ class ViewMazeTask:
         """
         drawn = {d: partial(self.evaluation_levels, d) for d in self.distributions}
         levels, of_distribution = chosen_levels(
-            name, drawn, SUFFIXES, read_view_levels, shipped_view_levels
+            name, drawn, SUFFIXES, read_view_levels, shipped_view_levels, self.levels_help
         )
         limit, slack = self.maze.max_steps, 0 if of_distribution else SLACK
         return score_view_levels(

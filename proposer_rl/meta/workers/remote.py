@@ -125,5 +125,5 @@ class WorkerPolicy(RolloutPolicy):
             parameter.data.copy_(weights[name])
         device = next(agent.parameters()).device
         shape = torch.Size([len(share), *self.shape])
-        generators = action_generators(streams, share, device)
+        generators = action_generators(streams, share)
         self.begin(uniform_noise(shape, self.horizon, generators, device))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,6 +76,11 @@ def test_levels_that_a_run_trained_on_keep_their_directions(tmp_path: Path) -> N
     assert [level.to_text() for level in levels.values()] == drawings
 
 
+def test_names_with_a_type_count_too(tmp_path: Path) -> None:
+    (tmp_path / "a.py").write_text('room: str = """\n>.\n.G\n"""\nhall = ">.G"\nside: int\n')
+    assert list(read_view_levels(tmp_path / "a.py")) == ["room", "hall"]
+
+
 def test_a_module_is_read_and_not_run(tmp_path: Path) -> None:
     file = tmp_path / "level.py"
     file.write_text(MODULE + "\nraise SystemExit('executed')\n")
@@ -121,6 +128,18 @@ LAVA = [[[9, 0, 0], [8, 1, 0]], [[1, 0, 0], [10, 0, 0]]]
 NOBODY = [[[1, 0, 0], [8, 1, 0]]]
 
 
+def saved(array: np.ndarray, save: Any = np.save) -> bytes:
+    file = io.BytesIO()
+    save(file, array)
+    return file.getvalue()
+
+
+# A header that claims more than any machine has.
+HUGE = saved(np.zeros((2, 2, 3), np.uint8)).replace(
+    b"(2, 2, 3), }" + b" " * 12, b"(%d, 2, 3), }" % 10**12
+)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
@@ -131,6 +150,9 @@ NOBODY = [[[1, 0, 0], [8, 1, 0]]]
         ("a.py", b"x = 1\n", "holds no levels"),
         ("a.py", b"\xff\xfe", "is no Python module"),
         ("a.npy", b"none", "is no array of numbers"),
+        ("a.npy", saved(np.zeros((5, 0, 3), np.uint8)), "is no array of numbers"),
+        ("a.npy", saved(np.zeros((2, 2, 3), np.uint8), np.savez), "is no array of numbers"),
+        ("a.npy", HUGE, "is no array of numbers"),
         ("a.json", b"[1, 2", "is no array of numbers"),
         ("a.json", b'[["a"]]', "must be MiniGrid's encoding"),
         ("a.json", b"[[1, 2], [3]]", "is no array of numbers"),
