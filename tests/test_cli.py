@@ -63,6 +63,15 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> Non
     assert tables(Path("run")) == before
 
 
+def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> None:
+    def broken(*_: object) -> float:
+        raise ValueError("a bug")
+
+    monkeypatch.setattr("proposer_rl.cli.run.train", broken)
+    with pytest.raises(ValueError, match="a bug"):
+        train("+method=target", *SMOKE, "hydra.run.dir=run")
+
+
 def test_a_damaged_summary_is_named(train, capsys) -> None:
     arguments = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*arguments) == 0

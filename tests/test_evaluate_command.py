@@ -194,6 +194,11 @@ def test_several_runs_are_compared_by_their_means(
     code, said = evaluate(tmp_path / "runs", "--levels", "small", "-o", output)
     assert code == 0 and "target" in said and "of_older_code" in said
     before = output.read_text()
+    limited = ("--levels", "small", "--max-steps", 5, "-o", tmp_path / "limited.csv")
+    code, said = evaluate(tmp_path / "runs", *limited)
+    assert code == 2 and "--max-steps: --output" in said
+    code, said = evaluate(tmp_path / "runs", "--levels", "nope", "-o", tmp_path / "nope.csv")
+    assert code == 2 and "--levels nope: must be one of" in said
     both = [tmp_path / "runs", "--levels", "small", "id@7x9", "-o", output]
     assert evaluate(*both)[0] == 0 and output.read_text().startswith(before)
     with output.open() as file:

@@ -92,6 +92,18 @@ def test_look_shows_every_stage_and_what_changes(run: Path, tmp_path: Path, caps
     assert "as it is" in capsys.readouterr().out
 
 
+def test_look_shows_the_first_of_several_solvers(run: Path, tmp_path: Path) -> None:
+    both, alone = tmp_path / "both", tmp_path / "alone"
+    assert call(train, "+method=target", *SMOKE, "seeds=[0,1]", f"hydra.run.dir={both}") == 0
+    assert call(train, "+method=target", *SMOKE, "seed=0", f"hydra.run.dir={alone}") == 0
+    rows = []
+    for folder in (both, alone):
+        output = tmp_path / "look.json"
+        assert call(look, str(run), str(folder), "--output", str(output)) == 0
+        rows.append([row["distance"] for row in json.loads(output.read_text())])
+    assert rows[0] == pytest.approx(rows[1], abs=1e-3) and len(rows[0]) > 2
+
+
 def test_look_refuses_a_run_without_a_proposer(tmp_path: Path, capsys) -> None:
     folder = tmp_path / "target"
     assert call(train, "+method=target", *SMOKE, f"hydra.run.dir={folder}") == 0

@@ -56,7 +56,7 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     task = make_task(config)
     frozen = frozen_proposer(Parts(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
-    stages = _stages(task, frozen, checkpoints(solvers), len(config.seeds))
+    stages = _stages(task, frozen, checkpoints(solvers))
     rows = []
     for stage in stages:
         shares = _shares(frozen, stage.seen, task.batch_size)
@@ -71,12 +71,13 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     return rows
 
 
-def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path], solvers: int) -> list[Stage]:
+def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path]) -> list[Stage]:
     learner = task.learner([Streams(0)])
     stages = []
     for file in files:
         _, state = load_checkpoint(file)
-        learner.restore(TensorDict(state["solver"], [solvers])[:1])
+        solvers = TensorDict(state["solver"]).auto_batch_size_(1)
+        learner.restore(solvers[:1])  # of several that were trained side by side the first
         stages.append(Stage(state["updates"], frozen.view.observe(learner.agent, 0.0)))
     return stages
 

@@ -18,9 +18,10 @@ from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import cost_curves, learning_curves
-from proposer_rl.report.decision import EXACT, STEADY, budgets, choices
+from proposer_rl.report.decision import EXACT, STEADY, budgets, choices, needs_of
 from proposer_rl.report.generalisation import (
     Score,
+    check_names,
     generalisation_table,
     read_scores,
     write_scores,
@@ -32,7 +33,7 @@ from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing
 from proposer_rl.report.tables import escape_markdown, write
-from tests.report.folders import cycle, write_rockets, write_run
+from tests.report.folders import TASK, cycle, write_rockets, write_run
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "findings"
@@ -338,3 +339,25 @@ def cell(row: Mapping[str, str], name: str) -> str:
     """A mean with its interval as Markdown has it."""
     ends = [float(row[f"{name}{part}"] or "nan") for part in ("", ", low", ", high")]
     return write(Interval(*ends))
+
+
+def test_a_claim_of_methods_that_are_missing_is_not_decided(tmp_path: Path) -> None:
+    runs = write_methods(tmp_path, {"first_order_gain": FASTEST, "paired": SLOW, "target": FLAT})
+    (study,), _ = read_studies(sorted(runs.iterdir()), None)
+    assert own_findings(study, NEEDS)[0][1] is None
+
+
+def test_two_runs_of_one_name_are_not_taken_for_one(tmp_path: Path) -> None:
+    for method in ("target", "plr"):
+        write_run(tmp_path / method / "lifetime_0", method)
+    (study,), _ = read_studies(sorted(tmp_path.glob("*/*")), None)
+    with pytest.raises(UnreadableRun, match="scores could not tell it from"):
+        check_names(study.runs)
+
+
+def test_performance_that_is_played_is_no_exact_evaluation(tmp_path: Path) -> None:
+    for exact in (True, False):
+        task = {**TASK, "exact": exact}
+        write_run(tmp_path / str(exact), "mine", task=task)
+        (study,), _ = read_studies([tmp_path / str(exact)], None)
+        assert (EXACT in needs_of(study.groups[0], {})) == exact
