@@ -309,7 +309,7 @@ def _spaces(
     for name, settings in parameters.items():
         try:
             if name in RESERVED:
-                raise ValueError("is what every level has anyway; choose another name")
+                raise ValueError("is a column of every table; choose another name")
             if not re.fullmatch(r"\w[\w .-]*", name):
                 raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = space_bins(settings), target_bins(settings)

@@ -24,7 +24,7 @@ from proposer_rl.report.decision import (
     usable,
 )
 from proposer_rl.report.findings import GAIN, TITLE, Evidence, finding_table, paper_findings
-from proposer_rl.report.generalisation import generalisation_table, read_scores
+from proposer_rl.report.generalisation import check_names, generalisation_table, read_scores
 from proposer_rl.report.own_findings import own_findings
 from proposer_rl.report.records import words
 from proposer_rl.report.runs import find_runs
@@ -76,6 +76,8 @@ def write_pages(
         titles = "; ".join(study.title for study in studies)
         raise OutputError(f"--pages: the runs were not measured alike ({titles}); give fewer")
     (study,) = studies
+    if scores is not None:
+        check_names(study.runs)
     more = [] if scores is None else ["--scores", str(scores)]
     more += ["--pages", str(output)]
     command = page.report_command(folders, threshold, baseline, *more)

@@ -40,7 +40,7 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ({"parameters": {}}, "parameters: at least one"),
         (
             {"parameters": {"seed": PARAMETERS["width"]}},
-            "parameters.seed: is what every level has anyway",
+            "parameters.seed: is a column of every table",
         ),
         (
             {"parameters": {"width": ParameterSettings(values=[2.0, 1.0], target=1.0)}},
@@ -74,7 +74,7 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ),
         (
             {"parameters": {"updates": PARAMETERS["width"]}},
-            "parameters.updates: is what every level has anyway",
+            "parameters.updates: is a column of every table",
         ),
         ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
         ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
