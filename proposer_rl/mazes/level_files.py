@@ -23,7 +23,6 @@ L = TypeVar("L", bound=Level)
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
 _RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
-TOO_MUCH = (OverflowError, RecursionError)  # a number, brackets
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -212,7 +211,14 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
             for nth, level in enumerate(row["levels"], 1):
                 drawn = "\n".join(recorded_drawing(level))
                 found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
-        except (KeyError, TypeError, AttributeError, ValueError, *TOO_MUCH) as error:
+        except (
+            KeyError,
+            TypeError,
+            AttributeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+        ) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
     if not found:
         raise ValueError("holds no levels")

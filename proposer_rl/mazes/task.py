@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -14,7 +14,14 @@ from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.board import MazeBoard
-from proposer_rl.mazes.checks import check_names, named
+from proposer_rl.mazes.checks import (
+    check_grid,
+    check_names,
+    check_network,
+    check_paths,
+    check_size,
+    named,
+)
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.mazes.edits import edit_levels
@@ -60,7 +67,6 @@ from proposer_rl.task import EpisodeLaw, Place, Score
 
 ACTIONS = 4
 PLANES = 3
-LARGEST_GRID = 10**6  # cells
 SAMPLES = 6  # levels of each distribution that a reader is shown
 WORST = 0.1  # of the levels, in <name>_success_worst10
 TEXT_KEY = f"S start, G goal, {EPISODE} the Solver's episode"
@@ -104,10 +110,10 @@ class MazeTask:
         make_network: Any = None,
     ) -> None:
         check_names(distributions, target, evaluation.distributions)
-        _check_grid(maze)
+        check_grid(maze)
         if make_network is None:
-            _check_network(maze, network)
-        _check_paths(maze, distributions, {target, *evaluation.distributions})
+            check_network(maze, network)
+        check_paths(maze, distributions, {target, *evaluation.distributions})
         self.maze = maze
         self.solver = solver
         self.batch_size = solver.batch_size
@@ -314,20 +320,8 @@ class MazeTask:
 
     def _check_size(self, name: str, level: Level) -> None:
         """Refuse a level that the U-Net cannot see; what another network sees, nobody knows."""
-        if self._make_network != self._unet:
-            return
-        least = 2 ** (len(self._network.channels) - 1)
-        height, width = level.walls.shape
-        if min(height, width) < least:
-            raise ValueError(
-                f"level {name!r}: its {height}x{width} cells are halved to nothing by this "
-                f"Solver; it sees levels of {least}x{least} cells and more"
-            )
-        if _normalises_single_numbers(height, width, self._network):
-            raise ValueError(
-                f"level {name!r}: of its {height}x{width} cells a single number is left to this "
-                "Solver in a group of channels; give a larger one"
-            )
+        if self._make_network == self._unet:
+            check_size(name, level.walls.shape, self._network)
 
     def _limit(self, length: int, slack: int = SLACK) -> int:
         """The step limit of a level, given the length of its shortest path."""
@@ -367,54 +361,6 @@ def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     """
     in_hardware = device.type == "cpu" and torch.cpu._is_amx_tile_supported()
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
-
-
-def _check_paths(
-    maze: MazeSettings, distributions: Mapping[str, DistributionSettings], measured: Iterable[str]
-) -> None:
-    for name in sorted(measured):
-        longest = max(length for _, length in distributions[name].specifications)
-        if longest > maze.max_steps:
-            raise ValueError(
-                f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
-                f"distributions.{name}, which is measured on: nobody could reach the goal"
-            )
-
-
-def _check_grid(maze: MazeSettings) -> None:
-    if maze.height * maze.width > LARGEST_GRID:
-        raise ValueError(
-            f"maze.height={maze.height}, maze.width={maze.width}: must be at most "
-            f"{LARGEST_GRID:,} cells together"
-        )
-
-
-def _check_network(maze: MazeSettings, network: NetworkSettings) -> None:
-    """Refuse a grid that the U-Net of the settings cannot see."""
-    size, channels = f"{maze.height}x{maze.width}", network.channels
-    if min(maze.height, maze.width) >> (len(channels) - 1) < 1:
-        raise ValueError(
-            f"network.channels={channels} halve a {size} maze to nothing; give fewer channels or a "
-            "larger maze"
-        )
-    if any(width % network.groups for width in channels):
-        raise ValueError(
-            f"network.channels={channels} must be multiples of network.groups={network.groups}"
-        )
-    if _normalises_single_numbers(maze.height, maze.width, network):
-        raise ValueError(
-            f"network.channels={channels} leave a group of channels with a single number on a "
-            f"{size} maze: give more channels, a larger maze or fewer than "
-            f"network.groups={network.groups}"
-        )
-
-
-def _normalises_single_numbers(height: int, width: int, network: NetworkSettings) -> bool:
-    """Whether there is nothing left of a group of channels of the U-Net but its sign."""
-    return any(
-        (height >> halvings) * (width >> halvings) * channels == network.groups
-        for halvings, channels in enumerate(network.channels)
-    )
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
