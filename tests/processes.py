@@ -24,6 +24,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from proposer_rl.runs.status import FILE as PROGRESS
+
 ROOT = Path(__file__).resolve().parents[1]
 CAPABILITIES_VERSION = 0x20080522  # capget(2)
 CAP_DAC_OVERRIDE = 1
@@ -33,7 +35,8 @@ CAP_DAC_OVERRIDE = 1
 class Ended:
     """How a child ended: its exit code, or minus the signal's number; what it said and did.
 
-    ``writes`` names its calls of fsync and replace in order, such as ``"fsync metrics.csv"``.
+    ``writes`` names its calls of fsync and replace in order, such as ``"fsync metrics.csv"``. Those
+    of ``progress.json`` are no part of it: how many there are, the clock decides.
     """
 
     code: int
@@ -190,13 +193,14 @@ def _note_writes(signal_at: dict[int, int], noted: int) -> None:
     indices = count()
 
     def call(name: str, file: Any, *arguments: Any) -> Any:
-        path = os.readlink(f"/proc/self/fd/{file}") if name == "fsync" else str(file)
-        os.write(noted, f"{name} {Path(path).name}\n".encode())
-        signum = signal_at.get(next(indices))
-        if signum is not None:
-            if signum == SIGKILL and name == "fsync" and Path(path).name.startswith(".step_"):
-                os.ftruncate(file, os.fstat(file).st_size // 2)
-            os.kill(os.getpid(), signum)
+        path = Path(os.readlink(f"/proc/self/fd/{file}") if name == "fsync" else str(file))
+        if path.name != f".{PROGRESS}.tmp":
+            os.write(noted, f"{name} {path.name}\n".encode())
+            signum = signal_at.get(next(indices))
+            if signum is not None:
+                if signum == SIGKILL and name == "fsync" and path.name.startswith(".step_"):
+                    os.ftruncate(file, os.fstat(file).st_size // 2)
+                os.kill(os.getpid(), signum)
         return originals[name](file, *arguments)
 
     for name in originals:

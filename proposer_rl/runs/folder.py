@@ -155,10 +155,15 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
     return rows
 
 
-def write_atomically(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
     """Writes a file under a temporary name beside it, then renames it, and waits for the disk.
 
     A crash leaves the old file as it was, and perhaps a ``.NAME.tmp``; an error leaves only it.
+
+    Args:
+        path: the file.
+        content: all of it.
+        durably: wait for the disk; where a file is worthless once the machine stops, do not.
 
     Raises:
         StorageError: if the disk cannot take it.
@@ -166,14 +171,15 @@ def write_atomically(path: Path, content: bytes) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
     with storage(path):
         try:
-            _write(temporary, "wb", content)
+            _write(temporary, "wb", content, durably)
             os.replace(temporary, path)
         except BaseException:
             # A full disk must not stay full of an attempt.
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        if durably:
+            _sync_folder(path.parent)
 
 
 @contextmanager
@@ -257,12 +263,13 @@ def _row_ends(path: Path) -> list[int]:
     return ends[1:] if path.suffix == ".csv" else ends
 
 
-def _write(path: Path, mode: str, content: bytes) -> None:
-    """Writes to a file and waits until it is on the disk."""
+def _write(path: Path, mode: str, content: bytes, durably: bool = True) -> None:
+    """Writes to a file and, if asked, waits until it is on the disk."""
     with open(path, mode) as file:
         file.write(content)
         file.flush()
-        os.fsync(file.fileno())
+        if durably:
+            os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

@@ -140,5 +140,6 @@ class Status:
         if self._folder is None or now - self._told < EVERY:
             return
         self._told = now
-        write_atomically(self._folder / FILE, json.dumps(self.activity()._asdict()).encode())
+        content = json.dumps(self.activity()._asdict()).encode()
+        write_atomically(self._folder / FILE, content, durably=False)
         self._show()
