@@ -15,6 +15,7 @@ from tqdm import tqdm
 from proposer_rl.curricula import Curriculum
 from proposer_rl.learning import PPO, Update, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
+from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
@@ -354,11 +355,16 @@ class Experiment:
 
 
 def check_headline(task: Task, schedule: Schedule) -> None:
-    """Refuse to sum runs up by what is not measured.
+    """Refuse to sum runs up by what is not measured, or not reached.
 
     Raises:
-        ValueError: if the headline is none of the task's measurements.
+        ValueError: if the headline is none of the task's measurements, or a rate that is to reach
+            what no rate can.
     """
-    known = list(task.measurements)
-    if schedule.headline not in known:
-        raise ValueError(f"schedule.headline={schedule.headline!r}: must be one of {known}")
+    headline, threshold, known = schedule.headline, schedule.threshold, list(task.measurements)
+    if headline not in known:
+        raise ValueError(f"schedule.headline={headline!r}: must be one of {known}")
+    if is_rate(headline) and not 0 < threshold <= 1:
+        raise ValueError(
+            f"schedule.threshold={threshold:g}: must be above 0 and at most 1, as {headline} is"
+        )

@@ -166,7 +166,7 @@ class Schedule:
     checkpoint_seconds: Annotated[float, Gt(0)] | None = 600.0
     keep_checkpoints: Annotated[int, Ge(1)] = 2
     headline: str = "id_success"
-    threshold: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    threshold: float = 0.8
 
 
 @settings

@@ -19,8 +19,9 @@ from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import read_progress
-from proposer_rl.report.records import is_rate, level_text
+from proposer_rl.report.records import level_text
 from proposer_rl.report.terminal import screen
+from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import processor
 

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from proposer_rl.report.comparisons import TOO_FEW, Decision, between, decisions, primary
-from proposer_rl.report.records import LONGEST_TEXT, is_rate, printable, words
+from proposer_rl.report.records import LONGEST_TEXT, printable, words
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
+from proposer_rl.runs.columns import is_rate
 
 # What methods and ablations do, by ``method`` or ``ablation`` and name.
 Meanings = Mapping[str, Mapping[str, str]]

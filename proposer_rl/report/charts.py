@@ -9,7 +9,7 @@ from typing import Any
 from proposer_rl.report.comparisons import Outcome, outcomes, updates_needed, waiting_outcome
 from proposer_rl.report.curves import axis_text
 from proposer_rl.report.proposals import gain_numbers, own_numbers
-from proposer_rl.report.records import Column, is_rate
+from proposer_rl.report.records import Column
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.series import COSTS, Series, band, over_cost, over_cycles
 from proposer_rl.report.series import over_updates as against_updates
@@ -17,6 +17,7 @@ from proposer_rl.report.single_levels import level_means, told, worst_series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import UPDATES
+from proposer_rl.runs.columns import is_rate
 
 Json = Any
 DIGITS = 5

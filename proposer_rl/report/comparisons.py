@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from proposer_rl.report.records import is_rate, level_text, words
+from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     ERROR,
@@ -25,6 +25,7 @@ from proposer_rl.report.statistics import (
     seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
+from proposer_rl.runs.columns import is_rate
 
 ALIKE = 0.1  # of a rate: differences below it are small, and who gained less learnt nothing
 

@@ -11,11 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from proposer_rl.report.comparisons import updates_needed, waiting_outcome
-from proposer_rl.report.records import Column, is_rate, level_text, words
+from proposer_rl.report.records import Column, level_text, words
 from proposer_rl.report.series import COSTS, Series, band, over_cost, over_updates
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import PANEL, UPDATES, Drawing, Look, Panel, axes_of, finish, style
+from proposer_rl.runs.columns import is_rate
 
 MOST_PANELS = 12
 

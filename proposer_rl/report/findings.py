@@ -27,11 +27,12 @@ from proposer_rl.report.comparisons import (
     primary,
 )
 from proposer_rl.report.proposals import axis_means
-from proposer_rl.report.records import is_rate, numbers, words
+from proposer_rl.report.records import numbers, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_interval, mean_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
+from proposer_rl.runs.columns import is_rate
 
 Verdict = Literal["supported", "contradicted", "undecided", "too few seeds"]
 Evidence = tuple[Verdict, str]

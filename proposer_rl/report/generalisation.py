@@ -9,11 +9,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from proposer_rl.report.records import is_rate, number, printable, words
+from proposer_rl.report.records import number, printable, words
 from proposer_rl.report.runs import Run, UnreadableRun
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, to_csv
+from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import storage
 
 LARGEST_FILE = 2**24

@@ -10,7 +10,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from proposer_rl.report.records import LevelRecord, SampleRecord, is_rate, picture, words
+from proposer_rl.report.records import LevelRecord, SampleRecord, picture, words
 from proposer_rl.report.runs import Run, read_run
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import (
@@ -23,6 +23,7 @@ from proposer_rl.report.style import (
     axes_of,
     finish,
 )
+from proposer_rl.runs.columns import is_rate
 
 STAGES = 5
 BATCH = 2  # levels of a batch

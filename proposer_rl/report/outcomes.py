@@ -15,7 +15,7 @@ from proposer_rl.report.comparisons import (
     updates_needed,
     waiting_outcome,
 )
-from proposer_rl.report.records import LONGEST_TEXT, is_rate, level_text, words
+from proposer_rl.report.records import LONGEST_TEXT, level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
@@ -27,6 +27,7 @@ from proposer_rl.report.statistics import (
 )
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
+from proposer_rl.runs.columns import is_rate
 
 MILLION = 1e6
 MOST_COLUMNS, DEEPEST = 200, 8

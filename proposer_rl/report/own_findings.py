@@ -18,10 +18,10 @@ from proposer_rl.report.comparisons import (
 )
 from proposer_rl.report.decision import TARGET, Needs, needs_of
 from proposer_rl.report.findings import Evidence, beats_in
-from proposer_rl.report.records import is_rate
 from proposer_rl.report.statistics import ERROR
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
+from proposer_rl.runs.columns import is_rate
 
 # The methods, by the labels of their groups.
 OURS, PROPOSER, LITERAL = "first_order_gain", "first_order_proposer", "perf_gain, paper_literal"

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
+from proposer_rl.runs.columns import is_rate
+
 PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
 LONGEST_TEXT = 400
@@ -158,11 +160,6 @@ def numbers(value: Any) -> Column | None:
         return None
     found = np.array([number(one) for one in value])
     return found if np.isfinite(found).all() else None
-
-
-def is_rate(name: str) -> bool:
-    """Whether a column holds shares from 0 to 1, as success is."""
-    return "success" in name.split("_")
 
 
 def words(name: str) -> str:

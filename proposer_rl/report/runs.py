@@ -24,10 +24,10 @@ from proposer_rl.report.records import (
     Sheets,
     TaskFacts,
     checked,
-    is_rate,
     number,
     printable,
 )
+from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
 LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB

@@ -10,12 +10,13 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
 from proposer_rl.report.curves import draw_curve
-from proposer_rl.report.records import Column, is_rate, words
+from proposer_rl.report.records import Column, words
 from proposer_rl.report.series import Series
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import Drawing, Panel, axes_of, finish
 from proposer_rl.report.tables import Cell
+from proposer_rl.runs.columns import is_rate
 
 SHARES = np.geomspace(0.01, 1.0, 61)
 TICKS = (0.01, 0.03, 0.1, 0.3, 1.0)

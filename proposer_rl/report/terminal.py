@@ -19,13 +19,13 @@ from proposer_rl.report.records import (
     GAINS,
     PLACE,
     Column,
-    is_rate,
     number,
     numbers,
     printable,
     words,
 )
 from proposer_rl.report.runs import Run, share_map
+from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.status import duration
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
