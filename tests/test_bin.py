@@ -69,30 +69,58 @@ case "$1 $2 $3" in
   "-m venv "*) mkdir -p "$3/bin" && cp "$0" "$3/bin/python" ;;
   "-m pip --version") [ "$(basename "$0")" = python ] ;;
   "-m pip install") for last; do :; done; echo "$last" >> "$PIP_LOG" ;;
+  "-m proposer_rl"*) echo "${PYTHONDONTWRITEBYTECODE-none} ${PYTHONPYCACHEPREFIX-none}" ;;
 esac
 """
 
 
-def test_environments_keep_the_extras_that_they_have(tmp_path: Path) -> None:
-    root, log = tmp_path / "checkout", tmp_path / "pip"
+@pytest.fixture
+def bare(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """A checkout on that machine, and the variables of a shell there."""
+    root, folder = tmp_path / "checkout", tmp_path / "path"
     shutil.copytree(BIN, root / "bin")
     (root / "constraints.txt").touch()
-    (tmp_path / "path").mkdir()
-    (tmp_path / "path" / "python3").write_text(BARE)
-    (tmp_path / "path" / "python3").chmod(0o755)
-    environment = os.environ | {"PATH": f"{tmp_path / 'path'}:{os.environ['PATH']}"}
+    folder.mkdir()
+    (folder / "python3").write_text(BARE)
+    (folder / "python3").chmod(0o755)
+    set_here = ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
+    kept = {key: value for key, value in os.environ.items() if key not in set_here}
+    path = f"{folder}:{kept['PATH']}"
+    return root, kept | {"PATH": path, "PIP_LOG": str(tmp_path / "pip")}
+
+
+def test_environments_keep_the_extras_that_they_have(bare: tuple[Path, dict[str, str]]) -> None:
+    root, environment = bare
+    log = Path(environment["PIP_LOG"])
     asked = []
     for command in ("report", "play", "docs", "report", "play", "test", "play", "docs", "train"):
         log.write_text("")
-        subprocess.run(
-            [root / "bin" / command],
-            env=environment | {"PIP_LOG": str(log)},
-            capture_output=True,
-            check=True,
-        )
+        subprocess.run([root / "bin" / command], env=environment, capture_output=True, check=True)
         asked.append(log.read_text().strip())
     extras = ["", "[play]", "[play,docs]", None, None, "[play,docs,dev]", None, None, None]
     assert asked == ["" if extra is None else f"{root}{extra}" for extra in extras]
+
+
+@pytest.mark.parametrize(
+    ("variables", "expected"),
+    [
+        ({}, "none none"),
+        ({"PYTHONDONTWRITEBYTECODE": "1"}, "none {root}/.venv/bytecode"),
+        ({"PYTHONDONTWRITEBYTECODE": "1", "PYTHONPYCACHEPREFIX": "/own"}, "none /own"),
+    ],
+)
+def test_bytecode_that_may_not_lie_beside_sources_is_kept_elsewhere(
+    variables: dict[str, str], expected: str, bare: tuple[Path, dict[str, str]]
+) -> None:
+    root, environment = bare
+    ended = subprocess.run(
+        [root / "bin" / "report"],
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ended.stdout.strip() == expected.format(root=root)
 
 
 def test_the_site_needs_only_its_own_extra() -> None:
