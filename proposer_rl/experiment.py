@@ -15,7 +15,7 @@ from tqdm import tqdm
 from proposer_rl.curricula import Curriculum
 from proposer_rl.learning import PPO, Update, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
@@ -364,7 +364,7 @@ def check_headline(task: Task, schedule: Schedule) -> None:
     headline, threshold, known = schedule.headline, schedule.threshold, list(task.measurements)
     if headline not in known:
         raise ValueError(f"schedule.headline={headline!r}: must be one of {known}")
-    if is_rate(headline) and not 0 < threshold <= 1:
+    if not can_reach(headline, threshold):
         raise ValueError(
             f"schedule.threshold={threshold:g}: must be above 0 and at most 1, as {headline} is"
         )

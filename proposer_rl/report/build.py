@@ -20,7 +20,7 @@ from proposer_rl.report.stages import stages
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
 from proposer_rl.report.tables import Cell, escape_markdown, to_csv
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import write_atomically
 
 PAGE = "report.html"
@@ -105,7 +105,7 @@ def write_report(
     if baseline not in (None, *labels):
         raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
     for study in studies:
-        if threshold is not None and is_rate(study.headline) and not 0 < threshold <= 1:
+        if threshold is not None and not can_reach(study.headline, threshold):
             raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
