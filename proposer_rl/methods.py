@@ -380,6 +380,8 @@ def _one_solver(parts: Parts) -> None:
 
 def _curriculum_state(path: Path) -> State:
     """The curriculum's part of a checkpoint, or of a run's newest one."""
+    if not path.exists():
+        raise CheckpointError(f"checkpoint={path}: there is no such file or folder")
     if path.is_dir():
         latest = load_latest(path / "checkpoints")
         if latest is None:

@@ -52,6 +52,21 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     assert "not reached in 6 updates (censored)" in said and "run.png" in said
 
 
+@pytest.mark.parametrize(
+    ("checkpoint", "said"),
+    [
+        ("null", "checkpoint=: name a run's folder or a checkpoint that has a Proposer"),
+        ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
+        (".", "checkpoint=.: the folder holds no checkpoints"),
+    ],
+)
+def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train, capsys) -> None:
+    arguments = ["+method=frozen_proposer", *SMOKE, f"checkpoint={checkpoint}"]
+    assert train(*arguments, "hydra.run.dir=run") == 2
+    assert f"error: curriculum: {said}\n" in capsys.readouterr().err
+    assert not Path("run").exists()
+
+
 def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:
     arguments = ["+method=target", *SMOKE, "hydra.run.dir=run"]
     assert train(*arguments) == 0

@@ -45,13 +45,14 @@ class Outcome(NamedTuple):
     value: Callable[[Run], float]
     sign: int = 1
 
-    def known(self, group: Group) -> list[Run]:
-        """The runs of a group that have a value."""
-        return [run for run in group.runs if not math.isnan(self.value(run))]
+    def known(self, group: Group) -> list[tuple[int, float]]:
+        """Seed and value of each of a group's runs that has one."""
+        found = [(run.seed, self.value(run)) for run in group.runs]
+        return [(seed, value) for seed, value in found if not math.isnan(value)]
 
     def values(self, group: Group) -> list[float]:
         """The known values of a group's runs."""
-        return [self.value(run) for run in self.known(group)]
+        return [value for _, value in self.known(group)]
 
 
 class Decision(NamedTuple):
@@ -140,9 +141,11 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
     Runs of the same seed begin with the same weights and draw the same numbers: where both groups
     have the same seeds, each once, they are compared in pairs.
     """
-    seeds = [[run.seed for run in outcome.known(group)] for group in (one, other)]
-    paired = seeds[0] == seeds[1] and len(set(seeds[0])) == len(seeds[0])
-    return difference_of(outcome.values(one), outcome.values(other), paired)
+    known = [outcome.known(group) for group in (one, other)]
+    seeds, others = ([seed for seed, _ in pairs] for pairs in known)
+    paired = seeds == others and len(set(seeds)) == len(seeds)
+    a, b = ([value for _, value in pairs] for pairs in known)
+    return difference_of(a, b, paired)
 
 
 def learnt(group: Group, name: str, updates: float) -> bool:
