@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -116,3 +117,61 @@ def number(cell: str) -> float | str:
         return float(cell)
     except ValueError:
         return cell
+
+
+# Pages whose numbers are all of runs whose tables are in the repository, prose and tables.
+PROSE = ["README.md", "docs/choice.md", "docs/comparison.md", "docs/replay.md", GYMNASIUM]
+NUMBER = r"[−]?\d*\.\d+"
+INTERVAL = re.compile(rf"\+?(?P<shown>{NUMBER} \[{NUMBER}, {NUMBER}\])")
+P_VALUE = re.compile(r",? \(?(?:undecided, )?p = (0?\.\d+)")
+
+
+def written(mean: float, low: float, high: float) -> Iterator[str]:
+    """An interval as prose has it, of a difference or of the same with its sides exchanged."""
+    for digits in (2, 3):
+        for shown in ((mean, low, high), (-mean, -high, -low)):
+            mean_text, *bounds = (f"{x:.{digits}f}".replace("-", "−") for x in shown)
+            yield f"{mean_text} [{', '.join(bounds)}]"
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, list[dict[str, str]]]:
+    """By every interval that a table has, the rows that have it; none if it is a table of docs."""
+    found: dict[str, list[dict[str, str]]] = {}
+    for table in (ROOT / "results").glob("*/tables/*.csv"):
+        with table.open(encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for name in (name for name in row if row.get(f"{name}, low")):
+                    bounds = (float(row[f"{name}{part}"]) for part in ("", ", low", ", high"))
+                    for text in written(*bounds):
+                        found.setdefault(text, []).append(row)
+    for page in (ROOT / "docs").rglob("*.md"):
+        for line in page.read_text(encoding="utf-8").replace("\\", "").splitlines():
+            if line.startswith("|"):
+                for match in INTERVAL.finditer(line):
+                    found.setdefault(match["shown"], [])
+    return found
+
+
+@pytest.mark.parametrize("page", PROSE)
+def test_the_prose_has_the_numbers_and_verdicts_of_the_tables(
+    page: str, told: dict[str, list[dict[str, str]]]
+) -> None:
+    text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
+    seen = list(INTERVAL.finditer(text))
+    assert len(seen) > 25
+    for match in seen:
+        around = text[match.start() - 130 : match.end() + 130]
+        assert match["shown"] in told, around
+        compared = [row for row in told[match["shown"]] if row.get("verdict")]
+        p_value = P_VALUE.match(text, match.end())
+        if p_value:
+            digits = len(p_value[1].partition(".")[2])
+            known = [f"{float(row['p (Holm)']):.{digits}f}" for row in compared]
+            assert f"0.{p_value[1].partition('.')[2]}" in known, around
+        if text.startswith((", undecided", " (undecided"), match.end()):
+            assert "undecided" in {row["verdict"] for row in compared}, around
+        # An interval without zero looks like a verdict, which after correction it need not be.
+        one_sided = ("[−" in match[0]) == (", −" in match[0])
+        if one_sided and {row["verdict"] for row in compared} == {"undecided"}:
+            assert re.search("decided|not told|not distinguishable", around), around
