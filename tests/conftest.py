@@ -9,14 +9,18 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
+from proposer_rl.cli import run
 from proposer_rl.cli.train import main
 from tests.processes import Processes
 
@@ -33,6 +37,24 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # What tests write need not outlive the machine, and waiting for disks takes long.
 os.fsync = lambda file: None
 
+load_file = OmegaConf.load
+read: dict[tuple[str, int, int], Any] = {}
+
+
+def load_once(file: Any) -> Any:
+    """Hydra reads the same files of ``conf/`` for each of a thousand compositions."""
+    if not hasattr(file, "read"):  # a path, and not Hydra's
+        return load_file(file)
+    name = file.name
+    state = os.stat(name)
+    key = (name, state.st_mtime_ns, state.st_size)
+    if key not in read:
+        read[key] = load_file(file)
+    return deepcopy(read[key])
+
+
+OmegaConf.load = staticmethod(load_once)  # type: ignore[method-assign,assignment]
+
 # Tensors in tests are too small for threads to pay, and tests share the machine.
 torch.set_num_threads(1)
 
@@ -41,6 +63,13 @@ torch.set_num_threads(1)
 def _seeded() -> None:
     """TorchRL's distributions draw from the global generator."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture at the end of a run takes a third of a smoke run, and few tests look at it."""
+    if request.node.get_closest_marker("pictures") is None:
+        monkeypatch.setattr(run, "draw_run", lambda folder, title: folder / "run.png")
 
 
 @pytest.fixture(scope="session")
