@@ -120,7 +120,7 @@ WRONG = [
     ),
     (
         "task.maze={height:10000,width:10000}",
-        "task.maze.height=10000, maze.width=10000: must be at most 1,0",
+        "task.maze.height=10000: input should be less than or equal to 1000",
     ),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
     # one of a few

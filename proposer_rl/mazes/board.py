@@ -17,7 +17,7 @@ from proposer_rl.mazes.level_files import (
     shipped_levels,
     shipped_sets,
 )
-from proposer_rl.mazes.levels import FREE, GOAL, START, WALL, Level, cell_index, planes
+from proposer_rl.mazes.levels import FREE, GOAL, START, WALL, Level, cell_index, cell_plane, planes
 from proposer_rl.mazes.occupancy import expected_visits, success_from_cells
 from proposer_rl.mazes.records import recorded_drawing
 from proposer_rl.mazes.settings import MazeSettings
@@ -127,7 +127,7 @@ class MazeBoard(Drawings):
         policy = logits.softmax(0)
         visits = expected_visits(level, policy, limit)
         results = ExactEvaluator(limit, self._step_penalty)(level, logits)
-        goal = _cells(level.goal, level.walls)
+        goal = cell_plane(level.goal, level.walls.shape).bool()
         maps = {
             "critic's value": (values, level.walls | goal),
             "success from here": (success_from_cells(level, policy, limit), level.walls),
@@ -185,13 +185,6 @@ def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
             return path[:length]
         seen.add(tuple(cell))
     return path
-
-
-def _cells(cell: Tensor, walls: Tensor) -> Tensor:
-    """Bool ``[H, W]``, True at one cell."""
-    marked = torch.zeros_like(walls)
-    marked[tuple(cell.tolist())] = True
-    return marked
 
 
 def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:

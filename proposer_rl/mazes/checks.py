@@ -7,8 +7,6 @@ from typing import Any
 
 from proposer_rl.mazes.settings import DistributionSettings, MazeSettings, NetworkSettings
 
-LARGEST_GRID = 10**6  # cells
-
 
 def named(key: str, make: Any, *arguments: Any) -> Any:
     """Make something, naming the key in whatever is wrong with its value."""
@@ -37,15 +35,6 @@ def check_paths(
                 f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
                 f"distributions.{name}, which is measured on: nobody could reach the goal"
             )
-
-
-def check_grid(maze: MazeSettings) -> None:
-    """Refuse a grid that would not fit in memory."""
-    if maze.height * maze.width > LARGEST_GRID:
-        raise ValueError(
-            f"maze.height={maze.height}, maze.width={maze.width}: must be at most "
-            f"{LARGEST_GRID:,} cells together"
-        )
 
 
 def check_network(maze: MazeSettings, network: NetworkSettings) -> None:

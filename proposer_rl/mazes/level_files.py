@@ -89,15 +89,19 @@ def shipped_sets() -> list[str]:
     return sorted(file.stem for file in _HERE.glob("*.txt"))
 
 
-def shipped_levels(name: str) -> dict[str, Level]:
-    """The levels of a set that comes with the package.
+def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
+    """The levels of a set that comes with the package; an agent that turns looks to the right.
+
+    Args:
+        name: Of the set.
+        kind: Class of the levels.
 
     Raises:
         ValueError: If there is no such set.
     """
     if name not in shipped_sets():
         raise ValueError(f"{name}: there is no such set of levels; there are {shipped_sets()}")
-    return read_levels(_HERE / f"{name}.txt")
+    return read_levels(_HERE / f"{name}.txt", kind)
 
 
 def chosen_levels(

@@ -25,8 +25,8 @@ class MazeSettings:
         observe_agent: draw the agent on a fourth plane; then every step needs its own forward pass.
     """
 
-    height: Annotated[int, Ge(1)] = 10
-    width: Annotated[int, Ge(1)] = 10
+    height: Annotated[int, Interval(ge=1, le=1000)] = 10
+    width: Annotated[int, Interval(ge=1, le=1000)] = 10
     max_steps: Annotated[int, Ge(1)] = 25
     step_penalty: Annotated[float, Ge(0)] = 0.01
     observe_agent: bool = False

@@ -15,7 +15,6 @@ from torch import Tensor
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.board import MazeBoard
 from proposer_rl.mazes.checks import (
-    check_grid,
     check_names,
     check_network,
     check_paths,
@@ -110,7 +109,6 @@ class MazeTask:
         make_network: Any = None,
     ) -> None:
         check_names(distributions, target, evaluation.distributions)
-        check_grid(maze)
         if make_network is None:
             check_network(maze, network)
         check_paths(maze, distributions, {target, *evaluation.distributions})

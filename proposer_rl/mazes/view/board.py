@@ -10,12 +10,12 @@ import torch
 
 from proposer_rl.mazes.board import Drawings
 from proposer_rl.mazes.dynamics import MOVES, successors
+from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.mazes.level_scores import SLACK
 from proposer_rl.mazes.levels import FREE, GOAL, WALL, Level
 from proposer_rl.mazes.view.distance import fewest_actions
 from proposer_rl.mazes.view.env import PENALTY
 from proposer_rl.mazes.view.evaluation import walks
-from proposer_rl.mazes.view.level_files import shipped_view_levels
 from proposer_rl.mazes.view.levels import AGENTS, AHEAD, ViewLevel
 from proposer_rl.mazes.view.settings import ViewMazeSettings
 from proposer_rl.models import ActorCritic
@@ -58,7 +58,7 @@ class ViewBoard(Drawings):
 
     def level_set(self, name: str) -> Mapping[str, Level]:
         """The levels of a set that comes along; the agent looks to the right."""
-        return shipped_view_levels(name)
+        return shipped_levels(name, ViewLevel)
 
     def examine(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None

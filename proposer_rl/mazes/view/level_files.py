@@ -18,7 +18,6 @@ from proposer_rl.mazes.level_files import (
     named_levels,
     read_content,
     read_levels,
-    shipped_levels,
 )
 from proposer_rl.mazes.levels import FREE, WALL, drawn_rows
 from proposer_rl.mazes.levels import GOAL as GOAL_MARK
@@ -65,16 +64,6 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
         return cast(dict[str, ViewLevel], named_levels(named, ViewLevel))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def shipped_view_levels(name: str) -> dict[str, ViewLevel]:
-    """The levels of a set that comes with the package; the agent looks to the right.
-
-    Raises:
-        ValueError: If there is no such set.
-    """
-    levels = shipped_levels(name).items()
-    return {title: ViewLevel.from_text(level.to_text()) for title, level in levels}
 
 
 def _assigned(content: bytes) -> dict[str, list[str]]:

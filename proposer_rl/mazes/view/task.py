@@ -15,7 +15,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.mazes.checks import check_names, named
 from proposer_rl.mazes.distance import shortest_path_length
 from proposer_rl.mazes.edits import edit_levels
-from proposer_rl.mazes.level_files import chosen_levels, shipped_sets
+from proposer_rl.mazes.level_files import chosen_levels, shipped_levels, shipped_sets
 from proposer_rl.mazes.level_scores import SLACK
 from proposer_rl.mazes.levels import planes
 from proposer_rl.mazes.records import level_records, level_statistics
@@ -25,7 +25,7 @@ from proposer_rl.mazes.view.distance import fewest_actions, optimal_return
 from proposer_rl.mazes.view.distributions import ViewDistribution, ViewSpace
 from proposer_rl.mazes.view.env import ViewMazeEnv
 from proposer_rl.mazes.view.evaluation import play, visits
-from proposer_rl.mazes.view.level_files import SUFFIXES, read_view_levels, shipped_view_levels
+from proposer_rl.mazes.view.level_files import SUFFIXES, read_view_levels
 from proposer_rl.mazes.view.level_scores import score_view_levels
 from proposer_rl.mazes.view.levels import ViewLevel, directed
 from proposer_rl.mazes.view.network import OBSERVED, view_network
@@ -237,7 +237,12 @@ class ViewMazeTask:
         """
         drawn = {d: partial(self.evaluation_levels, d) for d in self.distributions}
         levels, of_distribution = chosen_levels(
-            name, drawn, SUFFIXES, read_view_levels, shipped_view_levels, self.levels_help
+            name,
+            drawn,
+            SUFFIXES,
+            read_view_levels,
+            partial(shipped_levels, kind=ViewLevel),
+            self.levels_help,
         )
         limit, slack = self.maze.max_steps, 0 if of_distribution else SLACK
         return score_view_levels(

@@ -14,7 +14,7 @@ from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from benchmarks.minigrid_env import MiniGridMaze
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.mazes.records import level_records
-from proposer_rl.mazes.view.level_files import read_view_levels, shipped_view_levels
+from proposer_rl.mazes.view.level_files import read_view_levels
 from proposer_rl.mazes.view.levels import ViewLevel
 from tests.mazes.view.oracles import random_levels
 
@@ -118,7 +118,7 @@ def test_several_grids_of_one_size(tmp_path: Path) -> None:
 
 
 def test_the_sets_that_come_along_look_right() -> None:
-    found, plain = shipped_view_levels("shapes"), shipped_levels("shapes")
+    found, plain = shipped_levels("shapes", ViewLevel), shipped_levels("shapes")
     assert list(found) == list(plain)
     assert all(int(level.direction) == 0 for level in found.values())
     assert all(found[name].walls.equal(plain[name].walls) for name in plain)
