@@ -279,7 +279,9 @@ def replay(
     scorer = Scorer(parts.task, score, source, rollouts)
     space = parts.task.space
     new = space if new_levels is None else SomeBins(space, new_levels)
-    return ReplayCurriculum(scorer, rule, new, **numbers)
+    curriculum = ReplayCurriculum(scorer, rule, new, **numbers)
+    curriculum.check(len(parts.seeds))
+    return curriculum
 
 
 def learnability(
@@ -360,8 +362,11 @@ def _problem_policy(
     """
     _one_solver(parts)
     task, chosen = parts.task, parts.proposer
-    drawn = isinstance(chosen.action, ProblemSettings)
-    action = chosen.action if drawn else ProblemSettings()
+    action = ProblemSettings()
+    if isinstance(chosen.action, ProblemSettings):
+        action = chosen.action
+    if action.ratio == "joint":
+        raise ValueError("proposer.action.ratio=joint: here each draw is paid by itself")
     with Streams(parts.seeds[0], "proposer").as_default("weights"):
         agent = proposer_agent(task, replace(chosen, observes=[], action=action))
     numbers = replace(

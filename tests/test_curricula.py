@@ -147,6 +147,16 @@ def test_a_schedule_trains_copies_where_a_stage_does() -> None:
     assert ScheduleCurriculum(stages, [1]).trains_copies
 
 
+def test_a_proposer_may_begin_within_a_cycle() -> None:
+    stages = [SamplingCurriculum(SPACE), proposer(mix=True, action_repeat=L)]
+    curriculum = ScheduleCurriculum(stages, [1])
+    curriculum.improve(learners(1), 0, cycle(0))
+    for updates in range(3):
+        proposal = curriculum.propose(learners(1), updates, cycle(updates))
+        assert proposal.levels.batch_size == (1, P)
+    assert stages[1].state_dict()["began"] == 1
+
+
 def test_a_schedule_starts_anew_with_the_next_solver() -> None:
     calls: list = []
     curriculum = schedule(calls)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -67,22 +66,3 @@ def fresh_levels(
 def levels_at(levels: Levels, index: Tensor) -> Levels:
     """Levels [K, P] out of [K, N], by their places int64 [K, P]."""
     return levels[torch.arange(len(index)).unsqueeze(-1), index]
-
-
-def plain_levels(levels: Levels) -> dict[str, Any]:
-    """Levels as tensors by name, for a checkpoint."""
-    return levels.to_dict(convert_tensors=False)
-
-
-def restored_levels(like: Levels, entries: Mapping[str, Any], shape: Sequence[int]) -> Levels:
-    """Levels of what :func:`plain_levels` returned.
-
-    Args:
-        like: a level of the same kind, [].
-        entries: tensors by name.
-        shape: that the levels had.
-    """
-    levels = like.expand(shape).clone()
-    for name, entry in entries.items():
-        levels.set(name, entry.clone())
-    return levels

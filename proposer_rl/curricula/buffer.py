@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any, Literal, get_args
 
 import torch
@@ -241,19 +242,19 @@ def rescore(
 def level_keys(levels: Any) -> Tensor:
     """A number for each level, equal for equal levels and else different: int64 [*B].
 
-    Sums of mixed bits of all entries (Steele, Lea & Flood 2014, "Fast splittable pseudorandom
-    number generators", mix function variant 13): two levels collide with a probability of 2^-64.
+    Hashes of the bytes of all entries: two levels collide with a probability of 2^-64.
     """
-    total = torch.zeros(levels.batch_size, dtype=torch.int64)
-    place = 0
-    for name in sorted(levels.keys(include_nested=True, leaves_only=True), key=str):
-        entry = levels.get(name).cpu()
-        bits = entry.double().view(torch.int64) if entry.is_floating_point() else entry.long()
-        bits = bits.reshape(*levels.batch_size, -1)
-        places = torch.arange(place, place + bits.shape[-1])
-        total += _mixed(bits ^ _mixed(places + 1)).sum(-1)
-        place += bits.shape[-1]
-    return total
+    entries = (levels.get(name).cpu() for name in sorted(levels.keys(True, True), key=str))
+    rows = [entry.reshape(levels.batch_size.numel(), -1).numpy() for entry in entries]
+    keys = [
+        int.from_bytes(
+            blake2b(b"".join(row[i].tobytes() for row in rows), digest_size=8).digest(),
+            "little",
+            signed=True,
+        )
+        for i in range(levels.batch_size.numel())
+    ]
+    return torch.tensor(keys, dtype=torch.int64).reshape(levels.batch_size)
 
 
 def _insert_one(
@@ -305,15 +306,3 @@ def _changed(buffer: TensorDictBase, **entries: Tensor) -> TensorDict:
     for name, entry in entries.items():
         changed.set(name, entry)
     return changed
-
-
-def _mixed(bits: Tensor) -> Tensor:
-    """A bijection of int64 whose every output bit depends on every input bit."""
-    for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15)):
-        bits = (bits ^ _shifted(bits, shift)) * factor
-    return bits ^ _shifted(bits, 31)
-
-
-def _shifted(bits: Tensor, places: int) -> Tensor:
-    """To the right, with zeros from the left."""
-    return (bits >> places) & ((1 << (64 - places)) - 1)

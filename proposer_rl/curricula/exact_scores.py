@@ -114,7 +114,10 @@ def _by_law(
 
 
 def _learnability(task: Task, learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
-    success = task.performance(learner.agent, levels, generator)["success"]
+    performance = task.performance(learner.agent, levels, generator)
+    if "success" not in performance.keys():
+        raise ValueError("learnability: this task tells no success, only the return")
+    success = performance["success"]
     return success * (1 - success)
 
 

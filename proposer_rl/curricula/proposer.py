@@ -78,10 +78,11 @@ class ProposerCurriculum(Curriculum):
         """Levels [1, P] of the Proposer's policy, given what it sees of the Solver."""
         (stream,) = streams
         evaluations = 0
-        if (updates - self._began) % self.action_repeat == 0:
+        if self._action is None:  # the first update of a stage can come within a cycle
+            self._began = updates
+        if self._action is None or (updates - self._began) % self.action_repeat == 0:
             self._action = self._act(learner, updates - self._began, stream)
             evaluations = self.view.validation_levels
-        assert self._action is not None
         batch_size = learner.env.batch_size[1:].numel()
         levels, _ = self.actions.levels(self._action, batch_size, [stream])
         return Proposal(levels, evaluations=evaluations)

@@ -24,12 +24,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
-from proposer_rl.curricula.batches import (
-    fresh_levels,
-    levels_at,
-    plain_levels,
-    restored_levels,
-)
+from proposer_rl.curricula.batches import fresh_levels, levels_at
 from proposer_rl.curricula.buffer import (
     SEEN,
     ReplayRule,
@@ -42,7 +37,7 @@ from proposer_rl.curricula.buffer import (
 )
 from proposer_rl.curricula.checks import flag, one_of, part, real, whole
 from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
-from proposer_rl.learning import PPO, Update
+from proposer_rl.learning import PPO, DivergedError, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, EditableTask, Levels
 
@@ -71,6 +66,8 @@ class ReplayCurriculum(Curriculum):
             by which the scores of those trained on now have fallen (TRACED, arXiv 2506.19997).
 
     Raises:
+        DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
+            replayed.
         TypeError: if there are to be edits and the task has none.
         ValueError: if a number is out of range, or the numbers do not go together.
     """
@@ -113,6 +110,11 @@ class ReplayCurriculum(Curriculum):
                 f"parents=easy: {EASY} parents have as many children each, so the levels of an "
                 f"update must be a multiple of {EASY}; there are {self.task.batch_size}"
             )
+        if renew and co_learnability:
+            raise ValueError(
+                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
+                "before each draw, what is added to them is lost"
+            )
         if renew and scorer.from_episodes and capacity % self.task.batch_size:
             raise ValueError(
                 f"capacity={capacity} must be a multiple of the {self.task.batch_size} levels of "
@@ -135,19 +137,26 @@ class ReplayCurriculum(Curriculum):
         self._scored = 0  # new levels of each Solver
         self._told = {"updates": 0, "replayed": 0}
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P], replayed or new.
+    def check(self, copies: int) -> None:
+        """Refuse several Solvers, if each would decide by itself how much to play on new levels.
 
         Raises:
-            ValueError: for several Solvers, if each would decide by itself how much to play on new
-                levels.
+            ValueError: if so.
         """
-        copies, count = len(streams), self.task.batch_size
         if copies > 1 and not (self._train_on_new or self._synchronous):
             raise ValueError(
                 f"{copies} Solvers: each would decide by itself how many new levels to score; set "
                 "synchronous=true, or give one run for each"
             )
+
+    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
+        """Levels [K, P], replayed or new.
+
+        Raises:
+            ValueError: as :meth:`check`.
+        """
+        copies, count = len(streams), self.task.batch_size
+        self.check(copies)
         if not len(self.buffer):
             self.buffer = empty_buffer(self._template, copies, self._capacity)
         self._cost = [0, 0]
@@ -189,6 +198,11 @@ class ReplayCurriculum(Curriculum):
         batches = 0
         while True:
             warm = self._scored >= self._warm
+            if warm and not bool(self.buffer["filled"].any(-1).all()):
+                raise DivergedError(
+                    f"solver.ppo.horizon={learner.settings.horizon}: on none of {self._scored} new "
+                    "levels did an episode end within it, so that none has a score"
+                )
             draws = [s.generator("replay", batches) for s in streams]
             chance = torch.stack([torch.rand((), generator=g) for g in draws])
             if self._train_on_new:
@@ -328,7 +342,10 @@ class ReplayCurriculum(Curriculum):
         """The buffers, and what is known of the last update."""
         state = {"buffer": self.buffer, "last": self._last, "before": self._before}
         return {
-            **{name: None if td is None else _plain(td) for name, td in state.items()},
+            **{
+                name: None if td is None else td.clone().to_dict(convert_tensors=False)
+                for name, td in state.items()
+            },
             "scored": self._scored,
             "told": dict(self._told),
         }
@@ -345,18 +362,11 @@ class ReplayCurriculum(Curriculum):
 
     def _restored(self, entries: Mapping[str, Any]) -> TensorDict:
         shape = entries["slot" if "slot" in entries else "filled"].shape
-        restored = TensorDict({k: v.clone() for k, v in entries.items() if k != "level"}, shape)
+        restored = TensorDict.from_dict(dict(entries), batch_size=shape)
         if "level" in entries:
-            restored["level"] = restored_levels(self._template, entries["level"], shape)
-        return restored
-
-
-def _plain(entries: TensorDictBase) -> dict[str, Any]:
-    """Tensors by name, for a checkpoint; those of the levels among them by theirs."""
-    return {
-        name: plain_levels(entry) if name == "level" else entry.clone()
-        for name, entry in entries.items()
-    }
+            kind = type(self._template)
+            restored["level"] = kind.from_dict(entries["level"], batch_size=shape)
+        return restored.clone()
 
 
 def _easiness(scorer: Scorer, learner: PPO, update: Update) -> Tensor:

@@ -2,7 +2,8 @@
 
 A score from episodes reads a rollout [K, P, T], of which only episodes count that end in it: it is
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
-none ends. A score from evaluation asks the task instead, and needs no episode.
+none ends (``gradient_norm``: over all steps). A score from evaluation asks the task instead, and
+needs no episode.
 
 With A_t the generalised advantage, delta_t the error of one step, V the critic, p the probability
 of success, J the expected return, J* the largest that any policy reaches, and R the highest return

@@ -11,8 +11,6 @@ from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.batches import (
     fresh_levels,
     levels_at,
-    plain_levels,
-    restored_levels,
 )
 from proposer_rl.curricula.checks import part, whole
 from proposer_rl.curricula.scores import Scorer
@@ -102,11 +100,12 @@ class SelectionCurriculum(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """What is kept."""
-        kept = None if self.kept is None else plain_levels(self.kept)
+        kept = None if self.kept is None else self.kept.to_dict(convert_tensors=False)
         return {"kept": kept, "scores": self.scores.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with it."""
         kept, self.scores = state["kept"], state["scores"].clone()
         shape = self.scores.shape
-        self.kept = None if kept is None else restored_levels(self._template, kept, shape)
+        kind = type(self._template)
+        self.kept = None if kept is None else kind.from_dict(kept, batch_size=shape)

@@ -65,13 +65,13 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     Raises:
         DivergedError: if a Solver's success is exactly 0 on every level: then nothing points
             towards more of it.
-        ValueError: for another measure.
+        ValueError: for another measure, or if the task tells no success.
     """
     if measure == "return":
         return mean_return(performance)
     if measure not in MEASURES:
         raise ValueError(f"measure must be {' or '.join(MEASURES)}, got {measure!r}")
-    success = performance["success"]
+    mean, success = mean_log_success(performance), performance["success"]
     hopeless = (success <= 0).all(1)
     if bool(hopeless.any()):
         which = ", ".join(map(str, torch.nonzero(hopeless).flatten().tolist()))
@@ -79,7 +79,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
             f"copy {which}: the probability of success is exactly 0 on each of {success.shape[1]} "
             "levels of the target, so that nothing points towards it; measure=return may"
         )
-    return mean_log_success(performance)
+    return mean
 
 
 def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:

@@ -15,10 +15,13 @@ import torch
 from scipy.stats import f
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.distributions import Dirichlet
 
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
+
+UNEVEN = 0.15  # concentration of the Dirichlet distribution
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,18 @@ def variance_components(gains: Tensor) -> Signal:
         low=ratio(quotient / float(f.ppf(0.975, *freedom))),
         high=ratio(quotient / float(f.ppf(0.025, *freedom))),
     )
+
+
+def uneven_shares(shape: Sequence[int], bins: int) -> Tensor:
+    """Shares of very uneven mixtures, which differ as much as proposals can.
+
+    They are drawn from torch's default generator, since its Dirichlet takes no other: see
+    :meth:`Streams.as_default`.
+
+    Returns:
+        Float ``[*shape, bins]``, each at least 1e-6, so that they have logarithms.
+    """
+    return Dirichlet(torch.full((bins,), UNEVEN)).sample(torch.Size(shape)).clamp_min(1e-6)
 
 
 def performance_around(

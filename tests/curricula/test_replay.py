@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
+from proposer_rl.cli.build import parts
+from proposer_rl.cli.config import ConfigError
 from proposer_rl.curricula import ReplayCurriculum, Scorer
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (
@@ -19,7 +23,9 @@ from proposer_rl.curricula.buffer import (
 )
 from proposer_rl.curricula.replay import _lineage
 from proposer_rl.curricula.scores import unseen
+from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.mazes import planes
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from tests.curricula.living import (
     check_a_new_life_begins,
@@ -28,7 +34,7 @@ from tests.curricula.living import (
     live,
     solvers,
 )
-from tests.tiny import TASK, evaluate, mountain_cars
+from tests.tiny import TASK, composed, evaluate, mountain_cars
 
 P, T = 4, 8
 SMALL = {"capacity": 16, "fill": 0.5, "replay_probability": 0.6}
@@ -52,8 +58,8 @@ def plr() -> ReplayCurriculum:
     return replay(train_on_new=True, synchronous=False)
 
 
-def robust() -> ReplayCurriculum:
-    return replay(synchronous=False)
+def robust(**options: Any) -> ReplayCurriculum:
+    return replay(synchronous=False, **options)
 
 
 def accel(**options: Any) -> ReplayCurriculum:
@@ -331,9 +337,41 @@ def test_rules_that_make_no_sense_are_refused(rule: dict[str, Any]) -> None:
         ReplayRule(**rule)
 
 
+def test_levels_with_nested_entries_are_restored() -> None:
+    class Nested:
+        def sample(self, count: int, generator: torch.Generator, /) -> TensorDict:
+            numbers = torch.rand(count, 3, generator=generator)
+            return TensorDict({"wall": {"height": numbers}, "goal": numbers[:, 0]}, [count])
+
+    def made() -> ReplayCurriculum:
+        return ReplayCurriculum(Scorer(TASK, "regret", "exact"), ReplayRule(), Nested(), capacity=4)
+
+    curriculum, again = made(), made()
+    curriculum.buffer = empty_buffer(Nested().sample(1, torch.Generator())[0], 2, 4)
+    again.load_state_dict(curriculum.state_dict())
+    assert again.buffer.batch_size == (2, 4)
+    assert again.buffer["level", "wall", "height"].shape == (2, 4, 3)
+    assert (again.buffer == curriculum.buffer).all()
+
+
+def test_where_no_episode_ends_nothing_can_be_replayed() -> None:
+    whole = solvers([0])
+    learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
+    with pytest.raises(DivergedError, match=r"solver\.ppo\.horizon=1: on none of 8 new levels"):
+        live(robust(), learner, [0], range(1))
+
+
+def test_credit_is_refused_where_it_would_be_lost() -> None:
+    with pytest.raises(ValueError, match=r"co_learnability=1\.0, renew=true"):
+        robust(co_learnability=1.0, renew=True)
+
+
 def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:
     with pytest.raises(ValueError, match="set synchronous=true"):
         live(robust(), solvers([0, 1]), [0, 1], range(1))
+    config = composed("+method=robust_plr", "+scale=smoke", "+as=dcd", "seeds=[0,1]")
+    with pytest.raises(ConfigError, match="curriculum: 2 Solvers: each would decide by itself"):
+        parts(config, StopSignals())  # before anything is written
 
 
 def test_a_task_without_edits_is_told_so() -> None:
