@@ -110,7 +110,7 @@ def _against(
     """How the others stand to the baseline."""
     pairs = [between(found, baseline, other) for other in others]
     if all(decision.verdict == TOO_FEW for _, decision in pairs):
-        return f"How they stand to the baseline, {baseline.label}, is not decided either."
+        return f"How they stand to the baseline, {baseline.label}, is not decided."
     better = [group.label for group, decision in pairs if decision.winner == group.label]
     worse = [group.label for group, decision in pairs if decision.winner == baseline.label]
     rest = len(pairs) - len(better) - len(worse)

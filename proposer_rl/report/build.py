@@ -71,6 +71,25 @@ class OutputError(ValueError):
     exit_code = 2
 
 
+def read_checked(
+    folders: Sequence[Path], threshold: float | None, baseline: str | None
+) -> tuple[list[Study], list[str]]:
+    """The studies of the runs in some folders; see :func:`write_report`.
+
+    Raises:
+        UnreadableRun: if a folder has no run, or none can be read.
+        OutputError: if there is no such threshold or baseline.
+    """
+    studies, notes = read_studies(find_runs(folders), threshold, baseline)
+    labels = sorted({group.label for study in studies for group in study.compared})
+    if baseline not in (None, *labels):
+        raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
+    for study in studies:
+        if threshold is not None and not can_reach(study.headline, threshold):
+            raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
+    return studies, notes
+
+
 def write_report(
     folders: Sequence[Path],
     output: Path,
@@ -100,13 +119,7 @@ def write_report(
             threshold or baseline.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
-    studies, notes = read_studies(find_runs(folders), threshold, baseline)
-    labels = sorted({group.label for study in studies for group in study.compared})
-    if baseline not in (None, *labels):
-        raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
-    for study in studies:
-        if threshold is not None and not can_reach(study.headline, threshold):
-            raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
+    studies, notes = read_checked(folders, threshold, baseline)
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
     with tqdm(
@@ -182,7 +195,7 @@ def _section(
         "glossary": glossary(study),
         "facts": page.facts(study),
         "origin": page.origin(study),
-        "unfinished": page.unfinished(study),
+        "incomplete": page.incomplete(study),
         "looks": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": staged is not None,
@@ -220,8 +233,9 @@ def _markdown(
         parts += [f"## {escape_markdown(section['study'].title)}\n"]
         parts += [f"{escape_markdown(' '.join(section['answer']))}\n"]
         facts = section["facts"] + section["origin"]
-        if section["unfinished"]:
-            facts = [*facts, ("Unfinished, and not compared", ", ".join(section["unfinished"]))]
+        if section["incomplete"]:
+            told = f"Not finished, or shorter than {section['study'].horizon} updates"
+            facts = [*facts, (told, ", ".join(section["incomplete"]))]
         parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in facts]
         parts.append(f"\n![Learning curves and updates to the threshold]({section['picture']})\n")
         for table in filter(lambda table: table.rows, (section["claims"], section["methods"])):

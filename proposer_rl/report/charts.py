@@ -52,7 +52,7 @@ def charts(study: Study) -> dict[str, Json]:
         "measures": [*_measured(study), *_trained(study), *_recorded(study), *_single(study)],
         "outcomes": _outcomes(study),
         "levels": _levels(study),
-        "baseline": study.groups.index(study.baseline),
+        "baseline": [group.label for group in study.groups].index(study.baseline.label),
         "headline": {"name": axis_text(study.headline), "rate": is_rate(study.headline)},
     }
 
@@ -207,8 +207,8 @@ def _outcomes(study: Study) -> list[Json]:
             "sign": outcome.sign,
             "methods": [
                 {
-                    "estimate": plain(_estimate(study, group, outcome)),
-                    "values": plain(map(outcome.value, group.runs)),
+                    "estimate": plain(_estimate(study, study.group(group.label), outcome)),
+                    "values": plain(outcome.value(run.until(study.horizon)) for run in group.runs),
                 }
                 for group in study.groups
             ],
@@ -217,8 +217,10 @@ def _outcomes(study: Study) -> list[Json]:
     ]
 
 
-def _estimate(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
+def _estimate(study: Study, group: Group | None, outcome: Outcome) -> Sequence[float]:
     """Estimate and interval; empty without a run of full length."""
+    if group is None:
+        return ()
     if outcome.name == waiting_outcome(study).name:
         return updates_needed(study, group) or ()
     values = outcome.values(group)

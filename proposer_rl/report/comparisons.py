@@ -17,11 +17,11 @@ from proposer_rl.report.statistics import (
     FEWEST,
     Estimate,
     Interval,
+    balanced,
     difference_of,
     holm,
     mean_interval,
     mean_of,
-    probability_of_improvement,
     seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
@@ -71,25 +71,6 @@ class Decision(NamedTuple):
     p: float
     reason: str
     seeds: int | None = None
-
-
-class Comparison(NamedTuple):
-    """Two groups by one outcome.
-
-    Attributes:
-        one, other: their labels.
-        outcome: what is compared.
-        difference: of ``one`` minus ``other``.
-        improvement: probability that a run of ``one`` is better than a run of ``other``.
-        decision: None for all outcomes but the primary one.
-    """
-
-    one: str
-    other: str
-    outcome: str
-    difference: Interval
-    improvement: Interval
-    decision: Decision | None = None
 
 
 def primary(study: Study) -> Outcome:
@@ -195,6 +176,8 @@ def _decide(
         return Decision(None, UNDECIDED, p, "no spread between the runs")
     text = f"p = {p:.2g} after correction for {count} comparisons"
     if p > ERROR:
+        if runs[0] != runs[1]:
+            estimate = balanced(*map(outcome.values, pair))
         needed = seeds_needed(estimate, min(runs), ERROR / count)
         more = f", about {needed:,} seeds each would decide it" if needed else ""
         return Decision(None, UNDECIDED, p, text + more, needed)
@@ -209,27 +192,3 @@ def between(
 ) -> tuple[Group, Decision]:
     """The other of two groups, and what was decided between them."""
     return other, found.get((one.label, other.label)) or found[other.label, one.label]
-
-
-def comparisons(study: Study) -> list[Comparison]:
-    """Every pair of groups by every outcome that both have."""
-    decided = decisions(study)
-    found = []
-    for number, outcome in enumerate(outcomes(study)):
-        for one, other in combinations(study.compared, 2):
-            if outcome.known(one) and outcome.known(other):
-                decision = decided[one.label, other.label] if number == 0 else None
-                found.append(_compare(outcome, one, other, decision))
-    return found
-
-
-def _compare(outcome: Outcome, one: Group, other: Group, decision: Decision | None) -> Comparison:
-    a, b = (outcome.sign * np.asarray(outcome.values(group)) for group in (one, other))
-    return Comparison(
-        one.label,
-        other.label,
-        outcome.name,
-        difference(outcome, one, other).interval(),
-        probability_of_improvement(a, b),
-        decision,
-    )

@@ -15,7 +15,7 @@ from proposer_rl.report.records import Column, level_text, words
 from proposer_rl.report.series import COSTS, Series, band, over_cost, over_updates
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import PANEL, UPDATES, Drawing, Look, Panel, axes_of, finish, style
+from proposer_rl.report.style import UPDATES, Drawing, Look, Panel, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
 
 MOST_PANELS = 12
@@ -24,12 +24,10 @@ MOST_PANELS = 12
 def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
     panels = [_curve_panel(study, name) for name in study.measurements[:MOST_PANELS]]
-    rows = len(study.groups)
     bars = Panel(
         f"Updates until {words(study.headline)} reached "
-        f"{level_text(study.headline, study.threshold)}, by method.",
+        f"{level_text(study.headline, study.threshold)}, by method, the soonest first.",
         partial(_draw_bars, study=study),
-        (PANEL[0], max(1.2 + 0.4 * rows, PANEL[1])),
     )
     return Drawing(
         "learning_curves",
@@ -163,14 +161,15 @@ def axis_text(name: str) -> str:
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = axes_of(figure)
     horizon = study.horizon
-    groups = study.compared[::-1]
-    for place, group in enumerate(groups):
+    needed = [(updates_needed(study, group), group) for group in study.compared]
+    found = [(interval, group) for interval, group in needed if interval is not None]
+    found.sort(key=lambda each: -each[0].estimate)
+    groups = [group for _, group in found]
+    for place, (interval, group) in enumerate(found):
         waiting = group.waiting(study.headline, study.threshold)
-        interval = updates_needed(study, group)
         colour = group.look.colour
-        if interval is not None:
-            axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
-            axes.plot(interval[1:], [place, place], color=colour, linewidth=2.5)
+        axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
+        axes.plot(interval[1:], [place] * 2, color=colour, linewidth=2.5)
         offsets = place + np.linspace(-0.2, 0.2, len(waiting)) * (len(waiting) > 1)
         for run, y in zip(waiting, offsets, strict=True):
             marker = "o" if run.reached else ">"

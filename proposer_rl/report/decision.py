@@ -73,7 +73,6 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
     that cost least spent on all of its updates, so that every method has spent it.
     """
     name, whole = study.headline, [run for group in study.compared for run in group.runs]
-    whole = [run for run in whole if run.updates >= study.horizon]
     found = {"updates": primary(study)}
     for axis, cost in COSTS.items():
         budget = min(float(cost(run)[-1]) for run in whole)
@@ -90,11 +89,8 @@ def spread(study: Study, scarce: str) -> float:
     """
     if scarce not in COSTS:
         return 1.0
-    spent = [
-        [float(COSTS[scarce](run)[-1]) for run in group.runs if run.updates >= study.horizon]
-        for group in study.compared
-    ]
-    return max((max(each) / min(each) for each in spent if each and min(each) > 0), default=1.0)
+    spent = [[float(COSTS[scarce](run)[-1]) for run in group.runs] for group in study.compared]
+    return max((max(each) / min(each) for each in spent if min(each) > 0), default=1.0)
 
 
 def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[str]:

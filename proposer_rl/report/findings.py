@@ -177,7 +177,7 @@ def _started(study: Study, group: Group) -> tuple[int, int, str]:
     """How many runs of a group learnt at once, of how many, and both in words."""
     first = max(run.metrics["updates"][:2][-1] for run in group.runs)
     limit = max(SOON * study.horizon, float(first))  # no run can be seen to be faster
-    known = [run.waiting(study.headline, STARTED) for run in group.runs if run.updates >= limit]
+    known = [run.waiting(study.headline, STARTED) for run in group.runs]
     soon = sum(run.reached and run.updates <= limit for run in known)
     text = (
         f"{group.label} gets to {STARTED:.0%} within {limit:.0f} updates in {soon} of {len(known)} "
@@ -206,9 +206,9 @@ def _alike(study: Study) -> Evidence | None:
         if all(learnt(group, names[0], study.horizon) for group in groups):
             return "supported", text
         return "undecided", f"{text}; not all have learnt"
-    known = [each.p for each in found if not math.isnan(each.p)]
+    known = [p for each in found if not math.isnan(p := each.beyond(ALIKE))]
     smallest = min(holm(known), default=math.nan)
-    text += f"; the smallest p of a difference is {smallest:.2g} after correction"
+    text += f"; the smallest p of a larger difference is {smallest:.2g} after correction"
     return _either(math.nan, smallest), text
 
 
@@ -233,7 +233,7 @@ def _grow_harder(study: Study) -> Evidence | None:
         return None
     parts: list[str] = []
     verdict: Verdict = "undecided"
-    for group in study.groups:
+    for group in study.compared:
         like = group.runs[0]
         known = [change for run in group.logs if (change := _change(run, like)) is not None]
         if not group.proposes or not known:
@@ -299,4 +299,5 @@ def _either(p_for: float, p_against: float) -> Verdict:
 
 
 def _present(study: Study, *labels: str) -> list[Group]:
-    return [group for label in labels for group in study.compared if group.label == label]
+    found = map(study.group, labels)
+    return [group for group in found if group is not None]

@@ -66,7 +66,7 @@ def read_scores(file: Path) -> list[Score]:
                 row["run"],
                 int(row["seed"]),
                 int(row["updates"]),
-                printable(row["levels"])[:LONGEST_NAME],
+                stored_name(row["levels"]),
                 int(row["size"]),
                 number(float(row["success"] or "nan")),
                 number(float(row["returns"] or "nan")),
@@ -75,6 +75,11 @@ def read_scores(file: Path) -> list[Score]:
         ]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableRun(f"{file}: holds no scores of runs as bin/eval writes them") from error
+
+
+def stored_name(levels: str) -> str:
+    """What of the name of a set of levels is kept: one line, and not a long one."""
+    return printable(levels)[:LONGEST_NAME]
 
 
 def check_names(runs: Iterable[Run]) -> None:
@@ -124,7 +129,7 @@ def generalisation_table(study: Study, scores: Sequence[Score]) -> Table:
 
 
 def _result(run: Run, scores: Sequence[Score], levels: str, study: Study) -> float:
-    score = scored(run, scores, levels) if run.updates == study.horizon else None
+    score = scored(run, scores, levels)
     if score is None:
         return math.nan
     return score.success if is_rate(study.headline) else score.returns

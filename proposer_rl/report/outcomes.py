@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from proposer_rl.report import records
 from proposer_rl.report.comparisons import (
-    comparisons,
+    decisions,
+    difference,
+    outcomes,
     primary,
     updates_needed,
     waiting_outcome,
@@ -35,19 +39,26 @@ MOST_COLUMNS, DEEPEST = 200, 8
 
 def comparison_table(study: Study) -> Table:
     """Every pair of groups by every outcome."""
-    rows: list[dict[str, Cell]] = [
-        {
-            "outcome": row.outcome,
-            "first": row.one,
-            "second": row.other,
-            "difference": row.difference,
-            "verdict": row.decision.verdict if row.decision else None,
-            "p (Holm)": row.decision.p if row.decision else None,
-            "P(first better)": row.improvement,
-            "seeds needed": row.decision.seeds if row.decision else None,
-        }
-        for row in comparisons(study)
-    ]
+    decided = decisions(study)
+    rows: list[dict[str, Cell]] = []
+    for number, outcome in enumerate(outcomes(study)):
+        for one, other in combinations(study.compared, 2):
+            values = [outcome.sign * np.asarray(outcome.values(each)) for each in (one, other)]
+            if not all(map(len, values)):
+                continue
+            decision = decided[one.label, other.label] if number == 0 else None
+            rows.append(
+                {
+                    "outcome": outcome.name,
+                    "first": one.label,
+                    "second": other.label,
+                    "difference": difference(outcome, one, other).interval(),
+                    "verdict": decision and decision.verdict,
+                    "p (Holm)": decision and decision.p,
+                    "P(first better)": probability_of_improvement(*values),
+                    "seeds needed": decision and decision.seeds,
+                }
+            )
     note = (
         f"Only the primary outcome, {primary(study).name}, has verdicts; their p-values are "
         "corrected together for the number of pairs (Holm). Difference: first minus second, with "
@@ -66,12 +77,12 @@ def group_table(study: Study) -> Table:
     waiting, worst = waiting_outcome(study).name, f"{headline}_worst10"
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
-        runs = group.runs
-        ended = [run for run in runs if run.updates >= horizon]
-        reached = sum(run.reached for run in group.waiting(headline, threshold))
+        whole = study.group(group.label) or replace(group, runs=())
+        runs, begun = whole.runs, len(group.runs)
+        reached = sum(run.reached for run in whole.waiting(headline, threshold))
         row: dict[str, Cell] = {
             "method": group.label,
-            "seeds": len(ended) if len(ended) == len(runs) else f"{len(ended)} of {len(runs)}",
+            "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
             waiting: updates_needed(study, group),
             primary(study).name: _mean(primary(study).values(group)),
@@ -88,7 +99,7 @@ def group_table(study: Study) -> Table:
             "seconds per run": lambda run: run.own_seconds[-1],
         }
         row |= {
-            name: float(np.mean([paid(run) for run in ended or runs]))
+            name: float(np.mean([paid(run) for run in runs or group.runs]))
             for name, paid in cost.items()
         }
         rows.append(row)
@@ -116,7 +127,7 @@ def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
             gap = None if scores is None else mean_interval(1 - scores.mean(1))
             row[f"optimality gap of {words(name)}"] = gap
     values = [outcome.values(each) for each in (group, baseline)]
-    compared = group is not baseline and all(values)
+    compared = group.label != baseline.label and all(values)
     row[f"P(better than {baseline.label})"] = (
         probability_of_improvement(*values) if compared else None
     )

@@ -54,13 +54,13 @@ def own_findings(study: Study, needs: Needs) -> list[tuple[str, Evidence | None]
 
 
 def _beats_all(study: Study, needs: Needs) -> Evidence | None:
-    one = _compared(study, OURS)
+    one = study.group(OURS)
     untold = [
         group
         for group in study.compared
         if group is not one and TARGET not in needs_of(group, needs, {TARGET})
     ]
-    even, none = _compared(study, EVEN), _compared(study, NONE)
+    even, none = study.group(EVEN), study.group(NONE)
     if one is None or even is None or none is None:
         return None
     others = [none, *untold]
@@ -77,7 +77,7 @@ def _beats_all(study: Study, needs: Needs) -> Evidence | None:
 
 
 def _level_or_better(study: Study) -> Evidence | None:
-    one, hand = _compared(study, OURS), _compared(study, BY_HAND)
+    one, hand = study.group(OURS), study.group(BY_HAND)
     if one is None or hand is None or not is_rate(study.headline):
         return None
     _, decision = pair = between(decisions(study), one, hand)
@@ -97,7 +97,7 @@ def _level_or_better(study: Study) -> Evidence | None:
 
 def _learns_where_the_other_does_not(study: Study) -> Evidence | None:
     """Learning is to beat even draws; not to learn is to be shown not to be better than them."""
-    paid, literal, even = (_compared(study, label) for label in (PROPOSER, LITERAL, EVEN))
+    paid, literal, even = (study.group(label) for label in (PROPOSER, LITERAL, EVEN))
     if paid is None or literal is None or even is None or not is_rate(study.headline):
         return None
     beats = beats_in(study)
@@ -126,7 +126,3 @@ def _frames(one: Group, others: Sequence[Group]) -> str:
         float(np.mean([r.total_frames[-1] for r in g.runs])) / 1e6 for g in (one, *others)
     )
     return f"cost: {write(own)} million frames, theirs {write(min(rest))} to {write(max(rest))}"
-
-
-def _compared(study: Study, label: str) -> Group | None:
-    return next((group for group in study.compared if group.label == label), None)

@@ -123,13 +123,13 @@ def origin(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def unfinished(study: Study) -> list[str]:
-    """Runs that are not at the end of their schedule."""
+def incomplete(study: Study) -> list[str]:
+    """Runs that are not at the end of their schedule, or shorter than those that are compared."""
     return [
         f"{group.label} seed {run.seed} ({run.updates} updates)"
         for group in study.groups
         for run in group.runs
-        if not run.finished
+        if not run.finished or run.updates < study.horizon
     ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from proposer_rl.report import curves, page, proposals
-from proposer_rl.report.build import FIGURES, OutputError, check_output, write_files
+from proposer_rl.report.build import FIGURES, OutputError, check_output, read_checked, write_files
 from proposer_rl.report.comparisons import ALIKE, primary
 from proposer_rl.report.decision import (
     SITUATIONS,
@@ -27,9 +27,8 @@ from proposer_rl.report.findings import GAIN, TITLE, Evidence, finding_table, pa
 from proposer_rl.report.generalisation import check_names, generalisation_table, read_scores
 from proposer_rl.report.own_findings import own_findings
 from proposer_rl.report.records import words
-from proposer_rl.report.runs import find_runs
 from proposer_rl.report.statistics import FEWEST
-from proposer_rl.report.studies import Study, read_studies
+from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
 
@@ -71,7 +70,7 @@ def write_pages(
         OutputError: if the output folder holds something else, or the runs were not measured alike.
     """
     check_output(output, CHOICE)
-    studies, notes = read_studies(find_runs(folders), threshold, baseline)
+    studies, notes = read_checked(folders, threshold, baseline)
     if len(studies) > 1:
         titles = "; ".join(study.title for study in studies)
         raise OutputError(f"--pages: the runs were not measured alike ({titles}); give fewer")
@@ -192,7 +191,10 @@ def _claims(study: Study, needs: Needs, others: Table, files: dict[str, bytes]) 
 def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
     lines = []
     for number, (claim, evidence) in enumerate(found, 1):
-        verdict, text = evidence or ("not tested", "its methods are not among these runs")
+        verdict, text = evidence or (
+            "not tested",
+            "its methods, or what it is measured by, are not among these runs",
+        )
         lines.append(f"{number}. {claim} **{verdict.capitalize()}**: {escape_markdown(text)}.")
     return "\n".join(lines)
 
@@ -219,8 +221,9 @@ def _runs(study: Study) -> str:
 
 def _origin(study: Study, command: str, notes: Sequence[str]) -> str:
     facts = [f"- {escape_markdown(f'{name}: {text}')}" for name, text in page.origin(study)]
-    short = page.unfinished(study)
-    facts += [f"- Unfinished: {escape_markdown(', '.join(short))}"] if short else []
+    if incomplete := page.incomplete(study):
+        named = escape_markdown(", ".join(incomplete))
+        facts.append(f"- Not finished, or shorter than {study.horizon} updates: {named}")
     facts += [f"- {escape_markdown(note)}" for note in notes]
     made = "\n".join(page.commands(study))
     return "\n\n".join(

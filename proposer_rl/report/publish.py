@@ -77,8 +77,9 @@ def _light(folder: Path) -> dict[str, bytes]:
     run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     run["task"].pop("samples", None)
     config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    reused = str(config.get("checkpoint") or "")
     files = {name: (folder / name).read_bytes() for name in UNCHANGED if (folder / name).exists()}
-    files |= {"run.json": _json(run), "config.json": _json(config)}
+    files |= {"run.json": _json(run, reused), "config.json": _json(config, reused)}
     for name in ("cycles.jsonl", "levels.jsonl"):
         if (folder / name).exists():
             rows = map(_without_bulk, read_jsonl(folder / name))
@@ -92,8 +93,15 @@ def _without_bulk(row: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in row.items() if key not in dropped}
 
 
-def _json(value: Any) -> bytes:
-    return (anywhere(json.dumps(value, indent=1)) + "\n").encode()
+def _json(value: Any, reused: str) -> bytes:
+    """A file's content; of a checkpoint that the run began with the last two parts of its path.
+
+    Seeds of Proposers are called by the folders above their last lifetimes.
+    """
+    text = json.dumps(value, indent=1)
+    if os.path.isabs(reused):
+        text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
+    return (anywhere(text) + "\n").encode()
 
 
 def _replace(folder: Path, files: Mapping[str, bytes]) -> None:

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,6 +146,29 @@ class Run:
     def own_seconds(self) -> Column:
         """Wall seconds at each evaluation: an even share where seeds were trained together."""
         return self.metrics["seconds"] / self.shared_by
+
+    def until(self, horizon: int) -> Run:
+        """The run as it was after so many updates, measurements linear between evaluations.
+
+        What is only known of its end is left out. A shorter run stays as it is.
+        """
+        if self.updates <= horizon:
+            return self
+        x = self.metrics["updates"]
+        metrics = {
+            name: np.append(column[x < horizon], np.interp(horizon, x, column))
+            for name, column in self.metrics.items()
+        }
+        early = self.training.get("updates", np.empty(0)) <= horizon
+        return replace(
+            self,
+            metrics=metrics,
+            training={name: column[early] for name, column in self.training.items()},
+            cycles=[cycle for cycle in self.cycles if number(cycle["updates"]) < horizon],
+            samples=[sample for sample in self.samples if sample.updates <= horizon],
+            levels={},
+            sheets={},
+        )
 
     def waiting(self, measurement: str, threshold: float) -> Waiting:
         """Updates until a measurement first reached a threshold, or censored."""

@@ -92,7 +92,8 @@ def level_by_level(study: Study) -> Drawing | None:
     known = [
         (float(means.mean()), group)
         for group in study.groups
-        if group is not study.baseline and (means := level_means(study, group, name)) is not None
+        if group.label != study.baseline.label
+        and (means := level_means(study, group, name)) is not None
     ]
     if not known:
         return None

@@ -65,6 +65,10 @@ class Estimate(NamedTuple):
         interval = self.interval(1 - 2 * ERROR)
         return -bound < interval.low and interval.high < bound
 
+    def beyond(self, bound: float) -> float:
+        """p-value of the value being farther from zero than ``bound``, one-sided."""
+        return float(special.stdtr(self.freedom, (bound - abs(self.value)) / self.error))
+
 
 def mean_of(values: Values) -> Estimate:
     """Mean of independent values.
@@ -97,6 +101,15 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
     squares = [x.var(ddof=1) / len(x) for x in (a, b)]
     parts = [square**2 / (len(x) - 1) for square, x in zip(squares, (a, b), strict=True)]
     return Estimate(value, math.sqrt(sum(squares)), float(sum(squares) ** 2 / sum(parts)))
+
+
+def balanced(one: Values, other: Values) -> Estimate:
+    """Welch's difference if both had as many values as the fewer, and the variances seen."""
+    a, b = (np.asarray(values, dtype=float) for values in (one, other))
+    count, variances = min(len(a), len(b)), np.array([a.var(ddof=1), b.var(ddof=1)])
+    whole, squares = float(variances.sum()), float((variances**2).sum())
+    freedom = whole**2 / squares * (count - 1)
+    return Estimate(float(a.mean() - b.mean()), math.sqrt(whole / count), freedom)
 
 
 def mean_interval(values: Values) -> Interval:
@@ -176,7 +189,7 @@ def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
 
     Args:
         difference: as it was seen.
-        seeds: with so many.
+        seeds: with so many of each.
         level: of the two-sided test.
 
     Returns:

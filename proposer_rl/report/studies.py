@@ -104,11 +104,15 @@ class Study:
             return max(run.updates for run in self.runs)
         return max(lengths, key=lambda length: (lengths[length], length))
 
-    @property
+    @cached_property
     def compared(self) -> list[Group]:
-        """Groups of which some run is as long as the horizon."""
-        longest = {group.label: max(run.updates for run in group.runs) for group in self.groups}
-        return [group for group in self.groups if longest[group.label] >= self.horizon]
+        """Groups with those of their runs that are as long as the horizon, up to it."""
+        long = [[run for run in group.runs if run.updates >= self.horizon] for group in self.groups]
+        return [
+            replace(group, runs=tuple(run.until(self.horizon) for run in runs))
+            for group, runs in zip(self.groups, long, strict=True)
+            if runs
+        ]
 
     @property
     def legend(self) -> dict[str, Look]:
@@ -117,12 +121,9 @@ class Study:
 
     @property
     def baseline(self) -> Group:
-        """What the others are measured against: the chosen one, the usual one, or the first.
-
-        Of those that are compared: another has no run that is long enough.
-        """
-        found = [self.group(label) for label in (self.chosen, USUAL_BASELINE) if label]
-        return next((group for group in found if group in self.compared), self.compared[0])
+        """What the others are measured against: the chosen one, the usual one, or the first."""
+        found = (self.group(label) for label in (self.chosen, USUAL_BASELINE) if label)
+        return next((group for group in found if group is not None), self.compared[0])
 
     def scores(self, group: Group, name: str) -> Column | None:
         """What a group's runs of full length reach on each level, [runs, levels].
@@ -143,8 +144,8 @@ class Study:
         return name in run.levels and run.updates == self.horizon
 
     def group(self, label: str) -> Group | None:
-        """The group of that label, if there is one."""
-        return next((group for group in self.groups if group.label == label), None)
+        """The group of that label among those that are compared, if it is there."""
+        return next((group for group in self.compared if group.label == label), None)
 
 
 def read_studies(

@@ -94,6 +94,8 @@ def write(cell: Cell, digits: int | None = None) -> str:
         return cell
     if digits is None:
         digits = 0 if isinstance(cell, int) else 1 if abs(cell) >= 2 else 3
+        if 0 < abs(cell) < 0.5 * 10**-digits:
+            return f"{cell:.2g}".replace("-", "−")
     text = f"{cell:,.{digits}f}"
     return text.replace("-", "−") if float(text.replace(",", "")) else text.lstrip("-")
 

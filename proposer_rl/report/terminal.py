@@ -118,7 +118,9 @@ def _bar(progress: Progress) -> RenderableType:
 def _curves(runs: Sequence[Run]) -> RenderableType:
     grid = Table.grid(padding=(0, 1))
     for name in runs[0].measurements:
-        values = np.mean([run.metrics[name] for run in runs], 0)
+        # Of seeds that are trained together one can have a row more than another.
+        known = min(len(run.metrics[name]) for run in runs)
+        values = np.mean([run.metrics[name][:known] for run in runs], 0)
         rate = is_rate(name)
         low, high = (0, 1) if rate else (float(values.min()), float(values.max()))
         last = f"{values[-1]:.1%}" if rate else f"{values[-1]:.4g}"

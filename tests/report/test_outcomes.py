@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from proposer_rl.report.answer import answer
-from proposer_rl.report.comparisons import comparisons
+from proposer_rl.report.comparisons import difference, outcomes
 from proposer_rl.report.findings import findings
 from proposer_rl.report.outcomes import (
     comparison_table,
@@ -55,20 +55,20 @@ def study_of(folder: Path, seeds: int = SEEDS, **curves: list[float]) -> Study:
 
 
 def test_a_better_method_is_found_by_the_primary_outcome_alone(tmp_path: Path) -> None:
-    first, *others = comparisons(study_of(tmp_path, target=SLOW, hand_made=FAST))
-    assert (first.one, first.other) == ("hand_made", "target")
-    assert first.outcome == "ID success, mean over 50 updates"
-    assert first.decision is not None and first.decision.winner == "hand_made"
-    assert first.decision.seeds is None and first.improvement.estimate == 1
+    first, *others = comparison_table(study_of(tmp_path, target=SLOW, hand_made=FAST)).rows
+    assert (first["first"], first["second"]) == ("hand_made", "target")
+    assert first["outcome"] == "ID success, mean over 50 updates"
+    assert first["verdict"] == "hand_made is better"
+    assert first["seeds needed"] is None and first["P(first better)"].estimate == 1
     areas = [(np.sum(base) - (base[0] + base[-1]) / 2) / 5 for base in (FAST, SLOW)]
     scale = np.mean([1 - 0.01 * seed for seed in range(SEEDS)])
-    assert first.difference.estimate == pytest.approx((areas[0] - areas[1]) * scale)
-    assert len(others) == 3 and all(row.decision is None for row in others)
+    assert first["difference"].estimate == pytest.approx((areas[0] - areas[1]) * scale)
+    assert len(others) == 3 and all(row["verdict"] is row["p (Holm)"] is None for row in others)
     # 80 % after 30 updates in every seed, and never within 50: there is no spread.
-    assert others[0].difference.estimate == -20 and math.isnan(others[0].difference.low)
-    assert others[1].outcome == "ID success after 50 updates"
+    assert others[0]["difference"].estimate == -20 and math.isnan(others[0]["difference"].low)
+    assert others[1]["outcome"] == "ID success after 50 updates"
     expected = np.mean(curve_last(FAST)) - np.mean(curve_last(SLOW))
-    assert others[1].difference.estimate == pytest.approx(expected)
+    assert others[1]["difference"].estimate == pytest.approx(expected)
 
 
 def curve_last(base: list[float]) -> list[float]:
@@ -78,25 +78,23 @@ def curve_last(base: list[float]) -> list[float]:
 def test_equal_methods_are_undecided_and_more_seeds_are_asked_for(tmp_path: Path) -> None:
     for seed in range(SEEDS):
         write_run(tmp_path / f"a{seed}", "hand_made", [seed], curve_of(SLOW, SEEDS - seed))
-    first, *_ = comparisons(study_of(tmp_path, target=SLOW))
-    assert first.decision is not None and first.decision.winner is None
-    assert first.decision.verdict == "undecided" and first.decision.p > 0.05
-    assert first.decision.seeds > SEEDS
+    first, *_ = comparison_table(study_of(tmp_path, target=SLOW)).rows
+    assert first["verdict"] == "undecided" and first["p (Holm)"] > 0.05
+    assert first["seeds needed"] > SEEDS
 
 
 def test_methods_that_learnt_nothing_do_not_beat_each_other(tmp_path: Path) -> None:
     low = {"target": [value / 20 for value in SLOW], "hand_made": [value / 20 for value in FAST]}
-    first, *_ = comparisons(study_of(tmp_path, **low))
-    assert first.decision is not None and first.decision.p < 0.05
-    assert first.decision.verdict == "nothing learnt" and first.decision.winner is None
+    first, *_ = comparison_table(study_of(tmp_path, **low)).rows
+    assert first["p (Holm)"] < 0.05 and first["verdict"] == "nothing learnt"
 
 
 @pytest.mark.parametrize("seeds", [1, 2, 4])
 def test_with_few_seeds_there_is_no_interval_and_no_verdict(seeds: int, tmp_path: Path) -> None:
     study = study_of(tmp_path, seeds, perf_gain=FAST, task_difficulty=FAST, target=SLOW)
-    for row in comparisons(study):
-        assert math.isnan(row.difference.low) and math.isnan(row.improvement.low)
-        assert row.decision is None or row.decision.verdict == "too few seeds"
+    for row in comparison_table(study).rows:
+        assert math.isnan(row["difference"].low) and math.isnan(row["P(first better)"].low)
+        assert row["verdict"] in (None, "too few seeds")
     assert set(verdicts(study).values()) == {"too few seeds"}
     assert "[" not in "".join(map("".join, comparison_table(study).texts()))
 
@@ -107,11 +105,11 @@ def test_runs_with_the_same_seeds_are_compared_in_pairs(tmp_path: Path) -> None:
         for seed in range(SEEDS):
             end = 0.3 + 0.1 * seed + plus * (1 + seed % 2)
             write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end])
-    paired, *_ = comparisons(read_studies(sorted(tmp_path.iterdir()), None)[0][0])
-    assert paired.decision is not None and paired.decision.winner == "b"
+    paired, *_ = comparison_table(read_studies(sorted(tmp_path.iterdir()), None)[0][0]).rows
+    assert paired["verdict"] == "b is better"
     write_run(tmp_path / "b9", "b", [9], [0.0, 0.6])
-    alone, *_ = comparisons(read_studies(sorted(tmp_path.iterdir()), None)[0][0])
-    assert alone.decision is not None and alone.decision.p > 0.5
+    alone, *_ = comparison_table(read_studies(sorted(tmp_path.iterdir()), None)[0][0]).rows
+    assert alone["p (Holm)"] > 0.5
 
 
 def test_a_short_run_does_not_count_whether_it_got_there_or_not(tmp_path: Path) -> None:
@@ -200,6 +198,19 @@ def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Pat
         (study,), _ = read_studies(sorted((tmp_path / folder).iterdir()), None)
         found = verdicts(study)
         assert found[ALIKE] == expected and found[SLIGHTLY] == expected, folder
+
+
+def test_a_sure_but_small_difference_does_not_refute_alike(tmp_path: Path) -> None:
+    ends = {"perf_gain": (0.86, 0.002), "target": (0.9, 0.003), "task_difficulty": (0.8, 0.2)}
+    for name, (end, spread) in ends.items():
+        for seed, place in enumerate([0, 1, -1, 0.5, -0.5, 0.2][:SEEDS]):
+            value = end + spread * place
+            write_run(tmp_path / f"{name}{seed}", name, [seed], [0.0, value / 2, value])
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    outcome = next(one for one in outcomes(study) if one.name.startswith("OOD"))
+    pair = [group for label in ("target", "perf_gain") if (group := study.group(label))]
+    assert difference(outcome, *pair).p < 1e-3 and difference(outcome, *pair).within(0.1)
+    assert verdicts(study)[ALIKE] == "undecided"
 
 
 def test_a_method_that_is_slightly_worse_is_not_slightly_better(tmp_path: Path) -> None:

@@ -279,6 +279,8 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
     wrong = {
         "were not measured alike": [str(tmp_path / "rockets"), str(runs), "--pages", "new"],
         f"but no {CHOICE}": [str(runs), "--pages", str(tmp_path / "mine")],
+        "--baseline=nobody: must be one of": [str(runs), "--baseline=nobody", "--pages", "new"],
+        "--threshold=80: must be above 0": [str(runs), "--threshold=80", "--pages", "new"],
     }
     for message, arguments in wrong.items():
         with pytest.raises(SystemExit) as end:

@@ -10,6 +10,8 @@ import pytest
 
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import learning_curves
+from proposer_rl.report.runs import find_runs
+from proposer_rl.report.studies import read_studies
 from tests.report.folders import LEVEL, cycle, write_run
 
 SECRET = "/home/somebody/code"
@@ -68,7 +70,19 @@ def test_a_copy_has_no_pictures_and_names_no_folder_of_the_machine(
     assert str(LEVEL["picture"]) not in everything
     assert not any("curriculum.jsonl" in name or "checkpoint" in name for name in found)
     config = json.loads(found["target_0/config.json"])
-    assert config["checkpoint"] == "checkpoints"
+    assert config["checkpoint"] == "5/checkpoints"
+
+
+def test_other_checkpoints_remain_others(tmp_path: Path) -> None:
+    for life in range(3):
+        given = f"{tmp_path}/lives/{life}/lifetime_2"
+        own = {"checkpoint": given, "curriculum": {"_target_": "some.factory", "checkpoint": given}}
+        write_run(tmp_path / "runs" / str(life), "frozen_proposer", [5], **own)
+    for folder in (tmp_path / "runs", published(tmp_path / "runs", tmp_path / "light")):
+        (study,), notes = read_studies(find_runs([folder]), None)
+        assert len(study.groups) == 1 and len(study.runs) == 3 and not notes
+    config = json.loads((tmp_path / "light" / "1" / "config.json").read_text())
+    assert config["checkpoint"] == config["curriculum"]["checkpoint"] == "1/lifetime_2"
 
 
 def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: Path) -> None:

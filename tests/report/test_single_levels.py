@@ -125,8 +125,9 @@ def test_levels_of_runs_that_are_not_at_the_horizon_do_not_count(tmp_path: Path)
               task={**TASK, "exact": True})  # fmt: skip
     write_run(tmp_path / "odd", "target", [9], levels=[1.0], task={**TASK, "exact": True})
     study = study_of(tmp_path)
-    plr, target = study.group("plr"), study.group("target")
-    assert plr is not None and study.scores(plr, "id_success") is None
+    (plr,) = (group for group in study.groups if group.label == "plr")
+    target = study.group("target")
+    assert study.group("plr") is None and study.scores(plr, "id_success") is None
     assert target is not None and study.scores(target, "id_success").shape == (5, 3)
 
 

@@ -14,6 +14,7 @@ from scipy import stats
 from proposer_rl.report.statistics import (
     FEWEST,
     Estimate,
+    balanced,
     difference_of,
     holm,
     interquartile_mean,
@@ -155,3 +156,8 @@ def test_seeds_needed_have_the_power_in_a_simulation(paired: bool) -> None:
     test = stats.ttest_rel if paired else stats.ttest_ind
     p_values = test(drawn[..., 0], drawn[..., 1], axis=1).pvalue
     assert np.mean(p_values < 0.01) == pytest.approx(0.8, abs=0.05)
+    # Twice the runs of one of them, with the same mean and variance, say the same of each.
+    more = np.concatenate([one, one]) * math.sqrt(9 / 8)
+    more += one.mean() - more.mean()
+    if not paired:
+        assert balanced(more, other) == pytest.approx(difference_of(one, other))

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from proposer_rl.report.page import commands
+from proposer_rl.report.charts import charts
+from proposer_rl.report.comparisons import primary
+from proposer_rl.report.decision import ranking, spread
+from proposer_rl.report.outcomes import comparison_table, group_table
+from proposer_rl.report.page import commands, incomplete
 from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.series import COSTS
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import TASK, cycle, write_run
 
@@ -144,6 +150,43 @@ def test_runs_are_compared_at_the_length_of_most(tmp_path: Path) -> None:
     (study,), _ = read(tmp_path)
     assert study.horizon == 20
     assert [group.label for group in study.compared] == ["target"]
+
+
+def test_only_runs_of_full_length_count_and_only_up_to_it(tmp_path: Path) -> None:
+    for seed in range(6):
+        write_run(tmp_path / f"t{seed}", "target", [seed], [0.0, 0.4 + 0.01 * seed, 0.6])
+        curve, ended = ([0.0, 0.5 + 0.01 * seed, 0.7], True) if seed < 3 else ([0.0, 0.9], False)
+        write_run(tmp_path / f"p{seed}", "plr", [seed], curve, finished=ended, copies=100)
+    write_run(tmp_path / "p6", "plr", [6], [0.0, 0.5, 0.7, 0.9, 0.9], copies=100)
+    # Measured at other updates than most; in between it is linear.
+    odd = write_run(tmp_path / "p7", "plr", [7], [0.0, 0.5, 0.7, 0.9], copies=100)
+    metrics = odd / "metrics.csv"
+    metrics.write_text(metrics.read_text().replace("\n7,20,", "\n7,15,"))
+    (study,), _ = read(tmp_path)
+    assert study.horizon == 20
+    plr, target = (study.group(label) for label in ("plr", "target"))
+    assert plr is not None and target is not None
+    assert plr.seeds == [0, 1, 2, 6, 7] and all(run.updates == 20 for run in plr.runs)
+    assert plr.runs[-1].at("id_success", 20) == pytest.approx(0.7 + 0.2 / 3)
+    assert sum(run.reached for run in plr.waiting("id_success", 0.8)) == 0
+    ranked = {row["method"]: row for row in ranking(study, {}).rows}
+    assert ranked["plr"]["seeds"] == 5 and ranked["plr"]["frames (M)"] == pytest.approx(
+        0.0062 / 1.5
+    )
+    assert spread(study, next(iter(COSTS))) == pytest.approx(14 / 12)  # that of the odd one
+    drawn = charts(study)["outcomes"][0]["methods"]
+    of_plr = [group.label for group in study.groups].index("plr")
+    table = next(row for row in comparison_table(study).rows if row["first"] == "plr")
+    mean = float(np.mean(primary(study).values(plr)))
+    assert drawn[of_plr]["estimate"][0] == pytest.approx(mean, rel=1e-4)
+    known = [value is not None for value in drawn[of_plr]["values"]]
+    assert known == [True] * 3 + [False] * 3 + [True] * 2
+    other = float(np.mean(primary(study).values(target)))
+    assert table["difference"].estimate == pytest.approx(mean - other)
+    rows = {row["method"]: row for row in group_table(study).rows}
+    assert rows["plr"]["seeds"] == "5 of 8" and rows["plr"]["reached 80%"] == "0 of 5"
+    named = " ".join(incomplete(study))
+    assert all(f"plr seed {seed}" in named for seed in (3, 4, 5)) and "target" not in named
 
 
 def test_an_unreadable_folder_is_noted_and_the_others_are_read(tmp_path: Path) -> None:

@@ -43,6 +43,13 @@ def test_one_run_is_a_screen(tmp_path: Path, capsys) -> None:
     assert "S • • G" in text  # the path of the level that was recorded
 
 
+def test_seeds_of_which_one_is_a_row_ahead_are_drawn(tmp_path: Path, capsys) -> None:
+    folder = write_run(tmp_path / "run", seeds=[0, 1], finished=False)
+    table = folder / "metrics.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
+    assert "50.0%" in watch(capsys, str(folder))
+
+
 def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
     write_run(tmp_path / "done")
     write_run(tmp_path / "going", finished=False)
