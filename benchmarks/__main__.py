@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from proposer_rl.cli.instruments import positive
+from proposer_rl.cli.arguments import number
 
 
 def main() -> None:
@@ -25,8 +25,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks; default: see --list")
     parser.add_argument("--list", action="store_true", help="list the benchmarks and stop")
     parser.add_argument("--output", type=Path, default=Path("bench.json"), metavar="FILE")
-    parser.add_argument("--repeats", type=positive, default=5, help="rounds of each comparison")
-    parser.add_argument("--threads", type=positive, help="CPU threads; default: torch's choice")
+    parser.add_argument(
+        "--repeats", type=number(int, 1), default=5, help="rounds of each comparison"
+    )
+    parser.add_argument(
+        "--threads", type=number(int, 1), help="CPU threads; default: torch's choice"
+    )
     parser.add_argument(
         "--precision",
         choices=["auto", "fp32", "bf16"],

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +15,11 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.cli.config import methods
+from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.experiment import Experiment
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
+from proposer_rl.runs.signals import Interrupted
 from tests.same_run import assert_same_run, tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -21,6 +28,7 @@ SMOKE = ["+scale=smoke", "compute.progress=false"]
 LEARN_FROM_COPIES = ("perf_gain", "task_difficulty")
 
 
+@pytest.mark.pictures
 @pytest.mark.parametrize("method", methods())
 def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsys) -> None:
     arguments = [f"+method={method}", *SMOKE]
@@ -76,6 +84,53 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> Non
     assert train(*arguments, "solver.ppo.gamma=0.5") == 2
     assert "solver.ppo.gamma=0.5: the run in" in capsys.readouterr().err
     assert tables(Path("run")) == before
+
+
+def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, capsys) -> None:
+    arguments = ["+method=target", *SMOKE, "hydra.run.dir=run"]
+    assert train(*arguments) == 0
+    before = tables(Path("run"))
+
+    def refused(updates: int) -> str:
+        capsys.readouterr()
+        assert train(*arguments, f"schedule.updates={updates}") == 2
+        assert tables(Path("run")) == before
+        return capsys.readouterr().err
+
+    Path("run/summary.json").unlink()  # as if it had been interrupted just before
+    assert "schedule.updates=4: the run in" in (said := refused(4)) and "made 6 updates" in said
+    assert train(*arguments) == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(Experiment, "run", lambda _: os.kill(os.getpid(), signal.SIGINT))
+        patched.setattr("proposer_rl.runs.signals.StopSignals._keep", signal.default_int_handler)
+        assert train(*arguments, "schedule.updates=8") == 128 + signal.SIGINT
+    assert not Path("run/summary.json").exists()  # it is not at the end of what was asked for
+    assert train(*arguments) == 0
+    shutil.rmtree("run/checkpoints")
+    assert "ended after 6 updates and has no checkpoint to go on from" in refused(8)
+    monkeypatch.setattr("proposer_rl.cli.build.make_log", None)  # nothing is left to be logged
+    assert train(*arguments) == 0
+
+
+def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
+    def stopped(_: Experiment) -> None:
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setattr(Experiment, "run", stopped)
+    monkeypatch.setenv("PYTHONPATH", f"own parts{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    own = Path("own/method/mine.yaml")
+    own.parent.mkdir(parents=True)
+    own.write_text((CONFIG_FOLDER / "method/target.yaml").read_text())
+    arguments = ["+method=mine", *SMOKE, "lifetimes=2"]
+    ends = [("hydra.run.dir=run", "run"), ("+sweep=quick hydra.sweep.dir=all seed=3", "all/")]
+    for given, folder in ends:
+        assert train("--config-dir", "own", *given.split(), *arguments) == 128 + signal.SIGTERM
+        (told,) = re.findall(r"To go on: (.*)", capsys.readouterr().out)
+        path, command, *words = shlex.split(told)
+        assert path.startswith("PYTHONPATH=own parts") and command == "bin/train"
+        assert words[:2] == ["--config-dir", "own"] and {*arguments} <= {w.lower() for w in words}
+        assert not any(word.startswith("+sweep") for word in words)
+        assert folder in words[-1] and "lifetime_" not in words[-1]
 
 
 def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> None:
@@ -142,6 +197,8 @@ def test_a_proposer_goes_on_learning_over_several_lifetimes(train) -> None:
         steps += {int(entry["step"]) for entry in latest[1]["curriculum"]["proposer"].values()}
     assert steps == [4, 8]  # Adam's steps: 2 cycles of 2 epochs in each lifetime
     assert tables(first)["metrics.csv"][0] != tables(second)["metrics.csv"][0]
+    # The second has begun with what was learnt at the first's end, which cannot be later now.
+    assert train(*arguments, "schedule.updates=12", "hydra.run.dir=whole") == 2
     # Interrupted between two lifetimes, it goes on as if it had not been.
     shutil.copytree("whole", "again")
     shutil.rmtree("again/lifetime_1")

@@ -140,9 +140,9 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
         (["{run}", "-o", "rows.txt"], "--output rows.txt: must end in .json or .csv"),
         (["{run}", "-o", "no/rows.csv"], "--output no/rows.csv: there is no folder no"),
         (["{run}", "--pictures", "a.jpg"], "--pictures a.jpg: must end in .png"),
-        (["{run}", "--max-steps", "0"], "must be at least 1, got 0"),
-        (["{run}", "--max-steps", "100001"], "must be from 1 to 100,000, got 100001"),
-        (["{run}", "--max-steps", "many"], "invalid"),
+        (["{run}", "--max-steps", "0"], "must be a whole number from 1 to 100,000, got '0'"),
+        (["{run}", "--max-steps", "100001"], "from 1 to 100,000, got '100001'"),
+        (["{run}", "--max-steps", "many"], "must be a whole number from 1 to"),
     ],
 )
 def test_bad_input_is_told_in_one_line(
@@ -219,6 +219,7 @@ def test_several_runs_are_compared_by_their_means(
     ("arguments", "message"),
     [
         (["{run}", "{run}"], "--levels: name the sets"),
+        (["{run}", "--levels", "small", f"{'x' * 99}.txt"], "takes shorter names"),
         (["{run}", "--levels", "small", "shapes", "--pictures", "x.png"], "--pictures: give one"),
         (["{run}", "--levels", "small", "shapes", "-o", "x.json"], "are written as .csv"),
         (["{run}", "{run}", "--levels", "nothing"], "must be one of: "),

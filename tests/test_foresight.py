@@ -60,4 +60,4 @@ def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     with pytest.raises(SystemExit) as stopped:
         foresight()
     assert stopped.value.code == 2
-    assert "at least 4 proposals are needed, got 3" in capsys.readouterr().err
+    assert "--proposals: must be a whole number of at least 4, got '3'" in capsys.readouterr().err

@@ -65,8 +65,9 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
             ["{run}", "--output", "no/where/snr.json"],
             "--output no/where/snr.json: there is no folder no/where",
         ),
-        (["{run}", "--copies", "1", "--explorations", "even"], "at least 2 proposals and 2 copies"),
-        (["{run}", "--levels", "0"], "must be at least 1, got 0"),
+        (["{run}", "--copies", "1"], "--copies: must be a whole number of at least 2, got '1'"),
+        (["{run}", "--levels", "0"], "must be a whole number of at least 1, got '0'"),
+        (["{run}", "--levels", "few"], "must be a whole number of at least 1, got 'few'"),
     ],
 )
 def test_snr_refuses_in_one_line(run: Path, arguments: list[str], message: str, capsys) -> None:

@@ -95,8 +95,9 @@ def own_addresses() -> set[str]:
         (["empty"], "empty: is no run's folder: it has no config.json"),
         (["fresh"], "fresh: holds no checkpoints; give the folders of runs"),
         (["foreign"], "config.json: does not hold the settings of a run"),
-        (["{run}", "--port", "65536"], "must be from 0 to 65535, got 65536"),
-        (["{run}", "--port", "http"], "invalid"),
+        (["{run}", "--port", "65536"], "must be a whole number from 0 to 65,535, got '65536'"),
+        (["{run}", "--port", "http"], "must be a whole number from 0 to 65,535, got 'http'"),
+        (["{run}", "--port", "9" * 400], "must be a whole number from 0 to 65,535, got"),
         ([], "required: RUN"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
@@ -11,7 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from tqdm import tqdm
 
 from proposer_rl.cli.config import ConfigError, RunConfig, TaskMaker, task_maker, why_not_made
 from proposer_rl.cli.errors import one_line
@@ -130,44 +128,10 @@ def _make_in_worker(
     return recorded(task) if graphs else task
 
 
-class EpisodeBar:
-    """A progress bar for the updates of a meta-episode, redrawn for every episode.
-
-    Args:
-        updates: of an episode.
-        enabled: whether to draw it; it is drawn on a terminal only.
-    """
-
-    def __init__(self, updates: int, enabled: bool) -> None:
-        self._updates = updates
-        self._enabled = enabled and sys.stderr.isatty()
-        self._bar: tqdm | None = None
-
-    def __call__(self, done: int) -> None:
-        """Show that so many updates are done."""
-        if not self._enabled:
-            return
-        if self._bar is None:
-            self._bar = tqdm(
-                total=self._updates,
-                desc="  rollouts of the copies",
-                leave=False,
-                position=1,
-                dynamic_ncols=True,
-            )
-        self._bar.update(done - self._bar.n)
-        if done >= self._updates:
-            self._bar.close()
-            self._bar = None
-
-
 def _curriculum(
     config: RunConfig, task: Task, signals: StopSignals, status: Status | None
 ) -> Curriculum:
-    bar = EpisodeBar(config.proposer.meta_episode_length, config.compute.progress)
-
     def tell(done: int) -> None:
-        bar(done)
         if status is not None:
             status.tick("training the copies", done)
 

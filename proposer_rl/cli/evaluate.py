@@ -35,6 +35,7 @@ from proposer_rl.report.generalisation import (
     generalisation_table,
     read_scores,
     scored,
+    stored_name,
     whole,
     write_scores,
 )
@@ -119,6 +120,9 @@ def _compare(options: argparse.Namespace) -> None:
         raise ConfigError("--pictures: give one run and one set of levels")
     if not names:
         raise ConfigError("--levels: name the sets of levels on which several runs are compared")
+    for name in names:
+        if name != stored_name(name):
+            raise ConfigError(f"--levels {name}: the table of several runs takes shorter names")
     if output is not None and output.suffix != ".csv":
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
     if options.max_steps is not None and output is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,54 +12,52 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import bootstrap, linregress, rankdata
-from tensordict import TensorDict
 from torch import Tensor
-from torch.distributions import Dirichlet
 from tqdm import tqdm
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.stored import checkpoints, write_rows
+from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 from proposer_rl.curricula import require_gradients
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.first_order import bin_scores, exact_alignment, exact_direction
 from proposer_rl.meta.rewards import log_success, log_success_gain
-from proposer_rl.meta.signal import performance_at
+from proposer_rl.meta.signal import performance_at, uneven_shares
 from proposer_rl.meta.view import SolverView
-from proposer_rl.runs.checkpoint import load_checkpoint
 from proposer_rl.streams import Streams
 
-CONCENTRATION = 0.15  # of the Dirichlet distribution of the mixtures that are trained on
 CANDIDATES = 32  # levels of each bin that are scored
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measure, print and write what ``bin/foresight`` was asked."""
-    found = [(folder, file) for folder in arguments.folders for file in checkpoints(folder)]
+    runs = [stored_run(folder) for folder in arguments.folders]
+    for run in runs:
+        try:
+            require_gradients(run.task)
+        except TypeError as error:
+            raise ConfigError(str(error)) from error
+    found = [(run, file) for run in runs for file in run.files]
     rows: list[dict[str, Any]] = []
-    for folder, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
-        rows += _measure(folder, file, arguments)
+    for run, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
+        rows += _measure(run, run.stage(file), arguments)
     _print(rows)
     write_rows(rows, arguments.output)
 
 
-def _measure(folder: Path, file: Path, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def _measure(
+    run: StoredRun, stage: Stage, arguments: argparse.Namespace
+) -> Iterator[dict[str, Any]]:
     """A row for every number of updates ahead of a checkpoint."""
-    config = saved_config(folder)
-    task = make_task(config)
-    try:
-        require_gradients(task)
-    except TypeError as error:
-        raise ConfigError(str(error)) from error
-    step, state = load_checkpoint(file)
-    solver = TensorDict(state["solver"], [len(config.seeds)])[:1]
-    streams = Streams(arguments.seed, "foresight", folder.name, step)
+    task = run.task
+    streams = Streams(arguments.seed, "foresight", run.folder.name, stage.step)
     levels = task.target.sample(arguments.levels, streams.generator("levels"))
     learner = task.learner([Streams(0)])
-    learner.restore(solver)
-    shares = _mixtures(arguments.proposals, task.space.size, streams.generator("mixtures"))
+    learner.restore(stage.solver)
+    with streams.as_default("mixtures"):
+        shares = uneven_shares((arguments.proposals,), task.space.size)
+    shares = shares / shares.sum(-1, keepdim=True)
     predicted = (shares @ _scores(task, learner, levels, streams)).numpy()  # [G]
     ahead = sorted(set(arguments.ahead))
     env = SolverTrainingEnv(
@@ -72,27 +69,18 @@ def _measure(folder: Path, file: Path, arguments: argparse.Namespace) -> Iterato
         action_repeat=1,
     )
     actions = shares.log().expand(ahead[-1], -1, -1).to(task.device)
-    before, *after = performance_at([0, *ahead], env, solver[0], actions, levels, streams)
+    before, *after = performance_at([0, *ahead], env, stage.solver[0], actions, levels, streams)
     for updates, performance in zip(ahead, after, strict=True):
         gains = log_success(performance).mean(-1) - log_success(before).mean(-1)  # [G, R]
         measured = gains.mean(1).cpu().numpy()
         yield {
-            "run": folder.name,
-            "updates": state["updates"],
+            "run": run.folder.name,
+            "updates": stage.updates,
             "ahead": updates,
             "proposals": arguments.proposals,
             "copies": arguments.copies,
             **agreement(predicted, measured),
         }
-
-
-def _mixtures(count: int, bins: int, generator: torch.Generator) -> Tensor:
-    # Torch's Dirichlet takes no generator: its default one draws from this one's stream.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(generator.initial_seed())
-        shares = Dirichlet(torch.full((bins,), CONCENTRATION)).sample((count,))
-    shares = shares.clamp_min(1e-6)
-    return shares / shares.sum(-1, keepdim=True)
 
 
 def _scores(task: Any, learner: PPO, target: Any, streams: Streams) -> Tensor:

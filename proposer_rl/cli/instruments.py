@@ -13,6 +13,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 
 MOST_STEPS = 10**5
@@ -94,7 +95,7 @@ def _evaluate_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--max-steps",
-        type=_steps,
+        type=number(int, 1, MOST_STEPS),
         metavar="N",
         help="step limit of every level, where the task lets it be chosen (the run's, or on levels "
         "that are none of a distribution 2 for each move of the shortest path if this is more)",
@@ -113,13 +114,6 @@ def _evaluate_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _steps(text: str) -> int:
-    number = positive(text)
-    if number > MOST_STEPS:
-        raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_STEPS:,}, got {number}")
-    return number
-
-
 def _foresight_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bin/foresight",
@@ -130,12 +124,14 @@ def _foresight_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
-        "--ahead", type=positive, nargs="+", default=[1, 5, 20, 50],
+        "--ahead", type=number(int, 1), nargs="+", default=[1, 5, 20, 50],
         help="numbers of updates after which gains are measured (1 5 20 50)",
     )  # fmt: skip
-    parser.add_argument("--proposals", type=positive, default=16, help="different mixtures (16)")
-    parser.add_argument("--copies", type=positive, default=2, help="copies of each (2)")
-    parser.add_argument("--levels", type=positive, default=512, help="of the target (512)")
+    parser.add_argument(
+        "--proposals", type=number(int, 4), default=16, help="different mixtures (16)"
+    )
+    parser.add_argument("--copies", type=number(int, 1), default=2, help="copies of each (2)")
+    parser.add_argument("--levels", type=number(int, 1), default=512, help="of the target (512)")
     return _writing_rows(parser, "of all draws")
 
 
@@ -164,12 +160,14 @@ def _snr_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folders", nargs="+", type=Path, help="folders of runs")
     parser.add_argument(
-        "--meta-episode-length", type=positive, help="updates of an episode; the run's"
+        "--meta-episode-length", type=number(int, 1), help="updates of an episode; the run's"
     )
-    parser.add_argument("--proposals", type=positive, default=8, help="different proposals (8)")
-    parser.add_argument("--copies", type=positive, default=3, help="copies of each (3)")
     parser.add_argument(
-        "--levels", type=positive, nargs="+", default=[75, 256, 1024],
+        "--proposals", type=number(int, 2), default=8, help="different proposals (8)"
+    )
+    parser.add_argument("--copies", type=number(int, 2), default=3, help="copies of each (3)")
+    parser.add_argument(
+        "--levels", type=number(int, 1), nargs="+", default=[75, 256, 1024],
         help="sizes of the validation batch (75 256 1024)",
     )  # fmt: skip
     parser.add_argument(
@@ -189,14 +187,6 @@ def _writing_rows(parser: argparse.ArgumentParser, seed: str) -> argparse.Argume
     parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     parser.set_defaults(files={"output": (".json",)})
     return parser
-
-
-def positive(text: str) -> int:
-    """An argument's whole number of at least 1."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
-    return number
 
 
 def main() -> None:

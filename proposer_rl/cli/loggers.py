@@ -45,7 +45,11 @@ def make_log(settings: LoggerSettings, path: Path, name: str) -> Log | None:
         return None
     options: dict[str, Any] = {}
     if settings.type == "wandb":
-        options["wandb_kwargs"] = {"project": settings.project, "mode": settings.mode}
+        # Of a sweep in one process each run is its own.
+        reinit = "finish_previous"
+        options["wandb_kwargs"] = {
+            "project": settings.project, "mode": settings.mode, "reinit": reinit
+        }  # fmt: skip
     logger = get_logger(settings.type, str(path), name, **options)
 
     def log(table: str, row: Mapping[str, Any], step: int) -> None:

@@ -14,18 +14,17 @@ from torch import Tensor
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.stored import checkpoints, write_rows
+from proposer_rl.cli.stored import StoredRun, stored_run, write_rows
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Parts, frozen_proposer
 from proposer_rl.models import draw, uniform_noise
-from proposer_rl.runs.checkpoint import load_checkpoint
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, Task
 
 SAMPLES = 64  # batches drawn from a policy to know its mean composition
 
 
-class Stage(NamedTuple):
+class Seen(NamedTuple):
     """A Solver at some stage of training, and what the Proposer sees of it, batch [1]."""
 
     updates: int
@@ -56,7 +55,7 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     task = make_task(config)
     frozen = frozen_proposer(Parts(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
-    stages = _stages(task, frozen, checkpoints(solvers))
+    stages = _stages(task, frozen, stored_run(solvers))
     rows = []
     for stage in stages:
         shares = _shares(frozen, stage.seen, task.batch_size)
@@ -71,14 +70,12 @@ def look(proposer: Path, solvers: Path, seed: int = 0) -> list[dict[str, Any]]:
     return rows
 
 
-def _stages(task: Task, frozen: ProposerCurriculum, files: list[Path]) -> list[Stage]:
+def _stages(task: Task, frozen: ProposerCurriculum, solvers: StoredRun) -> list[Seen]:
     learner = task.learner([Streams(0)])
     stages = []
-    for file in files:
-        _, state = load_checkpoint(file)
-        solvers = TensorDict(state["solver"]).auto_batch_size_(1)
-        learner.restore(solvers[:1])  # of several that were trained side by side the first
-        stages.append(Stage(state["updates"], frozen.view.observe(learner.agent, 0.0)))
+    for stage in map(solvers.stage, solvers.files):
+        learner.restore(stage.solver)
+        stages.append(Seen(stage.updates, frozen.view.observe(learner.agent, 0.0)))
     return stages
 
 
@@ -98,9 +95,7 @@ def _shares(frozen: ProposerCurriculum, seen: TensorDict, batch_size: int) -> Te
     return choices.flatten().bincount(minlength=frozen.actions.bins) / choices.numel()
 
 
-def _row(
-    space: Space, stage: Stage, what: str, shares: Tensor, reference: Tensor
-) -> dict[str, Any]:
+def _row(space: Space, stage: Seen, what: str, shares: Tensor, reference: Tensor) -> dict[str, Any]:
     table = shares.unflatten(0, [len(values) for values in space.axes.values()])
     means = {
         name: float((table.movedim(i, 0).flatten(1).sum(1) * torch.tensor(values)).sum())

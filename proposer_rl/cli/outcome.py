@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,16 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "workers": config.compute.workers,
         "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
     }
+
+
+def to_go_on(path: Path) -> str:
+    """The command that goes on with the run in a folder."""
+    paths, config = _python_path(), _config_folder()
+    before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
+    options = ["--config-dir", config] if config else []
+    own = [word for word in overrides() if not word.startswith("+sweep=")]
+    words = shlex.join([*options, *own, f"hydra.run.dir={path}"])
+    return " ".join([*before, "bin/train", words])
 
 
 def _about(config: RunConfig) -> dict[str, str]:

@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.extras import install_command
 
@@ -66,15 +67,13 @@ def open_session(folder: Path) -> Session:
     """
     from proposer_rl.cli.config import saved_config
 
-    config = saved_config(folder)  # before what takes seconds to import
-    from proposer_rl.cli.build import make_task
+    saved_config(folder)  # before what takes seconds to import
     from proposer_rl.cli.outcome import run_name
-    from proposer_rl.cli.stored import checkpoints, restored
+    from proposer_rl.cli.stored import restored, stored_run
     from proposer_rl.play.session import Session
     from proposer_rl.runs.checkpoint import load_checkpoint
 
-    checkpoints(folder)
-    task = make_task(config)
+    config, task = (stored := stored_run(folder)).config, stored.task
 
     def load(file: Path) -> tuple[int, PPO]:
         state = load_checkpoint(file)[1]
@@ -94,17 +93,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="a run's folder")
     parser.add_argument(
-        "--port", type=_port, default=0, help="on which the page is served (default: a free one)"
+        "--port",
+        type=number(int, 0, 2**16 - 1),
+        default=0,
+        help="on which the page is served (default: a free one)",
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     return parser
-
-
-def _port(text: str) -> int:
-    number = int(text)
-    if not 0 <= number < 2**16:
-        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {number}")
-    return number
 
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--threshold",
-        type=_finite,
+        type=number(float),
         help="of sample efficiency, such as 0.8 of a success (default: the runs' own)",
     )
     parser.add_argument(
@@ -116,16 +116,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser
-
-
-def _finite(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
-    return value
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,19 +11,21 @@ from typing import Any
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import ConfigError, RunConfig, overrides
+from proposer_rl.cli.config import ConfigError, RunConfig
 from proposer_rl.cli.errors import SIGNALLED, one_line
-from proposer_rl.cli.outcome import announce, identity, run_name
+from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
-from proposer_rl.runs.checkpoint import CheckpointError, load_latest
-from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files, load_latest
+from proposer_rl.runs.folder import RunFolder, storage
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
 from proposer_rl.streams import Streams
+
+SUMMARY = "summary.json"
 
 
 def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
@@ -42,7 +43,17 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     with locked(path), signals:
         try:
-            return live(config, made, path, signals, status)
+            value = live(config, made, path, signals, status)
+            signals.deliver()  # of a sweep the next run is not to begin
+            return value
+        except Interrupted as stop:
+            stopped = f"{one_line(stop).capitalize()}; all is saved"
+            tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+            sys.exit(SIGNALLED + stop.signum)
+        except KeyboardInterrupt:
+            stopped = "Stopped at once; what came after the last checkpoint is lost"
+            tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+            raise
         finally:
             made.curriculum.close()
 
@@ -78,7 +89,12 @@ def live(
                 raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
             made.curriculum.load_state_dict(latest[1]["curriculum"])
             made.curriculum.begin()
-        value = run(build(config, made, folder, signals, scope, status), config)
+        finished = _finished(folder.path, config)
+        if finished is not None:
+            tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {folder.path}")
+            value = _value(finished, config)
+        else:
+            value = run(build(config, made, folder, signals, scope, status), config)
         before = folder
     return value
 
@@ -91,28 +107,16 @@ def run(experiment: Experiment, config: RunConfig) -> float:
     """
     folder = experiment.folder
     facts = identity(experiment, config)
-    finished = _finished(folder.path, config)
-    if finished is not None:
-        tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {folder.path}")
-        return _value(finished, config)
     described = {"planned_updates": config.schedule.updates, "task": experiment.task.facts}
     folder.write_json("run.json", {**facts, **described})
     try:
         result = experiment.run()
-    except Interrupted as stop:
-        tqdm.write(f"{one_line(stop).capitalize()}; all is saved. {_how_to_go_on(folder)}")
-        sys.exit(SIGNALLED + stop.signum)
-    except KeyboardInterrupt:
-        tqdm.write(
-            f"Stopped at once; what came after the last checkpoint is lost. {_how_to_go_on(folder)}"
-        )
-        raise
     except DivergedError as error:
         kept = folder.path / "checkpoints"
         raise DivergedError(
             f"{error}; the last checkpoints before it are kept in {kept}"
         ) from error
-    folder.write_json("summary.json", {**facts, **result})
+    folder.write_json(SUMMARY, {**facts, **result})
     announce(result, config, folder, draw_run(folder.path, title=run_name(config)))
     return _value(result, config)
 
@@ -123,19 +127,35 @@ def _value(result: dict[str, Any], config: RunConfig) -> float:
 
 
 def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
-    """The summary of a run that is already at the end of its schedule."""
-    file = folder / "summary.json"
+    """The summary of a run that is already at the end of its schedule.
+
+    One that goes on to a longer schedule has none until it ends again.
+
+    Raises:
+        ConfigError: if the run cannot come to the end of this schedule.
+    """
+    updates, file, checkpoints = config.schedule.updates, folder / SUMMARY, folder / "checkpoints"
     if not file.exists():
+        latest = load_latest(checkpoints)
+        if latest is not None and (made := latest[1].get("updates", 0)) > updates:
+            raise ConfigError(
+                f"schedule.updates={updates}: the run in {folder} has made {made} updates already"
+            )
         return None
     try:
         summary: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        return summary if summary["updates"] >= config.schedule.updates else None
+        ended = int(summary["updates"])
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
             f"{file}: is damaged; remove it to go on from the last checkpoint"
         ) from error
-
-
-def _how_to_go_on(folder: RunFolder) -> str:
-    again = shlex.join([*overrides(), f"hydra.run.dir={folder.path}"])
-    return f"To go on: bin/train {again}"
+    if ended >= updates:
+        return summary
+    if not checkpoint_files(checkpoints):
+        raise ConfigError(
+            f"schedule.updates={updates}: the run in {folder} ended after {ended} updates and has "
+            "no checkpoint to go on from"
+        )
+    with storage(file):
+        file.unlink()
+    return None

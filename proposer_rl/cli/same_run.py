@@ -7,7 +7,8 @@ from typing import Any
 from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
 from proposer_rl.runs.folder import RunFolder
 
-# What may differ: where it is computed and shown, and a longer schedule.
+# What may differ: where it is computed and shown, and, of one lifetime, a longer schedule: the next
+# lifetime has begun with what the curriculum had learnt at the end of the shorter one.
 FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
@@ -26,7 +27,8 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
         StorageError: if the file cannot be read or written.
     """
     now = config.model_dump(mode="json", exclude=FREE)
-    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
+    free = FREE_SCHEDULE if config.lifetimes == 1 else FREE_SCHEDULE - {"updates"}
+    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in free}
     file = folder.path / "config.json"
     if not file.exists():
         # Tables here are no run's of ours, and a run begins by removing what is left of one.

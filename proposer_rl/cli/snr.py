@@ -6,31 +6,25 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
 from rich.table import Table
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torch.distributions import Dirichlet
 from tqdm import tqdm
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.stored import checkpoints, write_rows
+from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success, performance_gain
-from proposer_rl.meta.signal import by_validation_size, performance_around
+from proposer_rl.meta.signal import by_validation_size, performance_around, uneven_shares
 from proposer_rl.meta.view import SolverView
-from proposer_rl.runs.checkpoint import load_checkpoint
 from proposer_rl.settings import MixtureSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
-UNEVEN = 0.15  # concentration of the Dirichlet distribution of uneven mixtures
 SPREAD = MixtureSettings().spread  # of a Proposer's first policy over mixtures
 MEASURES: dict[str, Callable[[Any], Tensor]] = {
     "return": lambda performance: performance["return"],
@@ -52,23 +46,21 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         ConfigError, CheckpointError: if a folder is no run's, or a checkpoint cannot be read.
         ValueError: if a number is out of range.
     """
-    found = [(folder, file) for folder in arguments.folders for file in checkpoints(folder)]
-    work = [(folder, file, name) for folder, file in found for name in arguments.explorations]
+    runs = [stored_run(folder) for folder in arguments.folders]
+    found = [(run, file) for run in runs for file in run.files]
+    work = [(run, file, name) for run, file in found for name in arguments.explorations]
     rows = []
-    for folder, file, name in tqdm(work, desc="explorations", disable=not sys.stderr.isatty()):
-        rows += _measure(folder, file, name, arguments)
+    for run, file, name in tqdm(work, desc="explorations", disable=not sys.stderr.isatty()):
+        rows += _measure(run, run.stage(file), name, arguments)
     return rows
 
 
 def _measure(
-    folder: Path, file: Path, exploration: str, arguments: argparse.Namespace
+    run: StoredRun, stage: Stage, exploration: str, arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    config = saved_config(folder)
-    task = make_task(config)
-    step, state = load_checkpoint(file)
-    solver = TensorDict(state["solver"], [len(config.seeds)])[0]
-    length = arguments.meta_episode_length or config.proposer.meta_episode_length
-    streams = Streams(arguments.seed, "snr", folder.name, step)
+    task = run.task
+    length = arguments.meta_episode_length or run.config.proposer.meta_episode_length
+    streams = Streams(arguments.seed, "snr", run.folder.name, stage.step)
     actions, held, draw = EXPLORATIONS[exploration](task)
     env = SolverTrainingEnv(
         task.learner([Streams(0)] * arguments.proposals * arguments.copies),
@@ -79,15 +71,16 @@ def _measure(
         meta_episode_length=length,
         action_repeat=length if held else 1,
     )
-    drawn = draw(env.steps, arguments.proposals, streams.generator("actions"))
+    with streams.as_default("actions"):
+        drawn = draw(env.steps, arguments.proposals)
     levels = task.target.sample(max(arguments.levels), streams.generator("levels"))
     around = performance_around(
-        env, solver, drawn.to(task.device), levels, streams.within(exploration)
+        env, stage.solver[0], drawn.to(task.device), levels, streams.within(exploration)
     )
     return [
         {
-            "run": folder.name,
-            "updates": state["updates"],
+            "run": run.folder.name,
+            "updates": stage.updates,
             "exploration": exploration,
             "measure": name,
             "meta_episode_length": length,
@@ -105,45 +98,28 @@ def _told(performance: TensorDictBase) -> list[str]:
 
 
 # The meaning of actions, whether one holds for the episode, and how to draw those of G proposals
-# in T steps, [T, G, ...].
-_Exploration = tuple[Actions, bool, Callable[[int, int, torch.Generator], Tensor]]
+# in T steps, [T, G, ...], from torch's default generator.
+_Exploration = tuple[Actions, bool, Callable[[int, int], Tensor]]
 
 
 def _even(task: Task) -> _Exploration:
     mixture = Mixture(task.space, torch.eye(task.space.size))
-    return mixture, True, lambda steps, groups, _: torch.zeros(steps, groups, mixture.bins)
+    return mixture, True, lambda steps, groups: torch.zeros(steps, groups, mixture.bins)
 
 
 def _problems(task: Task) -> _Exploration:
-    choices = ProblemChoices(task.space)
-
-    def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
-        shape = (steps, groups, task.batch_size)
-        return torch.randint(choices.bins, shape, generator=generator)
-
-    return choices, False, draw
+    choices, count = ProblemChoices(task.space), task.batch_size
+    return choices, False, lambda *shape: torch.randint(choices.bins, (*shape, count))
 
 
 def _mixture(task: Task) -> _Exploration:
     mixture = Mixture(task.space)
-
-    def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
-        return SPREAD * torch.randn(steps, groups, len(mixture.directions), generator=generator)
-
-    return mixture, True, draw
+    return mixture, True, lambda *shape: SPREAD * torch.randn(*shape, len(mixture.directions))
 
 
 def _uneven(task: Task) -> _Exploration:
     mixture = Mixture(task.space, torch.eye(task.space.size))
-
-    def draw(steps: int, groups: int, generator: torch.Generator) -> Tensor:
-        # Torch's Dirichlet takes no generator: its default one draws from this one's stream.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(generator.initial_seed())
-            shares = Dirichlet(torch.full((mixture.bins,), UNEVEN)).sample((steps, groups))
-        return shares.clamp_min(1e-6).log()
-
-    return mixture, True, draw
+    return mixture, True, lambda *shape: uneven_shares(shape, mixture.bins).log()
 
 
 # cli/instruments.py says what each is.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 
-from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.cli.build import make_task
+from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import (
     CheckpointError,
@@ -23,16 +24,57 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
 
-def checkpoints(folder: Path) -> list[Path]:
-    """All checkpoints of a run, oldest first.
+class Stage(NamedTuple):
+    """The first Solver of a run after some updates.
+
+    Attributes:
+        step: the checkpoint's.
+        updates: that the Solver has made.
+        solver: its snapshot, batch [1].
+    """
+
+    step: int
+    updates: int
+    solver: TensorDict
+
+
+class StoredRun(NamedTuple):
+    """A run's folder.
+
+    Attributes:
+        folder: the run's.
+        config: its settings.
+        task: made from them.
+        files: its checkpoints, oldest first; at least one.
+    """
+
+    folder: Path
+    config: RunConfig
+    task: Task
+    files: list[Path]
+
+    def stage(self, file: Path) -> Stage:
+        """What one of the files holds.
+
+        Raises:
+            CheckpointError: if it cannot be used.
+        """
+        step, state = load_checkpoint(file)
+        solvers = restored(self.task, self.config, state).snapshot()
+        return Stage(step, int(state["updates"]), solvers[:1])
+
+
+def stored_run(folder: Path) -> StoredRun:
+    """A run that has checkpoints.
 
     Raises:
-        ConfigError: if there are none.
+        ConfigError: if the folder holds none.
     """
     files = [file for _, file in checkpoint_files(folder / "checkpoints")]
     if not files:
         raise ConfigError(f"{folder}: holds no checkpoints; give the folders of runs")
-    return files
+    config = saved_config(folder)
+    return StoredRun(folder, config, make_task(config), files)
 
 
 def read_checkpoint(path: Path) -> tuple[Path, State]:

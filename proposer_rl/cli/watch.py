@@ -13,6 +13,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.report.progress import find_progress
 from proposer_rl.report.sweeps import PLAN, left
@@ -69,19 +70,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("folder", type=Path, help="a run's folder, or one with runs in it")
     parser.add_argument("--once", action="store_true", help="draw once and stop")
     parser.add_argument(
-        "--seconds", type=_seconds, default=2.0, help="between two looks (default: 2)"
+        "--seconds",
+        type=number(float, 0.1, 3600),
+        default=2.0,
+        help="between two looks (default: 2)",
     )
     return parser
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.1 <= value <= 3600:
-        raise argparse.ArgumentTypeError(f"must be from 0.1 to 3600, got {text!r}")
-    return value
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from playwright.sync_api import Page as Tab
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.stored import checkpoints, read_checkpoint, restored
+from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
 from proposer_rl.mazes.evaluation import ExactEvaluator
 from proposer_rl.mazes.level_files import read_levels, shipped_levels
 from proposer_rl.mazes.levels import Level, planes
@@ -109,7 +109,7 @@ def success(
     run: Path, rows: list[str], number: int, limit: int | None = None, solver: int = 0
 ) -> str:
     """What the page must say, computed without it."""
-    folder, state = read_checkpoint(checkpoints(run)[number])
+    folder, state = read_checkpoint(stored_run(run).files[number])
     config = saved_config(folder)
     agent = restored(make_task(config), config, state).agent
     level = Level.from_text("\n".join(rows))
@@ -196,7 +196,7 @@ def test_checkpoints_that_are_gone_leave_the_slider(
     with served(copy) as page:
         for tab in opened(context, page.address):
             expect(tab.locator("#updates")).to_have_text("3 of 3 · update 6")
-            first = checkpoints(copy)[0]
+            first = stored_run(copy).files[0]
             first.rename(tmp_path / "gone")
             slide(tab, 0)
             expect(tab.locator("#updates")).to_have_text("2 of 2 · update 6")

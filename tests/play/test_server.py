@@ -19,7 +19,7 @@ import torch
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.evaluate import evaluate, load
-from proposer_rl.cli.stored import checkpoints, read_checkpoint, restored
+from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
 from proposer_rl.mazes.level_files import levels_to_text, read_levels, shipped_levels
 from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.play.server import STATIC
@@ -119,7 +119,7 @@ def test_every_checkpoint_is_examined_as_the_command_does(
     level = make_task(saved_config(page.run)).board.read(ROWS)
     (tmp_path / "drawn.txt").write_text(levels_to_text({"drawn": level}))
     successes = set()
-    for number, file in enumerate(checkpoints(page.run), 1):
+    for number, file in enumerate(stored_run(page.run).files, 1):
         told = asked(page, "examine", {**EXAMINE, "checkpoint": number, "solver": solver})
         found = evaluate(load(file), str(tmp_path / "drawn.txt"))
         assert told["updates"] == found.updates == 2 * number
@@ -135,7 +135,7 @@ def test_a_solver_with_memory_is_examined_as_the_command_does(
 ) -> None:
     rows = ["v....", ".##..", "..#.G", ".....", "#...."]
     (tmp_path / "drawn.txt").write_text("\n".join(rows) + "\n")
-    for number, file in enumerate(checkpoints(view_page.run), 1):
+    for number, file in enumerate(stored_run(view_page.run).files, 1):
         question = {"checkpoint": number, "solver": 0, "rows": rows}
         told = asked(view_page, "examine", question)
         assert told == asked(view_page, "examine", question)

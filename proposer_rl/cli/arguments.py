@@ -1,0 +1,37 @@
+"""Numbers on a command line."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TypeVar
+
+Number = TypeVar("Number", int, float)
+
+
+def number(
+    kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf
+) -> Callable[[str], Number]:
+    """The type of an argument that is a finite number in a range, for argparse.
+
+    Args:
+        kind: ``int`` or ``float``.
+        least: the lowest that is allowed.
+        most: the highest.
+    """
+    allowed = "a whole number" if kind is int else "a number"
+    if math.isfinite(most):
+        allowed += f" from {least:,} to {most:,}"
+    elif math.isfinite(least):
+        allowed += f" of at least {least:,}"
+
+    def parse(text: str) -> Number:
+        with suppress(ValueError, OverflowError):
+            value = kind(text)
+            if math.isfinite(value) and least <= value <= most:
+                return value
+        raise argparse.ArgumentTypeError(f"must be {allowed}, got {text!r}")
+
+    return parse
