@@ -128,7 +128,11 @@ def against_convolutions(options: Options) -> Result:
                 samples={"update": seconds[dtype], "convolutions": ceiling},
             )
         )
-        tables.append(profile(solvers[dtype].update, f"Where a Solver update goes, {dtype}"))
+        plain = Solvers(scale.task(options, f"precision={dtype}", "compute.graphs=false"))
+        for _ in range(2):
+            plain.update()
+        title = f"Where a Solver update goes, {dtype}"
+        tables.append(profile(plain.update, title, options.device))
     tables.append(_details(layers, _Best(seconds, len(layers), dtypes)))
     return Result(rows, tables)
 

@@ -37,7 +37,7 @@ def environment_steps(options: Options) -> Result:
         }
         actions = draw_actions(min(steps, 40), batch, device)
         returns = [float(play(actions)) for play in contenders.values()]
-        if max(returns) - min(returns) > 1e-3 * actions.numel():
+        if max(returns) - min(returns) > 0.1:  # ten steps' penalty; rounding is a hundredth of it
             raise AssertionError(f"the environments differ: total rewards {returns}")
         counts = {"TorchRL": steps, "bare": steps, "Gymnasium": few}
         candidates = {

@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from benchmarks.meta import MetaStep, StepParts, trainer_of
+from benchmarks.meta import EVERY_UPDATE, parts_table, step_and_parts, trainer_of
 from benchmarks.results import Options, Result, Row, Spread
 from benchmarks.scales import Scale, Solvers, paper, precisions
 from benchmarks.timing import interleave, synchronise, time_once
-from proposer_rl.streams import Streams
 
 NOTHING = "There is no GPU here: none of its targets is measured."
 
@@ -19,7 +18,8 @@ def gpu_targets(options: Options) -> Result:
     """Everything that is promised of a GPU, at the paper's values."""
     if not (options.tiny or options.device.startswith("cuda")):
         return Result([], notes=[NOTHING])
-    options = replace(options, precision=precisions(options)[-1])
+    if options.precision == "auto":
+        options = replace(options, precision=precisions(options)[-1])
     scale = paper(options)
     step = _meta_step(scale, options)
     return Result([*_update(scale, options), *step.rows, *_runs(scale, options)], step.tables)
@@ -45,12 +45,11 @@ def _update(scale: Scale, options: Options) -> list[Row]:
 
 def _meta_step(scale: Scale, options: Options) -> Result:
     """K Solvers: a step and its parts."""
-    env = trainer_of(scale.made(options)).env
-    parts = StepParts(env)
-    seconds = interleave({"step": MetaStep(env), "parts": parts}, options.repeats, options.device)
+    env = trainer_of(scale.made(options, EVERY_UPDATE)).env
+    seconds = step_and_parts(env, options.repeats, options.device)
     size = f"K = {scale.config.proposer.rollouts}, {options.precision}"
     row = _row("a meta-environment step", size, seconds["step"], 50e-3)
-    return Result([row], [parts.table(f"Parts of a meta-environment step, {size}")])
+    return Result([row], [parts_table(f"Parts of a meta-environment step, {size}", seconds)])
 
 
 def _runs(scale: Scale, options: Options) -> list[Row]:
@@ -59,10 +58,11 @@ def _runs(scale: Scale, options: Options) -> list[Row]:
     cycles = schedule.updates // schedule.cycle_length
     target = Scale(scale.name, "target")
     plain, made = target.made(options), scale.made(options)
+    start = made.learner.snapshot()
 
     def one_cycle() -> None:
-        fresh = made._replace(learner=made.task.learner([Streams(0, "solver")]))
-        scale.run(options, fresh, f"schedule.updates={schedule.cycle_length}")
+        made.learner.restore(start)  # in place, so that what is recorded stays
+        scale.run(options, made, f"schedule.updates={schedule.cycle_length}")
 
     one_cycle()  # everything is recorded here
     size = f"{schedule.updates} updates"

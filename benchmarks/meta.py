@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.results import Options, Result, Row, Spread, Table
 from benchmarks.scales import PAPER, QUICK, TINY, paper
-from benchmarks.timing import interleave, ratio, threads
+from benchmarks.timing import Timings, interleave, ratio, threads, total
 from proposer_rl.cli.build import Made
 from proposer_rl.curricula import ProposerTrainer
 from proposer_rl.learning import PPO
@@ -32,27 +32,30 @@ def meta_step(options: Options) -> Result:
     for scale in scales:
         made = scale.made(options, EVERY_UPDATE)
         env = trainer_of(made).env
-        parts = StepParts(env)
         with threads(scale.threads):
-            seconds = interleave(
-                {"step": MetaStep(env), "parts": parts},
-                options.few if scale == PAPER else options.repeats,
-                options.device,
-            )
+            rounds = options.few if scale == PAPER else options.repeats
+            seconds = step_and_parts(env, rounds, options.device)
         size = f"K = {env.batch_size[0]}, {scale.name} values, {made.task.precision}"
         rows.append(
             Row(
                 f"a meta-environment step, {size}",
                 "the sum of its parts",
-                ratio(seconds["step"], seconds["parts"]),
+                ratio(seconds["step"], total(seconds, dict.fromkeys(PARTS, 1.0))),
                 "x",
                 target=1.05,
                 at_most=True,
                 samples=seconds,
             )
         )
-        tables.append(parts.table(f"Parts of a meta-environment step, {size}"))
+        tables.append(parts_table(f"Parts of a meta-environment step, {size}", seconds))
     return Result(rows, tables)
+
+
+def step_and_parts(env: SolverTrainingEnv, rounds: int, device: str) -> Timings:
+    """A step, as ``step``, and what it consists of, timed in turns."""
+    parts = StepParts(env)
+    calls = {part: getattr(parts, part) for part in PARTS}
+    return interleave({"step": MetaStep(env), **calls}, rounds, device)
 
 
 class MetaStep:
@@ -78,13 +81,6 @@ class StepParts:
         self.task = env.view.task
         self.streams = [Streams(copy, "bench") for copy in range(env.batch_size[0])]
         self.generators = [stream.generator() for stream in self.streams]
-        self.seconds: dict[str, list[float]] = {part: [] for part in PARTS}
-
-    def __call__(self) -> None:
-        """All parts, each timed."""
-        for part in PARTS:
-            timings = interleave({part: getattr(self, part)}, 1, str(self.task.device), warmup=0)
-            self.seconds[part] += timings[part]
 
     def generation(self) -> None:
         """Levels for random actions."""
@@ -106,15 +102,16 @@ class StepParts:
         """What the Proposer sees of them."""
         self.task.probe(self.solvers.agent, self.env.view.probes)
 
-    def table(self, title: str) -> Table:
-        """Milliseconds of each part."""
-        whole = sum(Spread.of(times).median for times in self.seconds.values())
-        lines = []
-        for part, times in self.seconds.items():
-            took = Spread.of(times)
-            cells = [f"{1e3 * s:.1f}" for s in (took.median, took.low, took.high)]
-            lines.append([part, f"{took.median / whole:.1%}", *cells])
-        return Table(title, ["part", "share", "median ms", "from", "to"], lines)
+
+def parts_table(title: str, seconds: Timings) -> Table:
+    """Milliseconds of each part of a step."""
+    spreads = {part: Spread.of(seconds[part]) for part in PARTS}
+    whole = sum(took.median for took in spreads.values())
+    lines = []
+    for part, took in spreads.items():
+        cells = [f"{1e3 * s:.1f}" for s in (took.median, took.low, took.high)]
+        lines.append([part, f"{took.median / whole:.1%}", *cells])
+    return Table(title, ["part", "share", "median ms", "from", "to"], lines)
 
 
 def memory(options: Options) -> Result:

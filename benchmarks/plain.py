@@ -144,7 +144,7 @@ class PlainPPO:
             critic_coeff=settings.critic_coeff,
             loss_critic_type="l2",
             normalize_advantage=settings.normalize_advantage,
-        )
+        ).to(env.device)
         self._adam = torch.optim.Adam(
             self.network.parameters(), lr=settings.learning_rate, eps=settings.adam_eps
         )

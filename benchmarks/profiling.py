@@ -34,18 +34,20 @@ def kind_of(operation: str) -> str:
     return REST
 
 
-def profile(call: Callable[[], object], title: str) -> Table:
+def profile(call: Callable[[], object], title: str, device: str) -> Table:
     """Profile one call.
 
     Args:
-        call: has run before, so that nothing is set up within it.
+        call: has run before, so that nothing is set up within it, and is no replay of a graph,
+            whose operations have no names.
         title: of the table.
+        device: that it computes on.
 
     Returns:
         Shares of the wall-clock time by kind, greatest first, with the costliest operations.
     """
     activities = [ProfilerActivity.CPU]
-    on_device = torch.cuda.is_available()
+    on_device = torch.device(device).type == "cuda"
     if on_device:
         activities.append(ProfilerActivity.CUDA)
     with torch_profile(activities=activities) as profiler:
@@ -56,6 +58,8 @@ def profile(call: Callable[[], object], title: str) -> Table:
         wall = time.perf_counter() - start
     spent: dict[str, dict[str, float]] = defaultdict(dict)
     for event in profiler.key_averages():
+        if event.device_type.name != "CPU":
+            continue  # a kernel, whose time is that of the operation which asked for it, too
         micro = event.self_device_time_total if on_device else event.self_cpu_time_total
         name = re.sub(r"^(aten|autograd::engine)::|evaluate_function: ", "", event.key)
         operations = spent[kind_of(name)]

@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -74,7 +75,8 @@ def use(device: torch.device) -> None:
     Without a GPU it does nothing.
     """
     if device.type == "cuda":
-        torch.cuda.set_device(device)
+        if device.index is not None:  # Ray's workers see none but their own
+            torch.cuda.set_device(device)
         torch.set_float32_matmul_precision("high")
 
 
@@ -139,14 +141,14 @@ class Captured:
     def __init__(self, function: Callable[..., TensorDictBase], recorder: Recorder) -> None:
         self._function = function
         self._recorder = recorder
-        self._recordings: dict[Any, _Recording] = {}
+        self._recordings: WeakKeyDictionary[object, dict[Any, _Recording]] = WeakKeyDictionary()
 
-    def __call__(self, inputs: TensorDictBase, *fixed: object) -> TensorDictBase:
+    def __call__(self, inputs: TensorDictBase, *agent: object) -> TensorDictBase:
         """Apply the function.
 
         Args:
             inputs: tensors, other ones at every call.
-            fixed: further arguments; each combination of objects has recordings of its own.
+            agent: at most one further argument; each has recordings of its own, which end with it.
 
         Returns:
             The function's outputs, which later calls leave alone.
@@ -154,45 +156,40 @@ class Captured:
         Raises:
             RuntimeError: if the function cannot be recorded.
         """
-        key = (*map(id, fixed), _shapes(inputs))
-        if key not in self._recordings:
-            self._recordings[key] = _Recording(self._function, fixed, self._recorder)
-        return self._recordings[key](inputs)
+        recordings = self._recordings.setdefault(agent[0] if agent else self, {})
+        shapes = _shapes(inputs)
+        if shapes not in recordings:
+            recordings[shapes] = _Recording(self._function, self._recorder)
+        return recordings[shapes](inputs, *agent)
 
 
 class _Recording:
-    """The function on inputs of one shape; keeps the fixed arguments, whose ids name it, alive."""
+    """The function on inputs of one shape."""
 
     _inputs: TensorDictBase
     _outputs: TensorDictBase
 
-    def __init__(
-        self,
-        function: Callable[..., TensorDictBase],
-        fixed: tuple[object, ...],
-        recorder: Recorder,
-    ) -> None:
+    def __init__(self, function: Callable[..., TensorDictBase], recorder: Recorder) -> None:
         self._function = function
-        self._fixed = fixed
         self._recorder = recorder
         self._calls = 0
         self._replay: Callable[[], object] | None = None
 
-    def __call__(self, inputs: TensorDictBase) -> TensorDictBase:
+    def __call__(self, inputs: TensorDictBase, *agent: object) -> TensorDictBase:
         self._calls += 1
         if self._calls <= WARM_UPS:
-            return self._recorder.warm_up(lambda: self._function(inputs, *self._fixed))
+            return self._recorder.warm_up(lambda: self._function(inputs, *agent))
         if self._replay is None:
             self._inputs = inputs.clone()
-            self._outputs, self._replay = self._record()
+            self._outputs, self._replay = self._record(*agent)
         else:
             self._inputs.update_(inputs)
         self._replay()
         return self._outputs.clone()
 
-    def _record(self) -> tuple[TensorDictBase, Callable[[], object]]:
+    def _record(self, *agent: object) -> tuple[TensorDictBase, Callable[[], object]]:
         try:
-            return self._recorder.record(lambda: self._function(self._inputs, *self._fixed))
+            return self._recorder.record(lambda: self._function(self._inputs, *agent))
         except RuntimeError as error:
             name = getattr(self._function, "__qualname__", self._function)
             raise RuntimeError(

@@ -98,7 +98,8 @@ class ActorCritic(TensorDictModuleBase):
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """The memory before the first step of a batch like this tensordict's, [*B]: zeros."""
-        batch, device = tensordict.batch_size, tensordict.device
+        # TorchRL's collector hands on tensordicts without a device.
+        batch, device = tensordict.batch_size, next(self.parameters()).device
         zeros = {key: torch.zeros(*batch, n, device=device) for key, n in self.memory.items()}
         return TensorDict(zeros, batch, device=device)
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.cuda._utils import _get_device_index
 
-from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, recorded
+from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, recorded, use
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.mazes import Level, planes
 from proposer_rl.mazes.evaluation import ExactEvaluator
@@ -48,6 +52,30 @@ def test_replays_equal_calls_and_run_no_python() -> None:
         assert (result == wanted).all()
     assert torch.equal(counter.total, plain.total)
     assert (plain.runs, counter.runs, tapes.recorded) == (6, WARM_UPS + 1, 1)
+
+
+def test_what_was_recorded_of_an_agent_ends_with_it() -> None:
+    captured = Captured(lambda td, layer: TensorDict({"y": layer(td["x"])}), Tapes())
+    layer = nn.Linear(3, 3)
+    with torch.no_grad():
+        for _ in range(WARM_UPS + 2):
+            captured(TensorDict({"x": torch.rand(2, 3)}), layer)
+    gone = weakref.ref(layer)
+    del layer
+    gc.collect()
+    assert gone() is None
+
+
+@pytest.mark.parametrize(("name", "current"), [("cuda:1", [1]), ("cuda", []), ("cpu", [])])
+def test_a_gpu_without_a_number_is_the_current_one(
+    name: str, current: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    # What torch.cuda.set_device does first, without a GPU.
+    monkeypatch.setattr(torch.cuda, "set_device", lambda d: made.append(_get_device_index(d)))
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", lambda _: None)
+    use(torch.device(name))
+    assert made == current
 
 
 def test_every_shape_and_every_object_has_a_recording_of_its_own() -> None:

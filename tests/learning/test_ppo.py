@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -25,9 +25,12 @@ from proposer_rl.learning.gradients import clip_gradients_
 from proposer_rl.learning.losses import MakeLoss
 from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.mazes import Level, MazeEnv, generate_levels
+from proposer_rl.mazes.view.env import ViewMazeEnv
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.maps import read_maps
+from proposer_rl.streams import Streams
 from tests.graphs import NoHostReads
+from tests.tiny import tiny_view_task
 
 P, T = 6, 12
 SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
@@ -481,13 +484,27 @@ class Crossings(TorchDispatchMode):
         return result
 
 
-def test_everything_in_an_update_stays_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the device ``meta``, which has shapes but no numbers and refuses to mix with another."""
+def seeing_all() -> PPO:
+    agent = map_actor_critic(Population(lambda: UNet(channels=(8, 16), groups=4), 1).to("meta"))
+    return PPO(MazeEnv(levels(1).to("meta"), max_steps=5), agent, SETTINGS)
+
+
+def remembering() -> PPO:
+    task = tiny_view_task()
+    ppo = task.learner([Streams(0)])
+    seen = task.target.sample(4, torch.Generator()).unsqueeze(0).to("meta")
+    return PPO(ViewMazeEnv(seen, max_steps=8), ppo.agent.to("meta"), ppo.settings)
+
+
+@pytest.mark.parametrize("make", [seeing_all, remembering])
+def test_everything_in_an_update_stays_on_the_device(
+    make: Callable[[], PPO], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the device ``meta``, which has shapes but no numbers; most of it mixes with no other."""
     # TorchRL compares bounds when it makes a spec; autocast does not know the device.
     monkeypatch.setattr(torch, "allclose", lambda *_, **__: True)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
-    agent = map_actor_critic(Population(lambda: UNet(channels=(8, 16), groups=4), 1).to("meta"))
-    ppo = PPO(MazeEnv(levels(1).to("meta"), max_steps=5), agent, SETTINGS)
+    ppo = make()
     ppo.update()  # constants are made, and moved there
     with Crossings() as crossings:
         rollout, metrics = ppo.update()
