@@ -222,6 +222,10 @@ WRONG_COMMANDS = [
         f"method/magic: unknown; choose one of: {METHODS}",
     ),
     (["+method=3"], "Config group override must be a string or a list. Got int"),
+    (
+        ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
+        "curriculum: proposer.action.ratio=joint: here each draw is paid by itself",
+    ),
     (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
     (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: medium, paper, quick, smoke"),
     (

@@ -270,6 +270,7 @@ def test_findings_without_their_methods_are_left_out(tmp_path: Path) -> None:
 
 def test_numbers_are_written_with_their_interval() -> None:
     assert write(-0.04, 1) == "0.0" and write(1234567) == "1,234,567" and write(None) == "–"
+    assert write(-3.14e-8) == "−3.1e−08" and write(0.0) == "0.000" and write(0.0005) == "0.001"
     assert write(Interval(-1.5, -2, 0.25), 2) == "−1.50 [−2.00, 0.25]"
     assert write(Interval(3, math.nan, math.nan), 1) == "3.0"
     assert write(Interval(0.5, 0.25, 0.75)) == "0.500 [0.250, 0.750]"
