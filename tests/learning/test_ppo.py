@@ -31,7 +31,7 @@ from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.maps import read_maps
 from proposer_rl.streams import Streams
 from tests.graphs import NoHostReads
-from tests.tiny import tiny_view_task
+from tests.tiny import TASK, tiny_view_task
 
 P, T = 6, 12
 SETTINGS = PPOSettings(horizon=T, epochs=3, max_grad_norm=0.5)
@@ -519,3 +519,16 @@ def test_everything_in_an_update_stays_on_the_device(
     assert crossings.count == 1  # the random numbers, which are drawn on the CPU
     leaves = [*rollout.values(True, True), *metrics.values()]
     assert {leaf.device.type for leaf in leaves} == {"meta"}
+
+
+def test_an_exact_evaluation_stays_on_the_device() -> None:
+    agent = TASK.learner([Streams(0)]).agent.to("meta")
+    measured = TASK.target.sample(6, torch.Generator()).to("meta")
+    with Crossings() as crossings:
+        found = [
+            TASK.performance(agent, measured, torch.Generator())["success"],
+            TASK.probe(agent, measured),
+            TASK.episode_law(agent, measured.unsqueeze(0)).probability,
+        ]
+    assert crossings.count == 0
+    assert {each.device.type for each in found} == {"meta"}
