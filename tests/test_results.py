@@ -12,7 +12,7 @@ import pytest
 
 from proposer_rl.report.findings import finding_table, findings
 from proposer_rl.report.outcomes import comparison_table, group_table, run_table
-from proposer_rl.report.runs import find_runs
+from proposer_rl.report.reading import find_runs
 from proposer_rl.report.studies import read_studies
 
 ROOT = Path(__file__).parents[1]

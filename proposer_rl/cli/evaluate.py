@@ -39,7 +39,8 @@ from proposer_rl.report.generalisation import (
     whole,
     write_scores,
 )
-from proposer_rl.report.runs import Run, begun, find_runs
+from proposer_rl.report.reading import begun, find_runs
+from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
 from proposer_rl.runs.checkpoint import CheckpointError
 from proposer_rl.runs.folder import write_atomically

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.report.runs import find_runs
+    from proposer_rl.report.reading import find_runs
 
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
     if options.pages is not None:

@@ -14,8 +14,8 @@ from proposer_rl.report import curves, levels, outcomes, page, proposals, single
 from proposer_rl.report.answer import Meanings, answer, glossary
 from proposer_rl.report.charts import charts
 from proposer_rl.report.findings import finding_table, findings
+from proposer_rl.report.reading import find_runs
 from proposer_rl.report.records import words
-from proposer_rl.report.runs import find_runs
 from proposer_rl.report.stages import stages
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render

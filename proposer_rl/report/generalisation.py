@@ -9,8 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.records import number, printable, words
-from proposer_rl.report.runs import Run, UnreadableRun
+from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, to_csv

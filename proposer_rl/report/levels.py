@@ -10,8 +10,9 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from proposer_rl.report.reading import read_run
 from proposer_rl.report.records import LevelRecord, SampleRecord, picture, words
-from proposer_rl.report.runs import Run, read_run
+from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import (
     SETTINGS,

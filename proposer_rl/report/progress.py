@@ -11,9 +11,10 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
+from proposer_rl.report.reading import FAILURE as FAILURE
+from proposer_rl.report.reading import UnreadableRun, begun, read_run
 from proposer_rl.report.records import LARGEST, LONGEST_TEXT, Text, checked, printable
-from proposer_rl.report.runs import FAILURE as FAILURE
-from proposer_rl.report.runs import Run, UnreadableRun, begun, read_run
+from proposer_rl.report.runs import Run
 from proposer_rl.runs.status import FILE, Activity
 
 

@@ -19,8 +19,9 @@ from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
 from proposer_rl.report.curves import draw_curve
+from proposer_rl.report.reading import read_run
 from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
-from proposer_rl.report.runs import Run, read_run, share_map
+from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.series import over_cycles
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import SETTINGS, UPDATES, Drawing, Panel, axes_of, finish

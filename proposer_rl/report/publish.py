@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from proposer_rl.report.build import OutputError
+from proposer_rl.report.reading import begun, find_runs, read_run
 from proposer_rl.report.records import anywhere
-from proposer_rl.report.runs import begun, find_runs, read_run
 from proposer_rl.runs.folder import read_jsonl, storage, write_atomically
 
 BULK = ("checkpoints", "curriculum.jsonl")  # what no copy has

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from proposer_rl.report.reading import UnreadableRun, read_run
 from proposer_rl.report.records import Column
-from proposer_rl.report.runs import Run, UnreadableRun, Waiting, read_run
+from proposer_rl.report.runs import Run, Waiting
 from proposer_rl.report.style import Look, looks
 
 USUAL_BASELINE = "domain_randomization"

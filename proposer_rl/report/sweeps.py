@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from proposer_rl.report.progress import recorded_activity
+from proposer_rl.report.reading import begun
 from proposer_rl.report.records import number
-from proposer_rl.report.runs import begun
 from proposer_rl.runs.status import FILE, duration
 
 PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder

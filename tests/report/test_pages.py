@@ -28,7 +28,7 @@ from proposer_rl.report.generalisation import (
 )
 from proposer_rl.report.own_findings import own_findings
 from proposer_rl.report.pages import CHOICE, CLAIMS
-from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing

@@ -10,7 +10,7 @@ import pytest
 
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import learning_curves
-from proposer_rl.report.runs import find_runs
+from proposer_rl.report.reading import find_runs
 from proposer_rl.report.studies import read_studies
 from tests.report.folders import LEVEL, cycle, write_run
 

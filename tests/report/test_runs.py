@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from proposer_rl.report import runs
+from proposer_rl.report import reading
 from proposer_rl.report.proposals import axis_means
-from proposer_rl.report.runs import UnreadableRun, Waiting, find_runs, read_run, share_map
+from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
+from proposer_rl.report.runs import Waiting, share_map
 from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 
@@ -222,7 +223,7 @@ def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
 
 def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_run(tmp_path / "run")
-    monkeypatch.setattr(runs, "LARGEST_FILE", 100)
+    monkeypatch.setattr(reading, "LARGEST_FILE", 100)
     with pytest.raises(UnreadableRun, match="is larger than"):
         read_run(folder)
 
@@ -238,7 +239,7 @@ def test_the_reader_is_independent_of_training() -> None:
     code = (
         "import sys, types, importlib\n"
         "package = types.ModuleType('proposer_rl')\n"
-        f"package.__path__ = [{str(Path(runs.__file__).parents[1])!r}]\n"
+        f"package.__path__ = [{str(Path(reading.__file__).parents[1])!r}]\n"
         "sys.modules['proposer_rl'] = package\n"
         "for name in ('cli.report', 'cli.watch', 'report.build'):\n"
         "    importlib.import_module('proposer_rl.' + name)\n"

@@ -12,7 +12,7 @@ from proposer_rl.report.comparisons import primary
 from proposer_rl.report.decision import ranking, spread
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.page import commands, incomplete
-from proposer_rl.report.runs import UnreadableRun
+from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.series import COSTS
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import TASK, cycle, write_run
