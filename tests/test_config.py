@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
+import resource
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -597,6 +599,18 @@ def smoke() -> dict[str, Any]:
     return found
 
 
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """What asks for many GiB is told so, where the system would end the process; on Linux."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if (taken := Path("/proc/self/statm")).exists():
+        now = int(taken.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (now + 4 * 2**30, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@pytest.mark.usefixtures("little_memory")
 @hypothesis.settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
