@@ -43,6 +43,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PYTHON",
         help="an interpreter that has jaxued: view measures its maze in JAX, too, on the CPU",
     )
+    parser.add_argument(
+        "--runs",
+        nargs="+",
+        default=[],
+        metavar="FOLDER",
+        help="with runs in them: curricula measures their methods, over whole cycles",
+    )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the paper's values throughout (longer)")
     size.add_argument("--tiny", action="store_true", help="only see that everything runs")

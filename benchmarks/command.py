@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import torch
 
+from benchmarks.curricula import read_methods
 from benchmarks.peer import require_jaxued
 from benchmarks.registry import BENCHMARKS, selected
 from benchmarks.report import describe, machine, summary, versions
@@ -103,7 +104,10 @@ def _options(arguments: argparse.Namespace) -> Options:
     size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
     if arguments.jaxued is not None:
         _check_jaxued(arguments.jaxued, arguments.names, device)
-    return Options(arguments.repeats, arguments.precision, device, size, arguments.jaxued)
+    if arguments.runs:
+        _check_runs(arguments.runs, arguments.names)
+    peers = (arguments.jaxued, arguments.runs)
+    return Options(arguments.repeats, arguments.precision, device, size, *peers)
 
 
 def _check_jaxued(python: str, names: list[str], device: str) -> None:
@@ -115,6 +119,15 @@ def _check_jaxued(python: str, names: list[str], device: str) -> None:
         require_jaxued(python)
     except ValueError as error:
         _refuse(f"--jaxued {python}: {error}; must be an interpreter that can import jaxued")
+
+
+def _check_runs(folders: list[str], names: list[str]) -> None:
+    if names != ["curricula"]:
+        _refuse(f"--runs: is for the benchmark curricula, not for {', '.join(names) or 'all'}")
+    try:
+        read_methods(folders)
+    except ValueError as error:
+        _refuse(f"--runs: {error}")
 
 
 def _list() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any, Literal
@@ -23,6 +24,7 @@ class Options:
         device: where the Solver and its levels live.
         size: ``tiny`` to see that everything runs, ``full`` for the paper's values throughout.
         jaxued: an interpreter that has jaxued, to be measured beside our view maze; None for none.
+        runs: folders of runs, whose methods are measured in place of those that one knows.
     """
 
     repeats: int = 5
@@ -30,6 +32,7 @@ class Options:
     device: str = "cpu"
     size: Size = "normal"
     jaxued: str | None = None
+    runs: Sequence[str] = ()
 
     @property
     def few(self) -> int:

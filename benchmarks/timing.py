@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import product
 
 import torch
+from tqdm import tqdm
 
 from benchmarks.results import Spread
 from proposer_rl.learning.cuda_graphs import WARM_UPS
@@ -35,11 +37,13 @@ def interleave(
     if warmup is None:
         warmup = 1 if torch.device(device).type == "cpu" else WARM_UPS + 1
     seconds: Timings = {name: [] for name in candidates}
-    for turn in range(warmup + repeats):
-        for name, candidate in candidates.items():
-            elapsed = time_once(candidate, device)
-            if turn >= warmup:
-                seconds[name].append(elapsed)
+    turns = [*product(range(warmup + repeats), candidates)]
+    bar = tqdm(turns, "timing", leave=False, disable=None)
+    for turn, name in bar:
+        bar.set_postfix_str(name)
+        elapsed = time_once(candidates[name], device)
+        if turn >= warmup:
+            seconds[name].append(elapsed)
     return seconds
 
 

@@ -13,6 +13,7 @@ import torch
 
 from benchmarks.__main__ import main
 from benchmarks.ceiling import convolutions
+from benchmarks.curricula import Training
 from benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
 from benchmarks.plain import PlainPPO, PlainUNet
 from benchmarks.plain_env import PlainMaze
@@ -23,7 +24,9 @@ from benchmarks.results import Options, Result, Row, Spread
 from benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from benchmarks.timing import interleave, ratio, threads
 from proposer_rl.mazes import MazeEnv, generate_levels
+from proposer_rl.report.timing import read_timing
 from proposer_rl.streams import Streams
+from tests.report.folders import write_run
 
 TRIED = Options(repeats=2, precision="fp32", size="tiny")
 
@@ -76,6 +79,7 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
         "device": "cuda" if torch.cuda.is_available() else "cpu",
         "size": "tiny",
         "jaxued": None,
+        "runs": [],
     }
     assert content["machine"]["cores"] and content["versions"]["torch"] == torch.__version__
     assert "error" in content["benchmarks"]["absent"]
@@ -104,6 +108,42 @@ def test_lists_the_benchmarks(bench, capsys) -> None:
 def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> None:
     assert bench(*arguments) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path) -> None:
+    for method in ("domain_randomization", "perf_gain"):
+        assert train(f"+method={method}", "+scale=smoke", f"hydra.run.dir=runs/{method}") == 0
+    assert bench("curricula", "--runs", "runs", "--repeats", "3", "--threads", "1") == 0
+    assert "a Solver update of perf_gain, Smoke scale" in capsys.readouterr().out
+    timing = read_timing(tmp_path / "bench.json")
+    assert set(timing.seconds) == {"domain_randomization", "perf_gain"}
+    assert timing.machine.endswith(", threads: 1")
+
+
+def test_a_cycle_has_its_updates_also_where_the_solver_becomes_a_copy() -> None:
+    """It has those of the copy then, and trains on no proposals of its own."""
+    for advance, proposals in {"train": 3, "best": 0}.items():
+        made = TINY.but(f"proposer.advance={advance}").made(TRIED)
+        training, asked = Training(made), []
+        propose = made.curriculum.propose
+        made.curriculum.propose = lambda *given: asked.append(1) or propose(*given)  # noqa: B023
+        training.cycle(3)
+        assert (training.count, len(asked)) == (3, proposals)
+
+
+def test_runs_that_cannot_be_timed_get_one_line(bench, capsys, tmp_path: Path) -> None:
+    write_run(tmp_path / "alone" / "a", "target", [0], [0.0, 0.5])
+    write_run(tmp_path / "two" / "a", "target", [0], [0.0, 0.5])
+    write_run(tmp_path / "two" / "b", "plr", [0], [0.0, 0.5])
+    for arguments, message in {
+        ("levels", "--runs", "two"): "is for the benchmark curricula, not for levels",
+        ("curricula", "--runs", "nowhere"): "nowhere: there is no such folder",
+        ("curricula", "--runs", "alone"): "the runs are of one method",
+        ("curricula", "--runs", "two"): "does not hold the settings of a run",
+    }.items():
+        assert bench(*arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: --runs: ") and message in line
 
 
 def test_long_benchmarks_run_on_request() -> None:

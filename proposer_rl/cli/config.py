@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.places import CONFIG_FOLDER, names
-from proposer_rl.runs.folder import storage
+from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ComputeSettings,
     HandMadeSettings,
@@ -170,10 +170,8 @@ def stored_config(file: Path) -> Any:
         ConfigError: if it is no JSON, or far too large to be settings.
         StorageError: if it cannot be read.
     """
-    with storage(file, "read"), open(file, "rb") as opened:
-        content = opened.read(LARGEST_FILE + 1)
     try:
-        return json.loads(content[:LARGEST_FILE])
+        return json.loads(read_bounded(file, LARGEST_FILE))
     except (ValueError, RecursionError):
         raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
 

@@ -32,8 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    if options.scores is not None and options.pages is None:
-        parser.error("--scores: only the pages of the docs take them up; give --pages, too")
+    for name in ("scores", "seconds"):
+        if getattr(options, name) is not None and options.pages is None:
+            parser.error(f"--{name}: only the pages of the docs take them up; give --pages, too")
     if options.publish is not None and (options.threshold, options.baseline) != (None, None):
         parser.error("--publish: copies runs, so neither --threshold nor --baseline has a meaning")
     command(partial(_run, options))
@@ -46,7 +47,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.pages is not None:
         from proposer_rl.report.pages import write_pages
 
-        asked = (options.threshold, options.baseline, options.scores)
+        asked = (options.threshold, options.baseline, options.scores, options.seconds)
         for page in write_pages(options.folder, options.pages, needs([CONFIG_FOLDER]), *asked):
             print(f"Page: {page}")
         return
@@ -113,6 +114,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="of these runs on further levels, as bin/eval writes them: for --pages",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=Path,
+        metavar="FILE",
+        help="of an update of each method, as bin/bench curricula --runs writes them: for --pages",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from proposer_rl.mazes import Level, shortest_path_length
 from proposer_rl.mazes.records import recorded_drawing
-from proposer_rl.runs.folder import storage, write_atomically
+from proposer_rl.runs.folder import read_bounded, write_atomically
 
 SUFFIXES = (".txt", ".json")
 RECORD = ".jsonl"  # of levels that a run trained on; read, not written
@@ -41,7 +41,7 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
     """
     path = Path(path)
     _check_suffix(path, (*SUFFIXES, RECORD))
-    content = read_content(path)
+    content = read_bounded(path, LARGEST_FILE)
     try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
         if path.suffix == ".json":
@@ -51,20 +51,6 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
         return levels_from_text(text, path.stem, kind)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def read_content(path: Path) -> bytes:
-    """All of a file that may come from anybody.
-
-    Raises:
-        ValueError: If it is larger than levels are.
-        StorageError: If it cannot be read.
-    """
-    with storage(path, "read"), open(path, "rb") as file:
-        content = file.read(LARGEST_FILE + 1)
-    if len(content) > LARGEST_FILE:
-        raise ValueError(f"{path}: is larger than {LARGEST_FILE:,} bytes")
-    return content
 
 
 def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> None:

@@ -64,12 +64,20 @@ def worst_levels(study: Study) -> Drawing | None:
 def cost_curves(study: Study) -> Drawing:
     """The headline against updates, and against what was paid for it with the curriculum's part."""
     name = words(study.headline)
+    seconds = (
+        "Seconds: of the whole process, evaluation included; where seeds were trained together, "
+        "an even share. Seconds can be compared only between runs on equal machines."
+    )
+    if study.timed:
+        seconds = (
+            "Seconds: updates times what one of the method takes, all methods timed in turns on "
+            f"one machine ({study.timed}), without measuring the Solver."
+        )
     return Drawing(
         "cost",
         f"The same {name} against updates and against its whole cost",
         "Frames: the Solver's own plus those that the curriculum spent, on copies or on scoring. "
-        "Seconds: of the whole process, evaluation included; where seeds were trained together, "
-        "an even share. Seconds can be compared only between runs on equal machines.",
+        + seconds,
         [
             _curve_panel(study, study.headline),
             *(

@@ -16,7 +16,7 @@ from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, to_csv
 from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.folder import storage
+from proposer_rl.runs.folder import read_bounded
 
 LARGEST_FILE = 2**24
 LONGEST_NAME = 80
@@ -56,12 +56,8 @@ def read_scores(file: Path) -> list[Score]:
         UnreadableRun: if the file holds something else.
         StorageError: if it cannot be read.
     """
-    with storage(file, "read"), file.open("rb") as opened:
-        content = opened.read(LARGEST_FILE + 1)
     try:
-        if len(content) > LARGEST_FILE:
-            raise ValueError("too large")
-        rows = csv.DictReader(io.StringIO(content.decode()))
+        rows = csv.DictReader(io.StringIO(read_bounded(file, LARGEST_FILE).decode()))
         return [
             Score(
                 row["run"],

@@ -31,6 +31,7 @@ from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
+from proposer_rl.report.timing import read_timing, timed
 
 CHOICE, CLAIMS = "which_curriculum.md", "claims.md"
 SCARCE = ("updates of the Solver", "environment frames", "seconds")
@@ -51,6 +52,7 @@ def write_pages(
     threshold: float | None = None,
     baseline: str | None = None,
     scores: Path | None = None,
+    seconds: Path | None = None,
 ) -> list[Path]:
     """Write the pages.
 
@@ -61,12 +63,14 @@ def write_pages(
         threshold: see :func:`~proposer_rl.report.build.write_report`.
         baseline: the same.
         scores: of the runs on further levels, as ``bin/eval`` writes them.
+        seconds: of the methods, as ``bin/bench curricula --runs`` writes them; None for what the
+            runs took.
 
     Returns:
         The pages.
 
     Raises:
-        UnreadableRun: if a folder has no run, or none can be read.
+        UnreadableRun: if a folder has no run, none can be read, or a file holds something else.
         OutputError: if the output folder holds something else, or the runs were not measured alike.
     """
     check_output(output, CHOICE)
@@ -77,12 +81,16 @@ def write_pages(
     (study,) = studies
     if scores is not None:
         check_names(study.runs)
-    more = [] if scores is None else ["--scores", str(scores)]
-    more += ["--pages", str(output)]
+    given = {"--scores": scores, "--seconds": seconds, "--pages": output}
+    more = [text for name, path in given.items() if path for text in (name, str(path))]
     command = page.report_command(folders, threshold, baseline, *more)
+    ranked = study if seconds is None else timed(study, read_timing(seconds))
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
-    pages = {CHOICE: _choice(study, needs, files), CLAIMS: _claims(study, needs, others, files)}
+    pages = {
+        CHOICE: _choice(ranked, needs, files),
+        CLAIMS: _claims(ranked, needs, others, files),
+    }
     for name, parts in pages.items():
         lines = [*parts, "## How this page is made", _origin(study, command, notes)]
         files[name] = ("\n\n".join(lines) + "\n").encode()
@@ -139,6 +147,15 @@ def _cell(choice: Choice) -> str:
 
 
 def _budgets(study: Study) -> str:
+    seconds = (
+        "Seconds hold for the machine below, and for what else it did: where runs of one method "
+        f"differ by more than {STEADY} times, none is chosen by them."
+    )
+    if study.timed:
+        seconds = (
+            "Seconds are updates times what an update of the method takes, all methods timed in "
+            f"turns on one machine ({study.timed}); measuring the Solver takes more."
+        )
     names = "; ".join(outcome.name for outcome in budgets(study).values())
     return (
         f"Ranked by {names}. The budget of frames and of seconds is what the run that cost least "
@@ -148,9 +165,7 @@ def _budgets(study: Study) -> str:
         "the better one must have learnt. A method that is not told apart from the best may be as "
         f"good. Brackets: 95 % intervals, from {FEWEST} seeds on. *No target*: the method is not "
         "told it; what is measured is success on it all the same. *Exact evaluation*: the task can "
-        "say how a Solver does on a level without playing it, with gradients. Seconds hold for the "
-        "machine below, and for what else it did: where runs of one method differ by more than "
-        f"{STEADY} times, none is chosen by them."
+        f"say how a Solver does on a level without playing it, with gradients. {seconds}"
     )
 
 

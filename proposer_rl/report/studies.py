@@ -70,12 +70,15 @@ class Study:
         groups: what is compared, by label.
         threshold: of the headline measurement.
         chosen: the label of the baseline that was asked for.
+        timed: the machine on which all methods were timed in turns; None where seconds are what the
+            runs took.
     """
 
     title: str
     groups: tuple[Group, ...]
     threshold: float
     chosen: str | None = None
+    timed: str | None = None
 
     @property
     def runs(self) -> list[Run]:

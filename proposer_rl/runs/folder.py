@@ -182,6 +182,20 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
             _sync_folder(path.parent)
 
 
+def read_bounded(path: Path, largest: int) -> bytes:
+    """A file that may come from anybody.
+
+    Raises:
+        ValueError: if it has more than ``largest`` bytes.
+        StorageError: if it cannot be read.
+    """
+    with storage(path, "read"), open(path, "rb") as file:
+        content = file.read(largest + 1)
+    if len(content) > largest:
+        raise ValueError(f"{path}: is larger than {largest:,} bytes")
+    return content
+
+
 @contextmanager
 def storage(path: Path, action: str = "write") -> Iterator[None]:
     """Names the file in whatever error of the operating system arises inside.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ import pandas as pd
 import pytest
 from scipy import integrate
 
+from benchmarks.results import Result, Row, Spread
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
@@ -33,11 +35,13 @@ from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing
 from proposer_rl.report.tables import escape_markdown, write
+from proposer_rl.report.timing import read_timing, timed
 from tests.report.folders import TASK, cycle, write_rockets, write_run
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "findings"
 NEEDS = needs([CONFIG_FOLDER])
+NOTHING = "no target, episodes alone"
 SEEDS = 5
 FLAT, SLOW = [0.0] * 6, [0.0, 0.0, 0.05, 0.3, 0.5, 0.6]
 FAST, FASTEST = [0.0, 0.4, 0.7, 0.85, 0.9, 0.9], [0.0, 0.8, 0.9, 0.95, 0.95, 0.95]
@@ -272,6 +276,61 @@ def test_other_levels_are_told_by_method(runs: Path, tmp_path: Path) -> None:
         read_scores(tmp_path / "scores.csv")
 
 
+def seconds_file(file: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
+    """As ``bin/bench curricula --runs`` writes them."""
+    row = Row("an update", "of another", Spread.of([2.0]), "x", samples=dict(seconds))
+    measured = {"threads": 3, "result": Result([row]).to_json()}
+    content = {"machine": {"processor": "abacus"}, "benchmarks": {"curricula": measured}}
+    file.write_text(json.dumps(content), encoding="utf-8")
+    return file
+
+
+def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
+    """Whatever the runs took: half as good at a fifth of the time is better by seconds."""
+    write_methods(tmp_path / "runs", {"plr": FAST, "accel": [value / 2 for value in FASTEST]})
+    table = pd.read_csv(slow := tmp_path / "runs" / "accel_2" / "metrics.csv")
+    table["seconds"] *= 9
+    table.to_csv(slow, index=False)
+    times = {"plr": [4.0, 5.0, 60.0], "accel": [1.0, 0.5, 1.5]}
+    file = seconds_file(tmp_path / "seconds.json", times)
+    study = timed(study_of(tmp_path / "runs"), read_timing(file))
+    for run in study.runs:
+        medians = {"plr": 5.0, "accel": 1.0}
+        assert run.own_seconds.tolist() == [
+            medians[run.method] * updates for updates in run.metrics["updates"]
+        ]
+    best = [choice and choice.best.label for choice in choices(study, NEEDS)[NOTHING].values()]
+    assert best[::2] == ["plr", "accel"]
+    main([str(tmp_path / "runs"), "--pages", str(tmp_path / "pages"), "--seconds", str(file)])
+    text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
+    assert "turns on one machine (abacus, threads: 3)" in text
+    assert "--seconds seconds.json --pages pages" in text and "**accel**" in text
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ({"plr": [1.0]}, "--seconds: has none of 'accel', but of: plr"),
+        ({"plr": [0.0], "accel": [1.0]}, "holds no seconds of methods"),
+        ({"plr": [], "accel": [1.0]}, "holds no seconds of methods"),
+        ({"plr": ["1"], "accel": [1.0]}, "holds no seconds of methods"),
+        ({}, "holds no seconds of methods"),
+        (None, "holds no seconds of methods"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")
+def test_wrong_seconds_get_one_line(times, message: str, tmp_path: Path, capsys) -> None:
+    write_methods(tmp_path / "runs", {"plr": FAST, "accel": SLOW}, seeds=1)
+    file = seconds_file(tmp_path / "seconds.json", times or {})
+    if times is None:
+        file.write_text("seconds")
+    with pytest.raises(SystemExit) as end:
+        main([str(tmp_path / "runs"), "--pages", str(tmp_path / "pages"), "--seconds", str(file)])
+    assert end.value.code == 2 and not (tmp_path / "pages").exists()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and message in line
+
+
 def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Path, capsys) -> None:
     write_rockets(tmp_path / "rockets", "target", 0)
     (tmp_path / "mine").mkdir()
@@ -325,6 +384,7 @@ def test_the_committed_pages_come_out_of_the_published_runs(
     monkeypatch.chdir(ROOT)
     medium = Path("results", "medium")
     folders = [str(medium / "runs"), "--scores", str(medium / "scores.csv")]
+    folders += ["--seconds", str(medium / "seconds.json")]
     main([*folders, "--pages", str(tmp_path / "again")])
     for name in (CHOICE, CLAIMS):
         before, after = (

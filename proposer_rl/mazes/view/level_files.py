@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proposer_rl.mazes.level_files import (
+    LARGEST_FILE,
     RECORD,
     named_levels,
-    read_content,
     read_levels,
 )
 from proposer_rl.mazes.levels import FREE, WALL, drawn_rows
@@ -24,6 +24,7 @@ from proposer_rl.mazes.levels import GOAL as GOAL_MARK
 from proposer_rl.mazes.view.env import EMPTY, GOAL
 from proposer_rl.mazes.view.env import WALL as WALL_NUMBER
 from proposer_rl.mazes.view.levels import AGENTS, ViewLevel
+from proposer_rl.runs.folder import read_bounded
 
 SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
 FLOOR, AGENT = 3, 10  # MiniGrid's numbers of further objects
@@ -52,7 +53,7 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path}: must end in one of {', '.join(SUFFIXES)}")
-    content = read_content(path)
+    content = read_bounded(path, LARGEST_FILE)
     encoded = path.suffix == ".npy"
     if path.suffix == ".json":
         encoded = content.lstrip().startswith(b"[")
