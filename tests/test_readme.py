@@ -23,7 +23,7 @@ from proposer_rl.cli.watch import main as watch_main
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.generalisation import write_scores
 from tests.gymnasium_task.toys import TINY
-from tests.report.folders import write_run
+from tests.report.folders import write_run, write_seconds
 
 DOCS = Path(__file__).parents[1] / "docs"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -123,6 +123,8 @@ def test_the_commands_about_runs_run(
             scores = Path(arguments[arguments.index("--scores") + 1])
             scores.parent.mkdir(parents=True, exist_ok=True)
             scores.write_bytes(write_scores([]))
+        if "--seconds" in arguments:
+            write_seconds(Path(arguments[arguments.index("--seconds") + 1]), {"target": [1.0]})
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
 
 

@@ -7,13 +7,14 @@ import gzip
 import io
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from benchmarks.results import Result, Row, Spread
 from proposer_rl.runs.folder import RunFolder
 
 EVERY = 10  # updates between two evaluations
@@ -168,3 +169,12 @@ def page_data(page: Path) -> list[dict[str, Any]]:
 def write_jsonl(path: Path, lines: Sequence[Any]) -> None:
     """Lines in place of those of a file."""
     path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+
+def write_seconds(file: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
+    """As ``bin/bench curricula --runs`` writes them."""
+    row = Row("an update", "of another", Spread.of([2.0]), "x", samples=dict(seconds))
+    measured = {"threads": 3, "result": Result([row]).to_json()}
+    content = {"machine": {"processor": "abacus"}, "benchmarks": {"curricula": measured}}
+    file.write_text(json.dumps(content), encoding="utf-8")
+    return file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,6 @@ import pandas as pd
 import pytest
 from scipy import integrate
 
-from benchmarks.results import Result, Row, Spread
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main
@@ -36,7 +34,7 @@ from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing
 from proposer_rl.report.tables import escape_markdown, write
 from proposer_rl.report.timing import read_timing, timed
-from tests.report.folders import TASK, cycle, write_rockets, write_run
+from tests.report.folders import TASK, cycle, write_rockets, write_run, write_seconds
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "findings"
@@ -276,15 +274,6 @@ def test_other_levels_are_told_by_method(runs: Path, tmp_path: Path) -> None:
         read_scores(tmp_path / "scores.csv")
 
 
-def seconds_file(file: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
-    """As ``bin/bench curricula --runs`` writes them."""
-    row = Row("an update", "of another", Spread.of([2.0]), "x", samples=dict(seconds))
-    measured = {"threads": 3, "result": Result([row]).to_json()}
-    content = {"machine": {"processor": "abacus"}, "benchmarks": {"curricula": measured}}
-    file.write_text(json.dumps(content), encoding="utf-8")
-    return file
-
-
 def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     """Whatever the runs took: half as good at a fifth of the time is better by seconds."""
     write_methods(tmp_path / "runs", {"plr": FAST, "accel": [value / 2 for value in FASTEST]})
@@ -292,7 +281,7 @@ def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     table["seconds"] *= 9
     table.to_csv(slow, index=False)
     times = {"plr": [4.0, 5.0, 60.0], "accel": [1.0, 0.5, 1.5]}
-    file = seconds_file(tmp_path / "seconds.json", times)
+    file = write_seconds(tmp_path / "seconds.json", times)
     study = timed(study_of(tmp_path / "runs"), read_timing(file))
     for run in study.runs:
         medians = {"plr": 5.0, "accel": 1.0}
@@ -321,7 +310,7 @@ def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")
 def test_wrong_seconds_get_one_line(times, message: str, tmp_path: Path, capsys) -> None:
     write_methods(tmp_path / "runs", {"plr": FAST, "accel": SLOW}, seeds=1)
-    file = seconds_file(tmp_path / "seconds.json", times or {})
+    file = write_seconds(tmp_path / "seconds.json", times or {})
     if times is None:
         file.write_text("seconds")
     with pytest.raises(SystemExit) as end:
