@@ -100,10 +100,10 @@ export async function save(event) {
   try {
     const { text } = await ask("file", { name, rows: state.level.rows });
     const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([text], { type: "text/plain" }));
+    // Not the URL of a blob: a busy browser fetches it after it was revoked, and saves nothing.
+    link.href = `data:text/plain;charset=utf-8,${encodeURIComponent(text)}`;
     link.download = `${name.replace(/[^\w-]+/g, "_")}.txt`;
     link.click();
-    URL.revokeObjectURL(link.href);
     trouble("file", "");
   } catch (error) {
     trouble("file", error.message);
