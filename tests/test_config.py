@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
-from proposer_rl.cli.errors import UNFORESEEN, exit_code
+from proposer_rl.cli.errors import UNFORESEEN, exit_code, lacks_memory
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
@@ -599,6 +599,21 @@ def smoke() -> dict[str, Any]:
     return found
 
 
+def test_a_run_that_runs_out_of_memory_says_so_in_one_line(train, monkeypatch, capsys) -> None:
+    def measure(*_: object) -> None:
+        raise RuntimeError("[enforce fail] can't allocate memory:\nyou tried to allocate 9 bytes")
+
+    monkeypatch.setattr("proposer_rl.mazes.task.MazeTask.measure", measure)
+    assert train("+method=target", *SMOKE) == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .startswith(
+            "error: the run does not fit in memory: [enforce fail] can't allocate memory: you tried"
+        )
+    )
+
+
 @pytest.fixture
 def little_memory() -> Iterator[None]:
     """What asks for many GiB is told so, where the system would end the process; on Linux."""
@@ -641,6 +656,9 @@ def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
     except Exception as error:
         if exit_code(error) == UNFORESEEN:
             raise
+        if lacks_memory(error):  # perhaps only when it measured
+            hypothesis.event("does not fit in memory")
+            return
         hypothesis.event("refused")
         assert not isinstance(error, OSError), repr(error)
         assert str(error).strip()

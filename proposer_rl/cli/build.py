@@ -60,10 +60,6 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
         raise
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "allocate" not in str(error):
-            raise
-        raise ConfigError(f"the run does not fit in memory: {one_line(error)}") from error
 
 
 def build(

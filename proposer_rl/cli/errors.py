@@ -38,8 +38,16 @@ def refuse(error: Exception) -> NoReturn:
 
 def exit_code(error: BaseException) -> int:
     """The exit code that an error stands for."""
+    if lacks_memory(error):
+        return BAD_INPUT
     storage = STORAGE if isinstance(error, OSError) else UNFORESEEN
     return int(getattr(error, "exit_code", storage))
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether there was not as much memory as was asked for, on the CPU or a GPU."""
+    torchs = isinstance(error, RuntimeError) and "allocate" in str(error)
+    return torchs or isinstance(error, MemoryError)
 
 
 def one_line(error: BaseException) -> str:
@@ -47,4 +55,6 @@ def one_line(error: BaseException) -> str:
     text = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         text = f"cannot use {error.filename}: {error.strerror}"
+    if lacks_memory(error):
+        text = f"the run does not fit in memory: {text}"
     return "".join(c for c in " ".join(text.split()) if c.isprintable())
