@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="FOLDER",
-        help="with runs in them: curricula measures their methods, over whole cycles",
+        help="with runs in them: curricula times their methods in whole cycles and their precision",
     )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the paper's values throughout (longer)")

@@ -13,6 +13,7 @@ from typing import Any
 
 import hypothesis
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hypothesis import HealthCheck, given
@@ -599,19 +600,35 @@ def smoke() -> dict[str, Any]:
     return found
 
 
-def test_a_run_that_runs_out_of_memory_says_so_in_one_line(train, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            RuntimeError("[enforce fail] can't allocate memory:\nyou tried to allocate 9 bytes"),
+            "[enforce fail] can't allocate memory: you tried to allocate 9 bytes",
+        ),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB. GPU 0 has 8 GiB."),
+            "CUDA out of memory. Tried to allocate 9 GiB. GPU 0 has 8 GiB.",
+        ),
+        (MemoryError("9 GiB"), "9 GiB"),
+    ],
+)
+def test_a_run_that_runs_out_of_memory_says_so_in_one_line(
+    error, said, train, monkeypatch, capsys
+) -> None:
     def measure(*_: object) -> None:
-        raise RuntimeError("[enforce fail] can't allocate memory:\nyou tried to allocate 9 bytes")
+        raise error
 
     monkeypatch.setattr("proposer_rl.mazes.task.MazeTask.measure", measure)
     assert train("+method=target", *SMOKE) == 2
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .startswith(
-            "error: the run does not fit in memory: [enforce fail] can't allocate memory: you tried"
-        )
-    )
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == f"error: the run does not fit in memory: {said}"
+
+
+def test_a_defect_that_speaks_of_memory_keeps_its_traceback() -> None:
+    error = RuntimeError("the buffer is allocated on another device")
+    assert exit_code(error) == UNFORESEEN
 
 
 @pytest.fixture

@@ -46,7 +46,8 @@ def exit_code(error: BaseException) -> int:
 
 def lacks_memory(error: BaseException) -> bool:
     """Whether there was not as much memory as was asked for, on the CPU or a GPU."""
-    torchs = isinstance(error, RuntimeError) and "allocate" in str(error)
+    # No word that a defect might use, too: that must keep its traceback.
+    torchs = isinstance(error, RuntimeError) and "tried to allocate" in str(error).lower()
     return torchs or isinstance(error, MemoryError)
 
 
