@@ -135,8 +135,10 @@ def test_a_failed_run_is_listed_and_tried_again(
     assert "failed: 0_target_seed_0: the disk is on fire" in printed.out
     assert "2 runs: 1 finished, 1 failed" in printed.out
     assert "Traceback" in printed.err and "error: the disk is on fire" in printed.err
+    assert train("-m", "+method=hand_made", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 0
+    assert "4 runs: 3 finished, 1 failed" in capsys.readouterr().out  # not in the second sweep
     assert train(*sweep) == 0
-    assert "2 runs: 2 finished" in capsys.readouterr().out
+    assert "4 runs: 4 finished" in capsys.readouterr().out
     assert not list(Path("all").rglob("error.json"))
 
 

@@ -6,7 +6,6 @@ One run's are told level by level, those of several by their means, as a table o
 from __future__ import annotations
 
 import argparse
-import csv
 import io
 import math
 import sys
@@ -42,6 +41,7 @@ from proposer_rl.report.generalisation import (
 from proposer_rl.report.reading import begun, find_runs
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
+from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.checkpoint import CheckpointError
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.pictures import pixels
@@ -107,7 +107,9 @@ def _one(options: argparse.Namespace) -> None:
     found = evaluate(load(checkpoint), name, options.max_steps)
     _print(found)
     if options.output is not None and options.output.suffix == ".csv":
-        write_atomically(options.output, _csv(found.rows()))
+        rows = found.rows()
+        table = to_csv(list(rows[0]), [list(row.values()) for row in rows])
+        write_atomically(options.output, table.encode())
     else:
         write_rows(found.rows(), options.output)
     if options.pictures is not None:
@@ -261,14 +263,6 @@ def _on_distribution(
 
 def _picture(task: Task, level: Any) -> NDArray[np.uint8]:
     return pixels(task.record(level, None)[0]["picture"])
-
-
-def _csv(rows: list[dict[str, Any]]) -> bytes:
-    file = io.StringIO(newline="")
-    writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue().encode()
 
 
 def _print(found: Evaluation) -> None:

@@ -33,8 +33,15 @@ LARGEST_PLAN, MOST_RUNS = 2**20, 10_000
 class SweepSummary(Callback):
     """Says after each run what is left of a sweep, and lists its runs when it is over.
 
-    The exit code is that of a failed run.
+    The exit code is that of a run that failed in it; other sweeps may have the same folder.
     """
+
+    def __init__(self) -> None:
+        self._failed_before: dict[Path, int] = {}
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra before the first run."""
+        self._failed_before = _failures(config)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
         """Called by Hydra after every run, of a sweep or not."""
@@ -48,10 +55,10 @@ class SweepSummary(Callback):
         """Called by Hydra after the last run, whatever became of the runs."""
         found = find_progress(Path(config.hydra.sweep.dir))
         Console().print(overview(found))
-        codes = [_exit_code(progress.folder) for progress in found]
-        if any(codes):
+        failed = _failures(config).items() - self._failed_before.items()
+        if failed:
             # Hydra turns an exception of a callback into a warning, but lets an exit through.
-            sys.exit(max(codes))
+            sys.exit(max(int(json.loads(file.read_text())["exit_code"]) for file, _ in failed))
 
 
 def planned(folder: Path) -> list[tuple[str, ...]]:
@@ -110,6 +117,7 @@ def record_failure(folder: Path, error: Exception, message: str, exit_code: int)
     return math.nan
 
 
-def _exit_code(folder: Path) -> int:
-    path = folder / FAILURE
-    return int(json.loads(path.read_text())["exit_code"]) if path.is_file() else 0
+def _failures(config: DictConfig) -> dict[Path, int]:
+    """What is recorded of failed runs in a sweep's folder, and when it was written."""
+    folder = Path(config.hydra.sweep.dir)
+    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

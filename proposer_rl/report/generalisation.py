@@ -14,7 +14,7 @@ from proposer_rl.report.records import number, printable, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.tables import Cell, Table, to_csv
+from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
 from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import read_bounded
 
@@ -60,10 +60,10 @@ def read_scores(file: Path) -> list[Score]:
         rows = csv.DictReader(io.StringIO(read_bounded(file, LARGEST_FILE).decode()))
         return [
             Score(
-                row["run"],
+                from_csv(row["run"]),
                 int(row["seed"]),
                 int(row["updates"]),
-                stored_name(row["levels"]),
+                stored_name(from_csv(row["levels"])),
                 int(row["size"]),
                 number(float(row["success"] or "nan")),
                 number(float(row["returns"] or "nan")),

@@ -67,7 +67,7 @@ def _places(folders: Sequence[Path]) -> dict[Path, Path]:
 def _check(output: Path) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the runs")
-    for path in sorted(output.iterdir()) if output.is_dir() else ():
+    for path in sorted(output.glob("[!.]*")):
         if not path.is_dir() or not any(begun(path)):
             raise OutputError(f"{output}: has {path.name} in it, which is no run; give another")
 

@@ -59,7 +59,9 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 
 def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Folders of runs in a folder, or itself, with names of their files; links are not followed.
+    """Folders of runs in a folder, or itself, with names of their files.
+
+    Links are not followed, hidden folders not looked into.
 
     Raises:
         UnreadableRun: if there is no such folder, or there are too many in it.
@@ -70,7 +72,8 @@ def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
         if seen > MOST_FOLDERS:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
         path = Path(root)
-        names.sort()
+        # Hidden are those of a run that is being published.
+        names[:] = sorted(name for name in names if not name.startswith("."))
         if "config.json" in files:
             names.clear()
         if {"config.json", FAILURE} & set(files):

@@ -7,8 +7,9 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from collections.abc import Hashable, Mapping
+from functools import cache
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,9 @@ class TaskFacts(BaseModel):
     exact: bool | None = None
 
 
+_adapter = cache(TypeAdapter)  # making one takes longer than checking a value
+
+
 def checked(kind: type[T], value: Any, where: str) -> T:
     """A value from a file as it should be.
 
@@ -110,7 +114,7 @@ def checked(kind: type[T], value: Any, where: str) -> T:
         ValueError: with the place of the first thing that is not so.
     """
     try:
-        return TypeAdapter(kind).validate_python(value, strict=True)
+        return cast(T, _adapter(cast(Hashable, kind)).validate_python(value, strict=True))
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
         place = ".".join(map(str, first["loc"]))

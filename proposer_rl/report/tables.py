@@ -11,6 +11,9 @@ from typing import Any
 
 from proposer_rl.report.statistics import Interval
 
+# A spreadsheet takes text that begins like this for a formula.
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
 Cell = str | int | float | Interval | None
 
 
@@ -76,6 +79,11 @@ def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return file.getvalue()
 
 
+def from_csv(text: str) -> str:
+    """A text as it was before :func:`to_csv` kept spreadsheets from taking it for a formula."""
+    return text[1:] if text.startswith(tuple(f"'{begin}" for begin in FORMULA)) else text
+
+
 def write(cell: Cell, digits: int | None = None) -> str:
     """A cell as a reader sees it.
 
@@ -110,5 +118,4 @@ def escape_markdown(text: str) -> str:
 def _csv_cell(cell: Any) -> Any:
     if isinstance(cell, float):
         return "" if math.isnan(cell) else f"{cell:.6g}"
-    # A spreadsheet takes text that begins like this for a formula.
-    return f"'{cell}" if isinstance(cell, str) and cell[:1] in "=+-@\t\r" and cell else cell
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell

@@ -10,8 +10,9 @@ import pytest
 
 from proposer_rl.cli.report import main
 from proposer_rl.report.curves import learning_curves
-from proposer_rl.report.reading import find_runs
+from proposer_rl.report.reading import begun, find_runs
 from proposer_rl.report.studies import read_studies
+from proposer_rl.runs.folder import write_atomically
 from tests.report.folders import LEVEL, cycle, write_run
 
 SECRET = "/home/somebody/code"
@@ -114,6 +115,28 @@ def test_published_runs_are_added_to_and_replaced(runs: Path, tmp_path: Path) ->
     changed = {name.partition("/")[0] for name in before if after.get(name) != before[name]}
     assert changed == {"target_0"}
     assert "target_0/levels.jsonl" not in after  # nothing of the former run is left
+
+
+@pytest.mark.parametrize("done", [1, 5])
+def test_a_copy_that_was_broken_off_is_no_run_and_made_again(
+    done: int, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def interrupted(path: Path, content: bytes) -> None:
+        if len(written) == done:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_atomically(path, content)
+
+    light = tmp_path / "light"
+    with monkeypatch.context() as patch:
+        patch.setattr("proposer_rl.report.publish.write_atomically", interrupted)
+        with pytest.raises(SystemExit):
+            main([str(runs), "--publish", str(light)])
+    assert written[0].parent.is_dir() and not list(begun(light))
+    published(runs, light)
+    assert len(find_runs([light])) == 10 and not list(light.glob(".*"))
 
 
 def test_runs_lie_as_they_did_below_the_folder_that_was_named(tmp_path: Path) -> None:
