@@ -206,7 +206,6 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         found = alignment(
             learner.agent,
             self._direction,
-            learner.settings.learning_rate,
             lambda: surrogate(learner.agent, rollout, advantage),
         ).to(score)
         means, counts = means_of_bins(self._choices, found, score.shape[-1])
