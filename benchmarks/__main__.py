@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.arguments import number
+from proposer_rl.cli.errors import command
 
 
 def main() -> None:
-    """Entry point; :func:`benchmarks.command.answer` has the exit codes."""
-    arguments = _parser().parse_args()
+    """Entry point; 1 if a benchmark failed, else the exit codes are those of ``cli/errors.py``."""
+    command(partial(_answer, _parser().parse_args()))
+
+
+def _answer(arguments: argparse.Namespace) -> None:
     from benchmarks.command import answer
 
     answer(arguments)

@@ -20,30 +20,35 @@ from benchmarks.registry import BENCHMARKS, selected
 from benchmarks.report import describe, machine, summary, versions
 from benchmarks.results import Options, Result, Size
 from benchmarks.worker import BenchmarkFailed, run_apart
+from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import SIGNALLED
 from proposer_rl.runs.folder import write_atomically
 
 FAILED = 1
-BAD_INPUT = 2
-INTERRUPTED = 130
-TERMINATED = 143
+TERMINATED = SIGNALLED + signal.SIGTERM
 
 
 def answer(arguments: argparse.Namespace) -> None:
-    """Ends with 0 if all was measured, 1 if a benchmark failed, 2 for bad input."""
+    """Ends with 0 if all was measured, 1 if a benchmark failed.
+
+    Raises:
+        ConfigError: for bad input.
+        StorageError: if the results cannot be written.
+    """
     if arguments.list:
         _list()
         return
     unknown = [name for name in arguments.names if name not in BENCHMARKS]
     if unknown:
-        _refuse(f"unknown benchmark {unknown[0]!r}; choose among: {', '.join(BENCHMARKS)}")
+        raise ConfigError(
+            f"unknown benchmark {unknown[0]!r}; choose among: {', '.join(BENCHMARKS)}"
+        )
     if not arguments.output.parent.is_dir():
-        _refuse(f"--output: there is no folder {arguments.output.parent}")
+        raise ConfigError(f"--output: there is no folder {arguments.output.parent}")
     # Told to end, it ends the benchmark's process too.
     before = signal.signal(signal.SIGTERM, _terminated)
     try:
         sys.exit(run(arguments.names, _options(arguments), arguments.threads, arguments.output))
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -75,15 +80,15 @@ def run(names: list[str], options: Options, threads: int | None, output: Path) -
         try:
             measured = run_apart(name, options, threads)
         except BenchmarkFailed as failure:
-            content["benchmarks"][name] = {"error": str(failure)}
+            measured = {"error": str(failure)}
             _say(f"{place}: failed\n{failure}")
-            continue
+        else:
+            results.append(Result.from_json(measured["result"]))
+            memory = f"{measured['peak_memory'] / 2**20:,.0f} MiB at most"
+            _say(f"{place}: {measured['seconds']:.1f} s, {memory}")
         content["benchmarks"][name] = measured
-        results.append(Result.from_json(measured["result"]))
-        memory = f"{measured['peak_memory'] / 2**20:,.0f} MiB at most"
-        _say(f"{place}: {measured['seconds']:.1f} s, {memory}")
-    content["seconds"] = time.perf_counter() - start
-    write_atomically(output, json.dumps(content, indent=1).encode())
+        content["seconds"] = time.perf_counter() - start
+        write_atomically(output, json.dumps(content, indent=1).encode())
     details = [text for result in results if (text := describe(result))]
     rows = [summary(results)] if any(result.rows for result in results) else []
     print("\n\n".join([*details, *rows]))
@@ -100,7 +105,7 @@ def _options(arguments: argparse.Namespace) -> Options:
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        _refuse(f"--device {device}: {str(error).splitlines()[0]}")
+        raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from error
     size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
     if arguments.jaxued is not None:
         _check_jaxued(arguments.jaxued, arguments.names, device)
@@ -112,22 +117,30 @@ def _options(arguments: argparse.Namespace) -> Options:
 
 def _check_jaxued(python: str, names: list[str], device: str) -> None:
     if names and "view" not in names:
-        _refuse(f"--jaxued {python}: is for the benchmark view, not for {', '.join(names)}")
+        raise ConfigError(
+            f"--jaxued {python}: is for the benchmark view, not for {', '.join(names)}"
+        )
     if torch.device(device).type != "cpu":
-        _refuse(f"--jaxued {python}: JAX is measured on the CPU; give --device cpu, not {device}")
+        raise ConfigError(
+            f"--jaxued {python}: JAX is measured on the CPU; give --device cpu, not {device}"
+        )
     try:
         require_jaxued(python)
     except ValueError as error:
-        _refuse(f"--jaxued {python}: {error}; must be an interpreter that can import jaxued")
+        raise ConfigError(
+            f"--jaxued {python}: {error}; must be an interpreter that can import jaxued"
+        ) from error
 
 
 def _check_runs(folders: list[str], names: list[str]) -> None:
     if names != ["curricula"]:
-        _refuse(f"--runs: is for the benchmark curricula, not for {', '.join(names) or 'all'}")
+        raise ConfigError(
+            f"--runs: is for the benchmark curricula, not for {', '.join(names) or 'all'}"
+        )
     try:
         read_methods(folders)
     except ValueError as error:
-        _refuse(f"--runs: {error}")
+        raise ConfigError(f"--runs: {error}") from error
 
 
 def _list() -> None:
@@ -143,11 +156,6 @@ def _list() -> None:
 
 def _terminated(*_: object) -> NoReturn:
     sys.exit(TERMINATED)
-
-
-def _refuse(message: str) -> NoReturn:
-    _say(f"error: {message}")
-    sys.exit(BAD_INPUT)
 
 
 def _say(message: str) -> None:

@@ -56,7 +56,7 @@ def environment_steps(options: Options) -> Result:
             ),
             Row(
                 f"speed of {interface}",
-                "Gymnasium's SyncVectorEnv",
+                "SyncVectorEnv, a plain Python maze",
                 ratio(seconds["Gymnasium"], seconds["TorchRL"], steps / few),
                 "x",
             ),

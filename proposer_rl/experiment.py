@@ -212,7 +212,7 @@ class Experiment:
             self._measure()
             self._record(outcome.advance.levels, outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
-        self._pause(due=bool(outcome.metrics))
+        self._pause(due=bool(outcome.metrics or outcome.frames))
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)

@@ -245,10 +245,10 @@ class ScoringTask(Protocol):
     """A task with named levels: files of them, sets that come along.
 
     Attributes:
-        levels_help: for ``--levels``, what there is; the first word is the default.
+        default_levels: name of the set that is taken where none is named.
     """
 
-    levels_help: str
+    default_levels: str
 
     def scores(self, agent: ActorCritic, name: str, max_steps: int | None) -> Sequence[Score]:
         """How K Solvers do on each level of a set, in the set's order.

@@ -216,9 +216,14 @@ WRONG = [
         "'my_parts'; if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
     ),
     ("curriculum._target_=os.system", "curriculum: Target 'os.system' is blocklisted"),
-    ("+curriculum.x=1", "curriculum: target has no setting 'x'"),
+    ("+curriculum.x=1", "curriculum: method=target has no setting 'x'"),
 ]
 WRONG_COMMANDS = [
+    (["+method=target", "seeds=0"], "seeds=0: input should be a valid array"),
+    (
+        ["task=cartpole", "+method=target", "+scale=medium"],
+        "+scale=medium: is of task=maze; task=cartpole has numbers of its own",
+    ),
     ([], f"method: missing; choose one with +method=NAME, NAME one of: {METHODS}"),
     (
         ["+method=magic"],
@@ -243,7 +248,7 @@ WRONG_COMMANDS = [
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
     (["+method=hand_made", "hand_made.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (["+method=hand_made", "hand_made.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
-    (["+method=perf_gain", "+curriculum.x=1"], "curriculum: proposer has no setting 'x'"),
+    (["+method=perf_gain", "+curriculum.x=1"], "curriculum: method=perf_gain has no setting 'x'"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),
     (
         ["+method=perf_gain", "+ablation=meta_episode_length_10", "+scale=quick"],
@@ -265,7 +270,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=plr", *SMOKE, "+choose=learnability"],
-        "curriculum: ReplayCurriculum has no setting 'choose'",
+        "curriculum: method=plr has no setting 'choose'",
     ),
     (
         ["+method=target", *SMOKE, "curriculum.choose={times: 4}"],
@@ -310,7 +315,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
-        "curriculum: task_difficulty has no setting 'reward'",
+        "curriculum: method=task_difficulty has no setting 'reward'",
     ),
     (
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from signal import SIGTERM
 
 import pytest
 
@@ -12,6 +11,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.mazes import MazeEnv
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import Interrupted, StopSignals
+from tests.stops import StopAt
 from tests.tiny import composed
 
 # Where frames are spent: in proposing, in observing, in improving.
@@ -32,23 +32,6 @@ SPENT = {
     ],
     "nowhere": ["+method=target"],
 }
-
-
-class At(StopSignals):
-    """A signal that comes at the n-th safe point."""
-
-    def __init__(self, points: int) -> None:
-        super().__init__()
-        self.left = points
-
-    @property
-    def pending(self) -> bool:
-        return self.left == 1
-
-    def deliver(self) -> None:
-        self.left -= 1
-        if self.left == 0:
-            raise Interrupted(SIGTERM)
 
 
 def experiment(folder: Path, arguments: list[str], signals: StopSignals) -> Experiment:
@@ -75,7 +58,7 @@ def test_the_frames_are_the_steps_that_were_made_also_after_a_resume(
     assert (summary["curriculum_frames"] > 0) == (arguments != SPENT["nowhere"])
     with pytest.raises(Interrupted):
         few = "+ablation=advance_best" in arguments  # of safe points: one for each cycle
-        experiment(tmp_path / "again", arguments, At(2 if few else 5)).run()
+        experiment(tmp_path / "again", arguments, StopAt(2 if few else 5)).run()
     assert len(read_csv(tmp_path / "again" / "metrics.csv")) < 4
     experiment(tmp_path / "again", arguments, StopSignals()).run()
     whole, again = (

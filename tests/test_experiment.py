@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from signal import SIG_DFL, SIGTERM, signal
@@ -21,6 +22,7 @@ from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.settings import Schedule
 from proposer_rl.streams import Streams
 from tests.same_run import assert_same_run
+from tests.stops import StopAt
 from tests.tiny import TASK
 
 LENGTHS = {"updates": 5, "cycle_length": 2, "evaluate_every": 2, "checkpoint_every": 3}
@@ -139,13 +141,33 @@ def test_the_curriculum_is_improved_once_per_cycle_and_sees_every_update(tmp_pat
     assert curriculum.events == expected
 
 
+def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> None:
+    class Silent(Costly):
+        crashes = False
+
+        def improve(self, learner, updates, streams) -> Improvement:
+            return replace(super().improve(learner, updates, streams), metrics={})
+
+        def propose(self, learner, updates, streams) -> Proposal:
+            if self.crashes:
+                raise RuntimeError("the machine is switched off")
+            return super().propose(learner, updates, streams)
+
+    first, again = Silent(), Silent()
+    first.crashes = True
+    with pytest.raises(RuntimeError, match="switched off"):
+        experiment(tmp_path, 0, curriculum=first).run()
+    experiment(tmp_path, 0, curriculum=again).run()
+    assert (first.events[0], again.events[0]) == (("improve", 0), ("propose", 0))
+
+
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_what_a_curriculum_costs_is_counted_written_and_survives(
     interrupted: bool, tmp_path: Path
 ) -> None:
     if interrupted:
         with pytest.raises(Interrupted):
-            experiment(tmp_path, 0, curriculum=Costly(), signals=After(4)).run()
+            experiment(tmp_path, 0, curriculum=Costly(), signals=StopAt(4)).run()
     summary = experiment(tmp_path, 0, curriculum=Costly()).run()
     rows = read_csv(tmp_path / "metrics.csv")
     # By updates: one of 10 and 1 for each, one of 1000 and 100 for each cycle that has begun.
@@ -157,23 +179,6 @@ def test_what_a_curriculum_costs_is_counted_written_and_survives(
     begun = [(0, 0, 1000, 100), (1, 2, 2020, 202), (2, 4, 3040, 304)]
     keys = ("cycle", "updates", "curriculum_frames", "evaluations", "own")
     assert cycles == [dict(zip(keys, (*place, [place[1]]), strict=True)) for place in begun]
-
-
-class After(StopSignals):
-    """A signal that comes at the n-th safe point."""
-
-    def __init__(self, points: int) -> None:
-        super().__init__()
-        self.left = points
-
-    @property
-    def pending(self) -> bool:
-        return self.left <= 1
-
-    def deliver(self) -> None:
-        self.left -= 1
-        if self.left == 0:
-            raise Interrupted(SIGTERM)
 
 
 class Jumps(SamplingCurriculum):

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import spearmanr
+from tensordict import TensorDict
 
 from proposer_rl.cli import train
 from proposer_rl.cli.foresight import agreement
@@ -42,6 +44,17 @@ def test_three_proposals_are_too_few() -> None:
         agreement(np.arange(3.0), np.arange(3.0))
 
 
+def growing(rates: torch.Tensor):
+    """In place of training: after n updates the logarithms of success + 0.001 grew by n mixes."""
+
+    def performance_at(steps, env, solver, actions, levels, streams):
+        rate = actions[0].softmax(-1) @ rates  # [G]
+        grown = [0.002 * (n * rate).exp()[:, None, None].expand(-1, 2, 8) for n in steps]
+        return [TensorDict({"success": each - 0.001}, each.shape) for each in grown]
+
+    return performance_at
+
+
 def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -55,7 +68,14 @@ def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     rows = json.loads(output.read_text())
     stages = len(list((run / "checkpoints").glob("*.pt")))
     assert [row["ahead"] for row in rows] == [1, 2] * stages
-    assert all(-1 <= row["rank"] <= 1 for row in rows)
+    # Were bins worth 0 to 3, and logarithms of successes to grow by twice what a mix is worth:
+    worth = torch.arange(4.0)
+    monkeypatch.setattr("proposer_rl.cli.foresight._scores", lambda *_: worth)
+    monkeypatch.setattr("proposer_rl.cli.foresight.performance_at", growing(2 * worth))
+    foresight()
+    for row in json.loads(output.read_text()):
+        assert (row["rank"], row["explained"]) == pytest.approx((1, 1))
+        assert row["slope"] == pytest.approx(2 * row["ahead"], rel=1e-3)
     monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes[:3], "--proposals", "3"])
     with pytest.raises(SystemExit) as stopped:
         foresight()

@@ -153,11 +153,3 @@ def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
         proposal = curriculum.propose(learner, 0, [Streams(0, "update", 0)])
         costs[options] = (proposal.frames > 0, proposal.evaluations > 0)
     assert costs == {(): (False, True), ("+score=sampled",): (True, False)}
-
-
-@pytest.mark.parametrize("method", ["first_order_gain", "first_order_proposer"])
-def test_a_choice_by_default_is_the_one_that_others_are_given(method: str) -> None:
-    """The same numbers stand in three files."""
-    own = composed(f"+method={method}", "+scale=smoke").curriculum["choose"]
-    given = composed("+method=target", "+scale=smoke", "+choose=learnability").curriculum["choose"]
-    assert own == given and own is not None

@@ -140,7 +140,9 @@ def _curriculum(
         factory = instantiate(config.curriculum, _partial_=True)
         curriculum = factory(chosen)
     except (TypeError, ValueError, HydraException) as error:
-        raise ConfigError(f"curriculum: {why_not_made(error)}") from error
+        raise ConfigError(
+            f"curriculum: {why_not_made(error, f'method={config.method}')}"
+        ) from error
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")

@@ -13,12 +13,12 @@ from typing import Annotated, Any, Literal, get_type_hints
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from proposer_rl.cli.errors import one_line
-from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ComputeSettings,
@@ -32,7 +32,10 @@ from proposer_rl.settings import (
 
 # ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
 OmegaConf.register_new_resolver(
-    "joined", lambda items: "-".join(str(item) for item in items), replace=True
+    "joined",
+    # What is no list is refused later, in a line that names its key.
+    lambda items: "-".join(map(str, items)) if isinstance(items, ListConfig) else str(items),
+    replace=True,
 )
 
 # No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
@@ -135,7 +138,7 @@ def task_maker(settings: Mapping[str, Any]) -> TaskMaker:
             ... if parameter.default is parameter.empty else parameter.default,
         )
         for name, parameter in parameters.items()
-        if name not in (*GIVEN_TO_TASKS, "make_network")
+        if name not in GIVEN_TO_TASKS
     }
     model = create_model("Task", __config__=ConfigDict(extra="forbid"), **fields)
     checked = _validated(model, values, "task.")
@@ -154,7 +157,6 @@ def saved_config(folder: Path) -> RunConfig:
     values = stored_config(file)
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        values["schedule"]["updates"] = 1
         return _validated(RunConfig, {**values, **free})
     except (ConfigError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
@@ -182,19 +184,29 @@ def overrides() -> list[str]:
     return list(given)
 
 
-def check_order(given: Sequence[str]) -> None:
-    """Refuse an order in which one group would undo another: later ones win.
+def check_groups(given: Sequence[str]) -> None:
+    """Refuse groups of which one would undo another, since later ones win, or that do not fit.
 
     Args:
         given: overrides as they stand on the command line.
 
     Raises:
-        ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them.
+        ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them, or a
+            scale of ours is of another of our tasks.
     """
+    said = dict(override.split("=", 1) for override in given if "=" in override)
+    task, scale = said.get("task"), said.get("+scale")
+    if task in names(CONFIG_FOLDER, "task") and scale in names(CONFIG_FOLDER, "scale"):
+        defaults: Any = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
+        scaled = next(group["task"] for group in defaults if "task" in group)
+        if task != scaled:
+            raise ConfigError(
+                f"+scale={scale}: is of task={scaled}; task={task} has numbers of its own"
+            )
     changed_by = None
     for override in given:
         group = override.partition("=")[0]
-        if group in ("+ablation", "+as", "+score", "+choose"):
+        if group in CHANGING:
             changed_by = changed_by or group
         elif group in ("+method", "+scale") and changed_by is not None:
             raise ConfigError(f"{group}: must come before {changed_by}, or it would undo it")
@@ -205,12 +217,17 @@ def methods() -> list[str]:
     return names(CONFIG_FOLDER, "method")
 
 
-def why_not_made(error: BaseException) -> str:
-    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
+def why_not_made(error: BaseException, called: str = "") -> str:
+    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does.
+
+    Args:
+        error: what happened.
+        called: the command's own name of what refuses a setting; its function's by default.
+    """
     line = one_line(error).partition(", set env var HYDRA_FULL_ERROR")[0]
     unknown = re.fullmatch(r"(\w+)\S*\(\) got an unexpected keyword argument (\S+)", line)
     if unknown:
-        return f"{unknown[1]} has no setting {unknown[2]}"
+        return f"{called or unknown[1]} has no setting {unknown[2]}"
     innermost = error
     while innermost.__cause__ is not None:
         innermost = innermost.__cause__

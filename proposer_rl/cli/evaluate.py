@@ -227,7 +227,7 @@ def evaluate(loaded: Loaded, name: str | None, max_steps: int | None = None) -> 
     """
     run, updates, seeds, task, agent = loaded
     if isinstance(task, ScoringTask):
-        name = name or task.levels_help.split(",")[0]
+        name = name or task.default_levels
         scores: Sequence[Score] = task.scores(agent, name, max_steps)
     else:
         name = name or next(iter(task.distributions))

@@ -5,19 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.cli.places import CONFIG_FOLDER, GROUPS, names
 
-# In the order in which they are given on the command line, and what each decides.
-GROUPS = {
-    "task=": "what is to be learnt",
-    "+method=": "what the Solver trains on",
-    "+scale=": "how much is computed",
-    "+as=": "the numbers of another library, for methods that keep levels",
-    "+score=": "where the scores of levels come from",
-    "+choose=": "which of more levels are trained on",
-    "+ablation=": "what is changed of a method",
-    "+sweep=": "many runs",
-}
 USAGE = """\
 Train a Solver on a curriculum.
 

@@ -9,12 +9,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
-from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.cli.places import ADDED, CONFIG_FOLDER, names
 from proposer_rl.extras import install_command
 
 LAUNCHERS = [f"hydra/launcher/{name}" for name in ("joblib", "submitit_local", "submitit_slurm")]
-# Groups of which nothing is chosen until a command does.
-ADDED = ("method", "scale", "ablation", "as", "score", "choose", "sweep")
 _NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
 
 

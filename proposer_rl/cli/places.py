@@ -1,4 +1,4 @@
-"""Where the package and its configuration lie; imports nothing that takes time."""
+"""Where the package and its configuration lie, and the groups in it; imports nothing slow."""
 
 from __future__ import annotations
 
@@ -10,6 +10,22 @@ CONFIG_FOLDER = next(
     (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
     PACKAGE / "conf",
 )
+
+# In the order in which they are given on the command line, and what each decides.
+GROUPS = {
+    "task=": "what is to be learnt",
+    "+method=": "what the Solver trains on",
+    "+scale=": "how much is computed",
+    "+as=": "the numbers of another library, for methods that keep levels",
+    "+score=": "where the scores of levels come from",
+    "+choose=": "which of more levels are trained on",
+    "+ablation=": "what is changed of a method",
+    "+sweep=": "many runs",
+}
+# Of these nothing is chosen until a command does.
+ADDED = [group.strip("+=") for group in GROUPS if group.startswith("+")]
+# And these change a method or a scale, which therefore come before them.
+CHANGING = [f"+{group}" for group in ADDED if group not in ("method", "scale", "sweep")]
 
 
 def names(folder: Path, group: str) -> list[str]:

@@ -17,7 +17,6 @@ from proposer_rl.cli.errors import command
 from proposer_rl.extras import install_command
 
 if TYPE_CHECKING:
-    from proposer_rl.learning import PPO
     from proposer_rl.play.session import Session
 
 EPILOG = """\
@@ -69,18 +68,17 @@ def open_session(folder: Path) -> Session:
 
     saved_config(folder)  # before what takes seconds to import
     from proposer_rl.cli.outcome import run_name
-    from proposer_rl.cli.stored import restored, stored_run
+    from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
-    from proposer_rl.runs.checkpoint import load_checkpoint
 
-    config, task = (stored := stored_run(folder)).config, stored.task
-
-    def load(file: Path) -> tuple[int, PPO]:
-        state = load_checkpoint(file)[1]
-        learner = restored(task, config, state)
-        return int(state["updates"]), learner
-
-    return Session(folder=folder, title=run_name(config), task=task, seeds=config.seeds, load=load)
+    stored = stored_run(folder)
+    return Session(
+        folder=folder,
+        title=run_name(stored.config),
+        task=stored.task,
+        seeds=stored.config.seeds,
+        load=lambda file: stored.learner(file)[1:],
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -54,14 +54,23 @@ class StoredRun(NamedTuple):
     files: list[Path]
 
     def stage(self, file: Path) -> Stage:
-        """What one of the files holds.
+        """The first Solver in one of the files.
+
+        Raises:
+            CheckpointError: if it cannot be used.
+        """
+        step, updates, learner = self.learner(file)
+        return Stage(step, updates, learner.snapshot()[:1])
+
+    def learner(self, file: Path) -> tuple[int, int, PPO]:
+        """The checkpoint's step, the updates made there, and the Solvers.
 
         Raises:
             CheckpointError: if it cannot be used.
         """
         step, state = load_checkpoint(file)
-        solvers = restored(self.task, self.config, state).snapshot()
-        return Stage(step, int(state["updates"]), solvers[:1])
+        learner = restored(self.task, self.config, state)
+        return step, int(state["updates"]), learner
 
 
 def stored_run(folder: Path) -> StoredRun:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli.config import ConfigError, check_order, overrides, read_config
+from proposer_rl.cli.config import ConfigError, check_groups, overrides, read_config
 from proposer_rl.cli.errors import UNFORESEEN, command, exit_code, one_line, refuse
 from proposer_rl.cli.hydra_errors import explained
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -56,7 +56,7 @@ def _main(hydra_config: DictConfig) -> float:
     signals = StopSignals()
     try:
         forget_failure(path)
-        check_order(overrides())
+        check_groups(overrides())
         config = read_config(hydra_config)
         from proposer_rl.cli.run import train  # only now: it takes seconds
 

@@ -229,9 +229,11 @@ def rescore(
         best: float [K, P], the highest returns, of which the highest ever is kept.
         solved: bool [K, P], whether there was a success, of which one is enough for ever.
     """
-    mean = _means(_alike(slots), score)
-    old = buffer["score"].gather(1, slots)
-    scores = buffer["score"].scatter(1, slots, mean.where(mean.isfinite(), old))
+    found = score.double().where(score.isfinite(), 0.0)
+    none = torch.zeros_like(buffer["score"])
+    counts = none.scatter_add(1, slots, score.isfinite().to(none))
+    means = none.scatter_add(1, slots, found.to(none)) / counts
+    scores = means.where(counts > 0, buffer["score"])
     seen = {
         name: buffer[name].scatter_reduce(1, slots, found.to(buffer[name]), "amax")
         for name, found in zip(SEEN, (best, solved), strict=True)

@@ -200,7 +200,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         return rollout[0].numel(), 0
 
     def observe(self, learner: PPO, levels: Any, update: Update) -> None:
-        """Score the bins that were trained on."""
+        """Score the bins that were trained on, as the Solver stands after its update."""
         rollout, score = update.rollout, self.scores["score"]
         advantage = ppo_advantages(learner, rollout)
         found = alignment(

@@ -97,6 +97,6 @@ class FirstOrderProposer(ProblemProposer):
         told = {
             "target_performance": float(reached.mean()),
             "alignment": float(paid.mean()),
-            "alignment_sd": float(paid.std()),
+            "alignment_sd": float(paid.std(correction=0)),
         }
         return Worth(paid, told, evaluations=count + 2 * paid.shape[1])

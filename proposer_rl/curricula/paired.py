@@ -53,7 +53,7 @@ class PairedProposer(ProblemProposer):
         super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
 
     def begin(self) -> None:
-        """The antagonist begins anew, too."""
+        """The antagonist begins anew, too, always with the same weights."""
         super().begin()
         self.antagonist.restore(self._newborn)
 
@@ -67,7 +67,7 @@ class PairedProposer(ProblemProposer):
                 for student in both
             ]
         regret = (returns[0] - returns[1]).clamp_min(0)
-        told = {"regret": float(regret.mean()), "regret_sd": float(regret.std())}
+        told = {"regret": float(regret.mean()), "regret_sd": float(regret.std(correction=0))}
         self._draws = stream.generator("antagonist")
         frames = task.batch_size * self.antagonist.settings.horizon
         return Worth(regret, told, frames=frames, evaluations=2 * regret.shape[1])

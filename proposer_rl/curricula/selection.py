@@ -14,7 +14,7 @@ from proposer_rl.curricula.batches import (
 )
 from proposer_rl.curricula.checks import part, whole
 from proposer_rl.curricula.scores import Scorer
-from proposer_rl.learning import PPO
+from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
@@ -76,11 +76,22 @@ class SelectionCurriculum(Curriculum):
         return Proposal(levels, *cost)
 
     def _select(self, learner: PPO, streams: Sequence[Streams]) -> list[int]:
-        """Keep the best of new candidates; the frames and evaluations that it cost."""
+        """Keep the best of new candidates; the frames and evaluations that it cost.
+
+        Raises:
+            DivergedError: if fewer have a score than are kept.
+        """
         scorer, space = self.scorer, self.task.space
         levels = fresh_levels(space, self._candidates, streams, "candidates")
         method = scorer.play if scorer.from_episodes else scorer.ask
         scored, cost = method(learner, levels, streams)
+        known = int(scored.score.isfinite().sum(-1).min())
+        if known < self._keep:
+            raise DivergedError(
+                f"solver.ppo.horizon={learner.settings.horizon}: on {known} of "
+                f"{self._candidates} candidates did an episode end within it, so that fewer than "
+                f"{self._keep} have a score"
+            )
         best = scored.score.sort(dim=-1, descending=True, stable=True)
         self.scores = best.values[:, : self._keep]
         self.kept = levels_at(levels.cpu(), best.indices[:, : self._keep])

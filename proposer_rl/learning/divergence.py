@@ -17,7 +17,11 @@ class DivergedError(ArithmeticError):
 
 
 def require_finite(
-    reward: Tensor, steps: TensorDictBase, weights: Mapping[str, Tensor], copies: int | None
+    reward: Tensor,
+    steps: TensorDictBase,
+    weights: Mapping[str, Tensor],
+    copies: int | None,
+    first: int = 0,
 ) -> None:
     """Check one update; costs one number read from the device unless something is wrong.
 
@@ -27,6 +31,7 @@ def require_finite(
             [S, K], or without copies [S].
         weights: after the update, by name, [K, ...] with copies.
         copies: K, or None for a single network.
+        first: number of the first copy, by which copies are named.
 
     Raises:
         DivergedError: naming what was not finite first, and the copies that it happened in. The
@@ -39,12 +44,12 @@ def require_finite(
     sums = nn.utils.get_total_norm([reward, *scalars, *weights.values()], norm_type=1.0)
     if bool(sums.isfinite()):
         return
-    _refuse("reward", reward, len(reward))
+    _refuse("reward", reward, len(reward), first)
     for i in range(len(steps)):
         for name in names:
-            _refuse(f"{name} of gradient step {i}", steps[name][i], copies)
+            _refuse(f"{name} of gradient step {i}", steps[name][i], copies, first)
     for name, weight in weights.items():
-        _refuse(f"weight {name}", weight, copies)
+        _refuse(f"weight {name}", weight, copies, first)
 
 
 @contextmanager
@@ -56,11 +61,11 @@ def located(place: str) -> Iterator[None]:
         raise DivergedError(f"{place}: {error}") from error
 
 
-def _refuse(name: str, tensor: Tensor, copies: int | None) -> None:
+def _refuse(name: str, tensor: Tensor, copies: int | None, first: int) -> None:
     finite = tensor.detach().isfinite().reshape(copies or 1, -1)
     if bool(finite.all()):
         return
     worst = float(tensor.detach().reshape(-1)[~finite.reshape(-1)][0])
-    which = torch.nonzero(~finite.all(1)).flatten().tolist()
+    which = (first + torch.nonzero(~finite.all(1)).flatten()).tolist()
     named = "" if copies is None else f"copy {', '.join(map(str, which))}: "
     raise DivergedError(f"{named}{name} is not finite ({worst})")

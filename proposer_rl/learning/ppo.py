@@ -191,14 +191,17 @@ class PPO:
         """Of the last training, [S]: what each step was like, for each copy [S, K] where told."""
         return self._last_training[1]
 
-    def check(self) -> None:
+    def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.
+
+        Args:
+            first: number of the first copy, by which copies are named.
 
         Raises:
             DivergedError: if a reward, loss, gradient or weight is not finite, naming the copy.
         """
         weights = dict(self.agent.named_parameters())
-        require_finite(*self._last_training, weights, self.agent.copies)
+        require_finite(*self._last_training, weights, self.agent.copies, first)
 
     def snapshot(self) -> TensorDict:
         """A copy of weights and Adam's state, batch [K] with copies and [] without.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from proposer_rl.mazes.dynamics import successors
+from proposer_rl.mazes.dynamics import shortest_way, successors
 from proposer_rl.mazes.evaluation import ExactEvaluator, policy_path
 from proposer_rl.mazes.level_files import (
     levels_from_text,
@@ -155,26 +154,13 @@ def shortest_path(level: Level) -> list[list[int]] | None:
     """A shortest path of a level ``[]``: its cells (row, column), start and goal included.
 
     Returns:
-        Of several the one whose moves come first in :data:`~proposer_rl.mazes.dynamics.MOVES`,
-        seen from the goal; None where there is no path.
+        Of several the one whose moves come first in :data:`~proposer_rl.mazes.dynamics.MOVES`; None
+        where there is no path.
     """
     width = level.walls.shape[1]
-    following = successors(level).T.tolist()  # [H*W][4]
     start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
-    # Backwards: moves can be undone, so that the way back is a way there.
-    towards, waiting = {goal: goal}, deque([goal])
-    while waiting and start not in towards:
-        cell = waiting.popleft()
-        for neighbour in following[cell]:
-            if neighbour not in towards:
-                towards[neighbour] = cell
-                waiting.append(neighbour)
-    if start not in towards:
-        return None
-    path = [start]
-    while path[-1] != goal:
-        path.append(towards[path[-1]])
-    return [list(divmod(cell, width)) for cell in path]
+    path = shortest_way(successors(level).tolist(), start, lambda cell: cell == goal)
+    return None if path is None else [list(divmod(cell, width)) for cell in path]
 
 
 def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:

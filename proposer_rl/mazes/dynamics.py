@@ -1,6 +1,9 @@
-"""How an agent moves in a maze, as a table."""
+"""How an agent moves in a maze, as a table, and the shortest way through one."""
 
 from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -36,3 +39,31 @@ def successors(level: Level) -> Tensor:
         for down, right in MOVES
     ]
     return torch.stack(table, dim=-3).flatten(-2)
+
+
+def shortest_way(
+    following: Sequence[Sequence[int]], start: int, arrived: Callable[[int], bool]
+) -> list[int] | None:
+    """The nodes of a way of fewest actions, the first and the last included.
+
+    Args:
+        following: where each action leads from each node.
+        start: the first node.
+        arrived: whether a node is a last one.
+
+    Returns:
+        Of several the one whose actions come first; None where there is none.
+    """
+    before, waiting = {start: start}, deque([start])
+    while waiting:
+        node = waiting.popleft()
+        if arrived(node):
+            way = [node]
+            while way[-1] != start:
+                way.append(before[way[-1]])
+            return way[::-1]
+        for action in following:
+            if action[node] not in before:
+                before[action[node]] = node
+                waiting.append(action[node])
+    return None

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from proposer_rl.learning import PPO
 from proposer_rl.mazes.board import MazeBoard
@@ -94,6 +94,8 @@ class MazeTask:
         ValueError: naming the key, if settings that are each valid do not go together.
     """
 
+    default_levels = "shapes"
+
     def __init__(
         self,
         *,
@@ -106,7 +108,7 @@ class MazeTask:
         evaluation: EvaluationSettings,
         solver: SolverSettings,
         place: Place,
-        make_network: Any = None,
+        make_network: Callable[[], nn.Module] | None = None,
     ) -> None:
         check_names(distributions, target, evaluation.distributions)
         if make_network is None:
@@ -143,11 +145,6 @@ class MazeTask:
             self._sampled
             if evaluation.evaluator == "exact"
             else RolloutEvaluator(*rules, episodes=evaluation.episodes)
-        )
-        self.levels_help = (
-            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
-            f"a run's curriculum{RECORD}, or a distribution: {', '.join(distributions)}, as it is "
-            f"or on another grid as in {target}@13x13"
         )
         self.board = MazeBoard(maze, self._check_size, self._limit, self.device)
         self.exact_performance = evaluation.evaluator == "exact"
@@ -301,9 +298,14 @@ class MazeTask:
                     size = map(int, asked.group(2, 3))
                     grid = named(f"--levels {name}", distribution.on_grid, *size)
                     drawn[name] = partial(self._fixed, name, grid)
+        there_are = (
+            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
+            f"a run's curriculum{RECORD}, or a distribution: {', '.join(self.distributions)}, as "
+            f"it is or on another grid as in {self._target}@13x13"
+        )
         files = (*SUFFIXES, RECORD)
         levels, of_distribution = chosen_levels(
-            name, drawn, files, read_levels, shipped_levels, self.levels_help
+            name, drawn, files, read_levels, shipped_levels, there_are
         )
         slack = 0 if of_distribution else SLACK
         for named_level in levels.items():

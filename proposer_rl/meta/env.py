@@ -141,7 +141,7 @@ class SolverTrainingEnv(EnvBase):
         place = f"update {self._updates} of the episode of the Solver's copies"
         with torch.enable_grad(), located(place):
             update = self.solvers.update(generators)
-            self.solvers.check()
+            self.solvers.check(self._copies.start)
         self.last_training = (levels, update)
         self._updates += 1
         before, _ = self._seen

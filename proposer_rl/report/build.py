@@ -42,18 +42,9 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     proposals.diagnostics,
 )
 
-# Of these the page has charts.
-CHARTED = {
-    curves.learning_curves,
-    curves.cost_curves,
-    curves.worst_levels,
-    single_levels.worst_curves,
-    single_levels.level_by_level,
-    curves.difficulty,
-    proposals.gains,
-    proposals.diagnostics,
-}
-# And of these, where levels of several stages can be shown.
+# Of these the page has pictures alone, and of others charts only where levels of several stages
+# can be shown.
+STILL = {levels.side_by_side, levels.told_by_curricula}
 STAGED = {proposals.heat_maps, levels.along_training}
 
 # Numbers behind the figures, as CSV alone.
@@ -174,7 +165,7 @@ def _section(
         if rows:
             files[f"{TABLES}/{prefix}{name}.csv"] = to_csv(header, rows).encode()
     staged = stages(study)
-    charted = CHARTED | (STAGED if staged else set())
+    still = STILL if staged else STILL | STAGED
     figures = []
     for draw in DRAWINGS:
         bar.set_postfix_str(draw.__name__.replace("_", " "))
@@ -182,7 +173,7 @@ def _section(
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
             drawn = render(drawing)
-            figures.append(page.figure(drawing, drawn, draw in charted))
+            figures.append(page.figure(drawing, drawn, draw not in still))
             files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
             animations = [panel.animation for panel in drawing.panels if panel.animation]
             files |= {f"{path}_{_slug(name)}.gif": make() for name, make in animations}

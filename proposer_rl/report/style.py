@@ -19,7 +19,7 @@ from proposer_rl.report.records import Column
 
 # Okabe and Ito's colours, which stay distinct under the common forms of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILLION = "#0072B2", "#D55E00"
 METHODS = {
     "perf_gain": VERMILLION,
     "task_difficulty": BLUE,

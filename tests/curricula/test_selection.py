@@ -10,6 +10,7 @@ import torch
 from proposer_rl.curricula import Scorer, SelectionCurriculum
 from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.buffer import level_keys
+from proposer_rl.learning import DivergedError
 from proposer_rl.streams import Streams
 from tests.curricula.living import (
     check_a_new_life_begins,
@@ -76,6 +77,16 @@ def test_what_is_mastered_or_hopeless_is_not_kept_while_there_is_else() -> None:
     curriculum.scorer = Told()  # type: ignore[assignment]
     curriculum.propose(solvers([0]), 0, [Streams(0)])
     assert curriculum.scores[0].tolist() == pytest.approx([0.25, 0.2, 0.1])
+
+
+def test_fewer_scores_than_are_kept_are_told() -> None:
+    """Levels without one, as where no episode ends within the horizon, are not trained on."""
+    curriculum = selection(keep=3)
+    found = torch.full((1, 16), -torch.inf)
+    found[0, :2] = 0.1
+    curriculum.scorer.ask = lambda *_: (type("Scored", (), {"score": found}), 16)  # type: ignore
+    with pytest.raises(DivergedError, match=r"horizon=8: on 2 of 16 .* fewer than 3 have"):
+        curriculum.propose(solvers([0]), 0, [Streams(0)])
 
 
 @pytest.mark.parametrize(("new", "fresh"), [(0.0, 0), (1.0, 4), (0.25, 1)])

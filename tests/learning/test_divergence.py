@@ -64,6 +64,13 @@ def test_names_all_copies_that_it_happened_in() -> None:
         require_finite(reward, steps, weights, K)
 
 
+def test_copies_are_named_by_their_numbers_among_all() -> None:
+    reward, steps, weights = healthy()
+    weights["b"][1, 1, 2] = torch.nan
+    with pytest.raises(DivergedError, match=r"^copy 5: weight b"):
+        require_finite(reward, steps, weights, K, first=4)
+
+
 def test_a_single_network_has_no_copies() -> None:
     reward, steps, weights = healthy()
     weights["b"][1, 1, 1] = torch.nan

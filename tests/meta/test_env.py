@@ -254,6 +254,15 @@ def test_a_share_of_the_copies_is_those_copies() -> None:
     assert not torch.equal(last["next", "reward"], every["next", "reward"])
 
 
+def test_a_copy_that_diverges_has_its_number_among_all() -> None:
+    share = meta_env(first_copy=4)
+    first, second = some_actions()[:2]
+    _, state = share.step_and_maybe_reset(share.reset().set("action", first))
+    next(share.solvers.agent.parameters()).data[1] = torch.nan
+    with pytest.raises(DivergedError, match="copy 5: "):
+        share.step(state.set("action", second))
+
+
 def test_the_seed_decides_what_an_episode_draws() -> None:
     env, actions, trained = meta_env(), some_actions(), []
     for seed in (1, 2, 1):

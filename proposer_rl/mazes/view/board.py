@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from proposer_rl.mazes.board import Drawings
-from proposer_rl.mazes.dynamics import MOVES, successors
+from proposer_rl.mazes.dynamics import MOVES, shortest_way, successors
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.mazes.level_scores import SLACK
-from proposer_rl.mazes.levels import FREE, GOAL, WALL, Level
+from proposer_rl.mazes.levels import FREE, GOAL, WALL, Level, cell_index
 from proposer_rl.mazes.view.distance import fewest_actions
 from proposer_rl.mazes.view.env import PENALTY
 from proposer_rl.mazes.view.evaluation import walks
@@ -108,19 +107,6 @@ def _following(level: ViewLevel) -> list[list[int]]:
 def _shortest(level: ViewLevel, following: list[list[int]]) -> list[Node] | None:
     """A way of fewest actions, start and goal included; None where there is none."""
     width = level.walls.shape[1]
-    (row, column), direction = level.start.tolist(), int(level.direction)
-    goal = level.goal.tolist()
-    start = 4 * (row * width + column) + direction
-    before, waiting = {start: start}, deque([start])
-    while waiting:
-        node = waiting.popleft()
-        if [*divmod(node // 4, width)] == goal:
-            way = [node]
-            while way[-1] != start:
-                way.append(before[way[-1]])
-            return [[*divmod(one // 4, width), one % 4] for one in reversed(way)]
-        for action in following:
-            if action[node] not in before:
-                before[action[node]] = node
-                waiting.append(action[node])
-    return None
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    way = shortest_way(following, 4 * start + int(level.direction), lambda n: n // 4 == goal)
+    return None if way is None else [[*divmod(node // 4, width), node % 4] for node in way]

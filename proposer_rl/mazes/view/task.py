@@ -69,6 +69,7 @@ class ViewMazeTask:
     """
 
     exact_performance = False
+    default_levels = "shapes"
 
     def __init__(
         self,
@@ -104,10 +105,6 @@ class ViewMazeTask:
         }
         self.target = self.distributions[target]
         self.space = named("space", ViewSpace, space, *grid)
-        self.levels_help = (
-            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
-            f"or a distribution: {', '.join(distributions)}"
-        )
         scoring = Streams(evaluation.seed, "scores")
         self.board = ViewBoard(maze, evaluation.named_episodes, scoring, self.device)
         self._measured_on = {
@@ -242,7 +239,8 @@ class ViewMazeTask:
             SUFFIXES,
             read_view_levels,
             partial(shipped_levels, kind=ViewLevel),
-            self.levels_help,
+            f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
+            f"or a distribution: {', '.join(self.distributions)}",
         )
         limit, slack = self.maze.max_steps, 0 if of_distribution else SLACK
         return score_view_levels(

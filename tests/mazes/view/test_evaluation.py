@@ -6,7 +6,6 @@ from typing import Any, cast
 
 import pytest
 import torch
-from scipy.stats import binomtest
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -126,12 +125,15 @@ def test_scores_count_episodes_and_bound_them() -> None:
     levels["wide"] = ViewLevel.from_text(">....G")
     scores = score_view_levels(agent, levels, lambda n: 5 + n, 8, Streams(0), CPU)
     assert [(s.level, s.solver) for s in scores] == [(n, k) for n in levels for k in range(K)]
+    # The wide one, of another size than the others, is played alone.
+    alone = play(agent, levels["wide"].unsqueeze(0), 10, 8, Streams(0).generator("wide"))
+    for score, success in zip(scores[-K:], alone["success"][:, 0].tolist(), strict=True):
+        assert score.results["success"] == success
     for score in scores:
-        results = score.results
-        count = round(results["success"] * 8)
-        interval = binomtest(count, 8).proportion_ci(method="wilson")
-        assert results["success_low"] == interval.low
-        assert results["success_high"] == interval.high
+        z, found = 1.959964, score.results["success"]  # Wilson 1927: the roots in p of
+        for bound in (score.results["success_low"], score.results["success_high"]):
+            if 0 < bound < 1:
+                assert (found - bound) ** 2 == pytest.approx(z**2 * bound * (1 - bound) / 8)
         assert score.about["max_steps"] == 5 + score.about["fewest_actions"]
         assert score.picture().ndim == 3
     last: Tensor = torch.tensor([list(s.about.values()) for s in scores[-K:]])
