@@ -297,6 +297,7 @@ def learnability(
 def first_order_proposer(
     parts: Parts,
     target_levels: int,
+    step: float = 1.0,
     measure: str = "log_success",
     copies: int = 0,
     choose: Choose = None,
@@ -309,6 +310,7 @@ def first_order_proposer(
             them the probes, the network, of PPO how far a step goes (``adam_eps``,
             ``clip_epsilon``, ``max_grad_norm``), and with copies the length of their episode.
         target_levels: see :class:`FirstOrderProposer`.
+        step: the same.
         measure: the same.
         copies: the same.
         choose: see :func:`_choice`.
@@ -323,6 +325,7 @@ def first_order_proposer(
         probe_levels=parts.proposer.probe_levels,
         choice=_choice(parts.task, choose),
         target_levels=target_levels,
+        step=step,
         measure=measure,
         copies=copies,
         copy_updates=parts.proposer.meta_episode_length,

@@ -68,7 +68,7 @@ class _AlignedBins(BinCurriculum):
 class FirstOrderCurriculum(_AlignedBins):
     """Scores each bin with the mean alignment of fresh levels of it, which nobody plays.
 
-    The alignments are exact (:mod:`proposer_rl.meta.first_order`): no frames are spent.
+    What a level returns is exact (:mod:`proposer_rl.meta.first_order`): no frames are spent.
 
     Args:
         task: whose target is to be mastered.
@@ -78,6 +78,7 @@ class FirstOrderCurriculum(_AlignedBins):
         smoothing: share of the old score in the average.
         target_levels: fresh levels E of the target that the direction is taken from.
         candidates: levels C of each bin.
+        step: of the differences that tell the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
         choice: see :class:`BinCurriculum`.
@@ -94,6 +95,7 @@ class FirstOrderCurriculum(_AlignedBins):
         every: int = 2,
         target_levels: int = 128,
         candidates: int = 8,
+        step: float = 1.0,
         temperature: float = 0.1,
         smoothing: float = 0.9,
         measure: str = "log_success",
@@ -106,6 +108,7 @@ class FirstOrderCurriculum(_AlignedBins):
         self._exact = exact
         self._target_levels = whole("target_levels", target_levels, 1)
         self._candidates = whole("candidates", candidates, 1)
+        self._step = real("step", step, above=0)
         self._measure = one_of("measure", measure, MEASURES)
 
     def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
@@ -117,8 +120,8 @@ class FirstOrderCurriculum(_AlignedBins):
         reached, direction = exact_direction(task, learner, target, self._measure)
         bins = torch.arange(size).repeat_interleave(count).expand(len(streams), -1)
         levels = task.space.generate(bins, [s.generator("candidates") for s in streams])
-        found = exact_alignment(task, learner, direction, levels).unflatten(-1, (size, count))
-        score, error = (x.cpu() for x in bin_scores(found))
+        found = exact_alignment(task, learner, direction, levels, self._step)
+        score, error = (x.cpu() for x in bin_scores(found.unflatten(-1, (size, count))))
         old = self.smoothing if self.scores else 0.0
         before = self.scores or {"score": score, "variance": error.square()}
         self.scores = {
@@ -206,6 +209,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         found = alignment(
             learner.agent,
             self._direction,
+            learner.settings.learning_rate,
             lambda: surrogate(learner.agent, rollout, advantage),
         ).to(score)
         means, counts = means_of_bins(self._choices, found, score.shape[-1])

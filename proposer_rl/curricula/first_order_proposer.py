@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from proposer_rl.curricula.base import Improvement
-from proposer_rl.curricula.checks import one_of, whole
+from proposer_rl.curricula.checks import one_of, real, whole
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.first_order import require_gradients
 from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
@@ -30,6 +30,7 @@ class FirstOrderProposer(ProblemProposer):
         probe_levels: probes C.
         choice: see :class:`ProblemProposer`.
         target_levels: fresh levels E of the target that the direction is taken from.
+        step: of the differences that tell the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
         copies: K; 0 for none.
@@ -39,6 +40,7 @@ class FirstOrderProposer(ProblemProposer):
 
     Raises:
         TypeError: if the task's performance has no gradients.
+        ValueError: if a number is out of range.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class FirstOrderProposer(ProblemProposer):
         probe_levels: int = 16,
         choice: Choice | None = None,
         target_levels: int = 256,
+        step: float = 1.0,
         measure: str = "log_success",
         copies: int = 0,
         copy_updates: int = 20,
@@ -58,6 +61,7 @@ class FirstOrderProposer(ProblemProposer):
         self._exact = require_gradients(task)
         super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
         self._target_levels = whole("target_levels", target_levels, 1)
+        self._step = real("step", step, above=0)
         self._measure = one_of("measure", measure, MEASURES)
         self._copy_updates, self._on_update = copy_updates, on_update
         count = whole("copies", copies, 0)
@@ -93,7 +97,7 @@ class FirstOrderProposer(ProblemProposer):
         target = task.target.sample(count, streams[0].generator("target"))
         everywhere = target.unsqueeze(0).expand(len(streams), count)
         reached, direction = exact_direction(task, learner, everywhere, self._measure)
-        paid = exact_alignment(task, learner, direction, levels)
+        paid = exact_alignment(task, learner, direction, levels, self._step)
         told = {
             "target_performance": float(reached.mean()),
             "alignment": float(paid.mean()),

@@ -15,15 +15,16 @@ the problem's own return J_p along u,
 
     <u, g_p>  =  d/de J_p(theta + e u)  =  (J_p(theta + s u) - J_p(theta - s u)) / 2 s + O(s^2),
 
-two forward passes for any number of problems, also of such that nobody has trained on. How small s
-must be is a matter of the whole move's length s |u|, not of a single parameter's: along a length of
-0.01 a return is as good as a straight line, along that of a step of Adam, the learning rate for
-each of a million parameters, it is none. Where J_p is not known exactly, the surrogate of episodes
-takes its place: with advantages A_t,
+two forward passes for any number of problems, also of such that nobody has trained on. Where J_p
+is not known exactly, the surrogate of episodes takes its place: with advantages A_t,
 
     <u, g_p>  is estimated by  d/de sum over t of A_t log pi_(theta + e u)(a_t | s_t).
 
-Here u is scaled to a root mean square of 1 over the parameters of each Solver.
+Here u is scaled to a root mean square of 1 over the parameters of each Solver: a step of ``s`` then
+moves a parameter by about s, as a step of Adam with that learning rate does. For a million
+parameters together that is a long way, on which returns are no straight lines: with s the learning
+rate the difference is a secant, what a step towards the target changes, and with a twentieth of it
+the derivative (docs/first_order.md compares them).
 
 Relatives: gradients of training examples aligned with those of a validation set: TracIn (Pruthi et
 al. 2020, arXiv 2002.08484), example weights (Ren et al. 2018, arXiv 1803.09050); in curricula the
@@ -49,7 +50,6 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.task import DifferentiableTask, Levels
 
 SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
-MOVE = 0.01  # length of the move on either side of a central difference
 
 Direction = Mapping[str, Tensor]
 """By the parameters' names, [K, ...]: a direction in which K Solvers can be moved."""
@@ -130,14 +130,14 @@ def root_mean_square(direction: Direction) -> Tensor:
 
 
 @contextmanager
-def moved(agent: ActorCritic, direction: Direction, step: Tensor) -> Iterator[None]:
-    """K Solvers that stand ``step`` [K] along a direction; afterwards they are again as before."""
+def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[None]:
+    """K Solvers that stand ``step`` along a direction; afterwards they are bit by bit as before."""
     parameters = dict(agent.named_parameters())
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
     try:
         with torch.no_grad():
             for name, parameter in parameters.items():
-                parameter.addcmul_(direction[name], _per_copy(step, parameter))
+                parameter.add_(direction[name], alpha=step)
         yield
     finally:
         with torch.no_grad():
@@ -147,9 +147,9 @@ def moved(agent: ActorCritic, direction: Direction, step: Tensor) -> Iterator[No
 
 @torch.no_grad()
 def alignment(
-    agent: ActorCritic, direction: Direction, worth: Callable[[], Tensor], length: float = MOVE
+    agent: ActorCritic, direction: Direction, step: float, worth: Callable[[], Tensor]
 ) -> Tensor:
-    """The derivative along a direction of what K Solvers get, by a central difference.
+    """The slope along a direction of what K Solvers get, by a central difference.
 
     Two forward passes do on any kind of network, also where neither forward-mode nor second
     derivatives exist.
@@ -157,9 +157,9 @@ def alignment(
     Args:
         agent: the Solvers.
         direction: as :func:`target_direction` makes it.
+        step: of the difference, such as the learning rate.
         worth: what the agent gets as it stands, such as the exact return of levels, or
             :func:`surrogate`: float [K, E].
-        length: of the move of all of a Solver's parameters on either side.
 
     Returns:
         float [K, E].
@@ -171,15 +171,14 @@ def alignment(
         >>> from torch import nn
         >>> linear = TensorDictModule(nn.Linear(1, 1, bias=False), ["x"], ["y"])
         >>> w = nn.init.constant_(linear.module.weight, 3.0)
-        >>> alignment(linear, {"module.weight": torch.ones(1, 1)}, lambda: w.square(), length=0.5)
+        >>> alignment(linear, {"module.weight": torch.ones(1, 1)}, 0.5, lambda: w.square())
         tensor([[6.]])
     """
-    step = length / squared_length(direction).sqrt()
     with moved(agent, direction, step):
         ahead = worth()
     with moved(agent, direction, -step):
         behind = worth()
-    return (ahead - behind) / (2 * step.unsqueeze(-1))
+    return (ahead - behind) / (2 * step)
 
 
 def exact_direction(
@@ -197,12 +196,14 @@ def exact_direction(
 
 
 def exact_alignment(
-    task: DifferentiableTask, learner: PPO, direction: Direction, levels: Levels
+    task: DifferentiableTask, learner: PPO, direction: Direction, levels: Levels, step: float = 1.0
 ) -> Tensor:
-    """Alignment of any levels [K, E] with a direction: float [K, E]."""
-    agent = learner.agent
+    """Alignment of levels [K, E], by differences of ``step`` learning rates: float [K, E]."""
     return alignment(
-        agent, direction, lambda: task.differentiable_performance(agent, levels)["return"]
+        learner.agent,
+        direction,
+        step * learner.settings.learning_rate,
+        lambda: task.differentiable_performance(learner.agent, levels)["return"],
     )
 
 

@@ -140,6 +140,9 @@ def test_scores_are_mean_inner_products_with_the_target_direction() -> None:
     ).unflatten(1, (BINS, 3))
     torch.testing.assert_close(found["score"], each.mean(-1), rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(found["variance"], each.var(-1) / 3, rtol=1e-3, atol=1e-10)
+    far = mazes(step=1000.0)  # differences, and no derivatives any more
+    far.propose(solvers, 0, streams(0, 0, 1))
+    assert not torch.allclose(far.state_dict()["scores"]["score"], each.mean(-1), rtol=0.05)
 
 
 def test_a_solvers_batch_depends_on_its_own_stream_alone() -> None:
@@ -215,6 +218,7 @@ def test_a_task_without_gradients_is_refused() -> None:
     [
         ({"every": 0}, "every must be a whole number from 1 to 1,000,000, got 0"),
         ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
+        ({"step": 0.0}, "step must be a finite number above 0, got 0.0"),
         ({"smoothing": 1.0}, "smoothing must be from 0 to below 1, got 1.0"),
         ({"candidates": 0}, "candidates must be a whole number from 1 to 1,000,000, got 0"),
     ],
