@@ -21,7 +21,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from proposer_rl.report.progress import FAILURE, find_progress
+from proposer_rl.report.progress import find_progress
+from proposer_rl.report.reading import FAILURE
 from proposer_rl.report.sweeps import PLAN, left
 from proposer_rl.report.terminal import overview
 from proposer_rl.runs.folder import write_atomically

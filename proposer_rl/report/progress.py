@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from dataclasses import dataclass
@@ -11,9 +10,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from proposer_rl.report.reading import FAILURE as FAILURE
-from proposer_rl.report.reading import UnreadableRun, begun, read_run
-from proposer_rl.report.records import LARGEST, LONGEST_TEXT, Text, checked, printable
+from proposer_rl.report.reading import FAILURE, UnreadableRun, begun, read_run
+from proposer_rl.report.records import LARGEST, LONGEST_TEXT, Text, checked, printable, small_json
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.status import FILE, Activity
 
@@ -72,13 +70,12 @@ def find_progress(folder: Path) -> list[Progress]:
 
 
 def _failure(folder: Path) -> str:
-    path = folder / FAILURE
-    if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**20:
+    if not (folder / FAILURE).is_file():
         return ""
-    try:
-        return printable(str(json.loads(path.read_text())["message"]))[:LONGEST_TEXT]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return f"{FAILURE} cannot be read"
+    match small_json(folder / FAILURE):
+        case {"message": message}:
+            return printable(str(message))[:LONGEST_TEXT]
+    return f"{FAILURE} cannot be read"
 
 
 class _Recorded(BaseModel):
@@ -91,12 +88,9 @@ class _Recorded(BaseModel):
 
 def recorded_activity(folder: Path) -> Activity | None:
     """What a run tells of itself; None where it is over, or that cannot be read."""
-    path = folder / FILE
-    if path.is_symlink() or not path.is_file() or path.stat().st_size > 2**12:
-        return None
     try:
-        found = checked(_Recorded, json.loads(path.read_text(encoding="utf-8")), FILE)
-    except (OSError, ValueError, RecursionError):
+        found = checked(_Recorded, small_json(folder / FILE, 2**12), FILE)
+    except ValueError:
         return None
     return Activity(**found.model_dump())
 

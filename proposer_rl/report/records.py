@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import math
 import re
 import warnings
 from collections.abc import Hashable, Mapping
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
@@ -119,6 +121,16 @@ def checked(kind: type[T], value: Any, where: str) -> T:
         first = error.errors(include_input=False, include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise ValueError(f"{where}: {place}{': ' * bool(place)}{first['msg']}") from error
+
+
+def small_json(path: Path, largest: int = 2**20) -> Any:
+    """What a small file of a run says; None where it is none that can be read."""
+    try:
+        if path.is_symlink() or path.stat().st_size > largest:
+            return None
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 def printable(text: str) -> str:

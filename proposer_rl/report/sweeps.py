@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Collection, Sequence
@@ -13,12 +12,11 @@ import numpy as np
 
 from proposer_rl.report.progress import recorded_activity
 from proposer_rl.report.reading import begun
-from proposer_rl.report.records import number
+from proposer_rl.report.records import number, small_json
 from proposer_rl.runs.status import FILE, duration
 
 PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder
 SUMMARY = "summary.json"
-LARGEST_FILE = 2**20
 GOING = 600.0  # seconds since a run that goes on has said so
 SEEDS = ("seed=", "seeds=")  # two runs that differ in nothing else take as long
 
@@ -69,13 +67,13 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
     going: list[tuple[set[str], float]] = []
     for path, files in begun(folder):
         if SUMMARY in files:
-            said = _read(path / SUMMARY)
+            said = _told(path / SUMMARY)
             finished.append((_settings(said), number(said.get("seconds"))))
         elif FILE in files and time.time() - (path / FILE).stat().st_mtime < GOING:
             activity = recorded_activity(path)
             seconds = activity.seconds_left if activity else None
             rest = math.nan if seconds is None else seconds
-            going.append((_settings(_read(path / "run.json")), rest))
+            going.append((_settings(_told(path / "run.json")), rest))
     spent = [(settings, seconds) for settings, seconds in finished if math.isfinite(seconds)]
     runs, unlike, total = 0, 0, 0.0
     for own in map(set, planned):
@@ -98,12 +96,6 @@ def _settings(said: dict[str, object]) -> set[str]:
     return {word for word in found if isinstance(word, str)} if isinstance(found, list) else set()
 
 
-def _read(path: Path) -> dict[str, object]:
-    """A small file of a run; empty where it is none that can be read."""
-    try:
-        if path.is_symlink() or path.stat().st_size > LARGEST_FILE:
-            return {}
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
+def _told(path: Path) -> dict[str, object]:
+    found = small_json(path)
     return found if isinstance(found, dict) else {}
