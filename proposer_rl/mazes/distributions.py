@@ -176,8 +176,8 @@ class SpecificationSpace(LevelDistribution):
     def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
         """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
 
-        Of equally near ones it is the first; other pairs than the space has are rounded, also such
-        that lie outside of it.
+        Between equally near ones rounding decides. Pairs that the space does not have get the
+        nearest that it has, also where they lie outside of it.
         """
         wanted = zip(*specifications, strict=True)
         scaled = [
