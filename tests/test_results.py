@@ -28,7 +28,7 @@ TABLES = [
     ("docs/replay.md", 240, "sampled", "ID success", 11),
     ("README.md", 400, "medium", "ID success", 5),
     ("docs/comparison.md", 400, "medium", "ID success", 5),
-    ("docs/comparison.md", 750, "paper", "ID success", 3),
+    ("docs/comparison.md", 750, "paper", "ID success", 4),
     (GYMNASIUM, 40, "cartpole", "target success", 4),
     (GYMNASIUM, 80, "lunar_lander", "target success", 4),
     (GYMNASIUM, 60, "minigrid", "target success", 4),
