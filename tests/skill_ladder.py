@@ -52,7 +52,7 @@ class SkillLadder:
         self.agent.skills = train(skills, taught.float().mean(1))
         return Update(TensorDict({}, [*self.env.batch_size, 1]), TensorDict({}))
 
-    def check(self) -> None:
+    def check(self, first: int = 0) -> None:
         """Everything is finite."""
 
     def snapshot(self) -> TensorDict:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import itertools
 import json
 import re
 import shlex
@@ -111,16 +110,16 @@ def test_the_arguments_are_understood(
 
 
 def write_files(folder: Path) -> list[Path]:
-    """Writes the files that two pages show, each with its path in the second line."""
+    """Writes the files that two pages show, each after a line that ends in its path."""
     written = []
-    shown = [
-        blocks("yaml", PAGES[page]) for page in ("configuration", "your_gymnasium_environment")
-    ]
-    for block in itertools.chain(*shown):
-        file = folder / block.splitlines()[1].removeprefix("# ")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(block, encoding="utf-8")
-        written.append(file)
+    for page in ("configuration", "your_gymnasium_environment"):
+        shown = re.findall(r"`(my_conf/\S+)`:\n\n```yaml\n(.*?)```", PAGES[page], re.DOTALL)
+        assert len(shown) == len(blocks("yaml", PAGES[page]))
+        for path, block in shown:
+            file = folder / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(block, encoding="utf-8")
+            written.append(file)
     return written
 
 
