@@ -158,7 +158,7 @@ def saved_config(folder: Path) -> RunConfig:
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return _validated(RunConfig, {**values, **free})
-    except (ConfigError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import read_bounded
 
 PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
@@ -126,9 +127,7 @@ def checked(kind: type[T], value: Any, where: str) -> T:
 def small_json(path: Path, largest: int = 2**20) -> Any:
     """What a small file of a run says; None where it is none that can be read."""
     try:
-        if path.is_symlink() or path.stat().st_size > largest:
-            return None
-        return json.loads(path.read_text(encoding="utf-8"))
+        return None if path.is_symlink() else json.loads(read_bounded(path, largest))
     except (OSError, ValueError, RecursionError):
         return None
 
