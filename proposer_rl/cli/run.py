@@ -14,7 +14,7 @@ from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import ConfigError, RunConfig
 from proposer_rl.cli.errors import SIGNALLED, one_line
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
-from proposer_rl.cli.same_run import check_same_run
+from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
@@ -40,6 +40,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         The headline measurement at the end.
     """
     status = Status(config.proposer.meta_episode_length)
+    config = as_begun(config, path)
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     with locked(path), signals:
         try:
@@ -77,7 +78,7 @@ def live(
     before: RunFolder | None = None
     for lifetime in range(config.lifetimes):
         folder = RunFolder(path / f"lifetime_{lifetime}" if config.lifetimes > 1 else path)
-        # What `auto` has become, so that a run does not go on in another precision elsewhere.
+        # What `auto` has become, so that a run goes on in the same precision elsewhere.
         check_same_run(folder, config.model_copy(update={"precision": made.task.precision}))
         scope: tuple[str | int, ...] = ()
         if before is not None:

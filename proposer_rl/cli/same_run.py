@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
@@ -48,6 +49,24 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
             f"{key}={_short(new)}: the run in {folder.path} was started with {_short(old)}; "
             f"differing keys: {', '.join(differing)}"
         )
+
+
+def as_begun(config: RunConfig, path: Path) -> RunConfig:
+    """The settings, with what ``precision=auto`` was on the machine where the run was begun.
+
+    Args:
+        config: the settings that are asked for.
+        path: the run's folder, whether or not there is one.
+
+    Raises:
+        ConfigError: if the folder's ``config.json`` is no JSON.
+        StorageError: if it cannot be read.
+    """
+    files = (path / "config.json", path / "lifetime_0" / "config.json")
+    begun = next((stored_config(file) for file in files if file.is_file()), None)
+    if config.precision != "auto" or not isinstance(begun, dict):
+        return config
+    return config.model_copy(update={"precision": begun.get("precision", "auto")})
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:

@@ -353,13 +353,13 @@ class MazeTask:
 def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     """``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
 
-    That is a wide network on a CPU with matrix instructions for it; see docs/benchmark.md.
+    That is a wide network on a CPU with instructions for it; see docs/benchmark.md.
 
     Args:
         channels: of the Solver's network.
         device: that it runs on.
     """
-    in_hardware = device.type == "cpu" and torch.cpu._is_amx_tile_supported()
+    in_hardware = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 

@@ -263,7 +263,7 @@ def test_the_bins_are_the_product_of_the_axes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("amx", "device", "channels", "expected"),
+    ("bf16", "device", "channels", "expected"),
     [
         (True, "cpu", [64, 128, 256], "bf16"),
         (True, "cpu", [16, 32, 32], "fp32"),
@@ -272,7 +272,7 @@ def test_the_bins_are_the_product_of_the_axes() -> None:
     ],
 )
 def test_bf16_is_chosen_where_it_was_measured(
-    monkeypatch: pytest.MonkeyPatch, amx, device, channels, expected
+    monkeypatch: pytest.MonkeyPatch, bf16, device, channels, expected
 ) -> None:
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: bf16)
     assert faster_precision(channels, torch.device(device)) == expected
