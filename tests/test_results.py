@@ -21,7 +21,6 @@ GYMNASIUM = "docs/your_gymnasium_environment.md"
 # Pages with tables, updates of the runs in them, folder of their results, headline, least number of
 # rows. A page has no two tables of runs of the same length.
 TABLES = [
-    ("README.md", 240, "curricula", "ID success", 20),
     ("docs/comparison.md", 240, "curricula", "ID success", 20),
     ("docs/first_order.md", 240, "curricula", "ID success", 8),
     ("docs/choice.md", 240, "curricula", "ID success", 8),
