@@ -5,23 +5,21 @@ import os
 # Before anything imports pyplot: tests draw into files, also where there is no display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-import logging
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import hypothesis
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from proposer_rl.cli import run
 from proposer_rl.cli.train import main
+from tests.commands import call
 from tests.processes import Processes
 
 # A busy machine makes an example slow, not wrong.
@@ -87,28 +85,6 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def train(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Calls the command in this process; returns its exit code."""
-
-    def call(*arguments: str) -> int:
-        GlobalHydra.instance().clear()
-        HydraConfig.instance().cfg = None
-        monkeypatch.setattr(sys, "argv", ["proposer-train", *arguments])
-        try:
-            main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        finally:
-            _forget_loggers()
-        return 0
-
-    return call
-
-
-def _forget_loggers() -> None:
-    """Hydra's loggers write to what stood for the terminal in the test that called the command."""
-    for logger in (logging.getLogger(), logging.getLogger("hydra")):
-        for handler in logger.handlers[:]:
-            if type(handler) in (logging.StreamHandler, logging.FileHandler):
-                logger.removeHandler(handler)
-                handler.close()
+def train() -> Callable[..., int]:
+    """Calls ``bin/train`` in this process; returns its exit code."""
+    return partial(call, main)

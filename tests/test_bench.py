@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from benchmarks.timing import interleave, ratio, threads
 from proposer_rl.mazes import MazeEnv, generate_levels
 from proposer_rl.report.timing import read_timing
 from proposer_rl.streams import Streams
+from tests.commands import call
 from tests.report.folders import write_run
 
 TRIED = Options(repeats=2, precision="fp32", size="tiny")
@@ -35,16 +36,7 @@ TRIED = Options(repeats=2, precision="fp32", size="tiny")
 def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Call the command in a folder of its own; returns its exit code."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> int:
-        monkeypatch.setattr(sys, "argv", ["bin/bench", *arguments])
-        try:
-            main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
-    return call
+    return partial(call, main)
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)

@@ -17,6 +17,7 @@ from benchmarks.peer import jaxued_maze, played
 from benchmarks.timing import threads
 from benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
 from proposer_rl.mazes.view.levels import ViewLevel
+from tests.commands import call
 from tests.mazes.view.oracles import random_levels
 
 DRAWINGS = ["v#..\n.#G.", "..<#\nG...", "G#.^\n....", "...G\n.>#."]
@@ -83,10 +84,7 @@ def test_refused_before_anything_is_measured(
     monkeypatch, capsys, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["bin/bench", *arguments])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
+    assert call(main, *arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: --jaxued ") and message in line
     assert not (tmp_path / "bench.json").exists()

@@ -5,19 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.evaluate import SHOWN
 from proposer_rl.cli.instruments import evaluate as main
-from proposer_rl.cli.train import main as train
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
+from tests.commands import trained_run
 
 KEYS = ["success", "return", "greedy_success", "greedy_return"]
 
@@ -41,20 +39,9 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of two Solvers that were trained side by side."""
+    settings = ["compute.progress=false", "seeds=[3,5]", "task.evaluation.levels=40"]
     folder = tmp_path_factory.mktemp("runs") / "trained"
-    settings = [
-        "+scale=smoke",
-        "compute.progress=false",
-        "seeds=[3,5]",
-        "task.evaluation.levels=40",
-    ]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            sys, "argv", ["train", "+method=target", *settings, f"hydra.run.dir={folder}"]
-        )
-        GlobalHydra.instance().clear()
-        train()
-    return folder
+    return trained_run(folder, "+method=target", "+scale=smoke", *settings)
 
 
 @pytest.mark.parametrize("name", ["ID", "ood"])

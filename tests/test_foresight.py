@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,9 @@ import torch
 from scipy.stats import spearmanr
 from tensordict import TensorDict
 
-from proposer_rl.cli import train
 from proposer_rl.cli.foresight import agreement
 from proposer_rl.cli.instruments import foresight
+from tests.commands import call, trained_run
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
@@ -58,13 +57,11 @@ def growing(rates: torch.Tensor):
 def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, output = tmp_path / "run", tmp_path / "rows.json"
-    smoke = ["+method=target", "+scale=smoke", "compute.progress=false", f"hydra.run.dir={run}"]
-    monkeypatch.setattr(sys, "argv", ["train", *smoke, "schedule.updates=2"])
-    train.main()
+    smoke = ["+method=target", "+scale=smoke", "compute.progress=false", "schedule.updates=2"]
+    run, output = trained_run(tmp_path / "run", *smoke), tmp_path / "rows.json"
     sizes = ["--ahead", "1", "2", "--proposals", "4", "--copies", "1", "--levels", "8"]
-    monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes, "--output", str(output)])
-    foresight()
+    command = [str(run), *sizes, "--output", str(output)]
+    assert call(foresight, *command) == 0
     rows = json.loads(output.read_text())
     stages = len(list((run / "checkpoints").glob("*.pt")))
     assert [row["ahead"] for row in rows] == [1, 2] * stages
@@ -72,12 +69,9 @@ def test_every_checkpoint_and_every_number_of_updates_gets_a_row(
     worth = torch.arange(4.0)
     monkeypatch.setattr("proposer_rl.cli.foresight._scores", lambda *_: worth)
     monkeypatch.setattr("proposer_rl.cli.foresight.performance_at", growing(2 * worth))
-    foresight()
+    assert call(foresight, *command) == 0
     for row in json.loads(output.read_text()):
         assert (row["rank"], row["explained"]) == pytest.approx((1, 1))
         assert row["slope"] == pytest.approx(2 * row["ahead"], rel=1e-3)
-    monkeypatch.setattr(sys, "argv", ["foresight", str(run), *sizes[:3], "--proposals", "3"])
-    with pytest.raises(SystemExit) as stopped:
-        foresight()
-    assert stopped.value.code == 2
+    assert call(foresight, str(run), *sizes[:3], "--proposals", "3") == 2
     assert "--proposals: must be a whole number of at least 4, got '3'" in capsys.readouterr().err

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.instruments import EXPLORATIONS, look, snr
 from proposer_rl.cli.train import main as train
+from tests.commands import call, trained_run
 
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"]
 
 
-def call(command, *arguments: str) -> int:
-    before, sys.argv = sys.argv, ["command", *arguments]
-    try:
-        GlobalHydra.instance().clear()
-        command()
-    except SystemExit as end:
-        return int(end.code or 0)
-    finally:
-        sys.argv = before
-    return 0
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "learnt"
-    assert call(train, "+method=perf_gain", *SMOKE, f"hydra.run.dir={folder}") == 0
-    return folder
+    return trained_run(tmp_path_factory.mktemp("runs") / "learnt", "+method=perf_gain", *SMOKE)
 
 
 def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys) -> None:

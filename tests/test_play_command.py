@@ -18,14 +18,14 @@ import uvicorn
 
 from proposer_rl.cli import play
 from proposer_rl.extras import install_command
-from tests.play.pages import trained
+from tests.commands import trained_run
 
 SMOKE = ("+method=target", "+scale=smoke", "compute.progress=false", "schedule.updates=2")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(tmp_path_factory.mktemp("runs") / "run", *SMOKE)
+    return trained_run(tmp_path_factory.mktemp("runs") / "run", *SMOKE)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

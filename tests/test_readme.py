@@ -6,12 +6,10 @@ import io
 import re
 import shlex
 import shutil
-import sys
 from itertools import takewhile
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -22,6 +20,7 @@ from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.generalisation import write_scores
+from tests.commands import call, trained_run
 from tests.gymnasium_task.toys import TINY
 from tests.report.folders import write_run, write_seconds
 
@@ -96,10 +95,8 @@ def test_the_commands_run(
         for word in small
         if word.startswith("checkpoint=")
     ]
-    for call in (*before, small):
-        monkeypatch.setattr(sys, "argv", ["bin/train", *call])
-        GlobalHydra.instance().clear()
-        main()
+    for arguments in (*before, small):
+        assert call(main, *arguments) == 0
     assert list(tmp_path.rglob("summary.json"))
 
 
@@ -133,11 +130,7 @@ def test_the_commands_about_levels_run(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     (drawn,) = blocks("text", (DOCS / "levels.md").read_text(encoding="utf-8"))
     Path("my_levels.txt").write_text(drawn)
-    monkeypatch.setattr(
-        sys, "argv", ["bin/train", "+method=target", "+scale=smoke", "hydra.run.dir=my_run"]
-    )
-    GlobalHydra.instance().clear()
-    main()
+    trained_run(Path("my_run"), "+method=target", "+scale=smoke")
     found = commands("bin/eval")
     assert found
     for arguments in found:

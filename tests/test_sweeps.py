@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
@@ -15,6 +14,7 @@ from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
+from tests.commands import call
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
@@ -26,17 +26,7 @@ def train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     # Launchers start other processes, which shall run this checkout too.
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
-
-    def call(*arguments: str) -> int:
-        GlobalHydra.instance().clear()
-        monkeypatch.setattr(sys, "argv", ["proposer-train", *arguments])
-        try:
-            main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
-    return call
+    return partial(call, main)
 
 
 def measured(folder: Path, seed: int) -> dict[str, object]:

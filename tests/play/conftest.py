@@ -7,27 +7,28 @@ from pathlib import Path
 
 import pytest
 
-from tests.play.pages import CARS, MAZES, VIEWS, Page, served, trained
+from tests.commands import trained_run
+from tests.play.pages import CARS, MAZES, VIEWS, Page, served
 from tests.tiny import EXAMPLES
 
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Mazes, two Solvers side by side, three checkpoints."""
-    return trained(tmp_path_factory.mktemp("runs") / "mazes", *MAZES, "seeds=[3,5]")
+    return trained_run(tmp_path_factory.mktemp("runs") / "mazes", *MAZES, "seeds=[3,5]")
 
 
 @pytest.fixture(scope="session")
 def car_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
-        yield trained(tmp_path_factory.mktemp("runs") / "cars", *CARS)
+        yield trained_run(tmp_path_factory.mktemp("runs") / "cars", *CARS)
 
 
 @pytest.fixture(scope="session")
 def view_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """Mazes seen through a window, two checkpoints."""
-    with served(trained(tmp_path_factory.mktemp("runs") / "views", *VIEWS)) as page:
+    with served(trained_run(tmp_path_factory.mktemp("runs") / "views", *VIEWS)) as page:
         yield page
 
 

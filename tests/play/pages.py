@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +9,7 @@ from threading import Thread
 from time import monotonic, sleep
 from typing import NamedTuple
 
-import pytest
-from hydra.core.global_hydra import GlobalHydra
-
 from proposer_rl.cli.play import open_session
-from proposer_rl.cli.train import main
 from proposer_rl.play.server import application, listen, server
 from tests.tiny import EXAMPLES
 
@@ -40,14 +35,6 @@ class Page(NamedTuple):
     port: int
     address: str
     run: Path
-
-
-def trained(folder: Path, *settings: str) -> Path:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train", *settings, f"hydra.run.dir={folder}"])
-        GlobalHydra.instance().clear()
-        main()
-    return folder
 
 
 def files(folder: Path) -> dict[Path, tuple[int, int]]:

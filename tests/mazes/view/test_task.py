@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.instruments import evaluate
 from proposer_rl.cli.train import main as train
@@ -16,21 +14,15 @@ from proposer_rl.mazes.view.env import ViewMazeEnv
 from proposer_rl.mazes.view.levels import ViewLevel, validate_view_levels
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
+from tests.commands import call
 from tests.tiny import composed, tiny_view_task
 
 SMOKE = ["task=view_maze_smoke", "compute.progress=false"]
 
 
-def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> int:
+def run(folder: Path, *words: str) -> int:
     """Calls bin/train at the smallest size; returns its exit code."""
-    call = ["train", *SMOKE, *words, f"hydra.run.dir={folder}"]
-    monkeypatch.setattr(sys, "argv", call)
-    GlobalHydra.instance().clear()
-    try:
-        train()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
+    return call(train, *SMOKE, *words, f"hydra.run.dir={folder}")
 
 
 def test_the_fields_numbers_are_the_default() -> None:
@@ -95,12 +87,12 @@ def test_a_run_is_trained_resumed_and_evaluated(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["+method=accel", "seed=2", "schedule.updates=4"]
-    assert run(monkeypatch, tmp_path / "once", *words) == 0
+    assert run(tmp_path / "once", *words) == 0
     rows = read_csv(tmp_path / "once" / "metrics.csv")
     assert float(rows[-1]["curriculum_frames"]) > 0
     newest = max((tmp_path / "once" / "checkpoints").iterdir())
     newest.unlink()
-    assert run(monkeypatch, tmp_path / "once", *words) == 0
+    assert run(tmp_path / "once", *words) == 0
     for before, after in zip(rows, read_csv(tmp_path / "once" / "metrics.csv"), strict=True):
         assert {**before, "seconds": 0} == {**after, "seconds": 0}
     Path("mine.txt").write_text("[hall]\n>..G\n[turn]\n<.G\n")
@@ -136,7 +128,7 @@ def test_what_does_not_go_is_refused_before_anything_is_written(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, tmp_path / "none", *words) == 2
+    assert run(tmp_path / "none", *words) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and said in lines[0]
     assert not list(tmp_path.iterdir())
@@ -150,7 +142,7 @@ def test_a_file_that_holds_no_levels_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, tmp_path / "run", "+method=target", "schedule.updates=2") == 0
+    assert run(tmp_path / "run", "+method=target", "schedule.updates=2") == 0
     capsys.readouterr()
     if not file.startswith("missing"):
         Path(file).write_text(">#G\n")
