@@ -163,6 +163,16 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkey
     assert "error: precision='bf16': the run in" in capsys.readouterr().err
 
 
+def test_a_precision_that_nobody_wrote_is_told_in_one_line(train, capsys) -> None:
+    command = ["+method=domain_randomization", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
+    assert train(*command) == 0
+    config = Path("run/config.json")
+    config.write_text(config.read_text().replace('"fp32"', '"fp8"'))
+    assert train(*command, "schedule.updates=4") == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: precision='fp32': the run in") and "'fp8'" in error
+
+
 def test_lives_go_on_in_the_precision_that_they_began_with(train, monkeypatch) -> None:
     command = ["+method=perf_gain", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*command, "lifetimes=2") == 0

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from proposer_rl.report.findings import finding_table, findings
@@ -95,6 +96,20 @@ def test_the_tables_have_the_numbers_of_the_results(
         }
         for column in expected.keys() & row.keys():
             assert row[column] == expected[column], (row["method"], column)
+
+
+def test_the_columns_by_seed_have_the_numbers_of_the_measurements() -> None:
+    metrics = pd.read_csv(ROOT / "results" / "paper" / "tables" / "metrics.csv")
+    for row in rows("docs/comparison.md", 750):
+        of_method = metrics[metrics["method"] == row["method"].strip("`")].sort_values("updates")
+        seeds = [run for _, run in of_method.groupby("seed")]
+        ends = [f"{run['id_success'].iloc[-1]:.3f}" for run in seeds]
+        reached = [run["updates"][run["id_success"] >= 0.95].min() for run in seeds]
+        assert row["seeds"] == str(len(seeds))
+        assert row["success at the end by seed"] == ", ".join(ends)
+        assert row["updates to 95 % by seed"] == ", ".join(
+            "never" if pd.isna(update) else f"{update:.0f}" for update in reached
+        )
 
 
 @pytest.mark.parametrize("runs", sorted((ROOT / "results").glob("*/runs")), ids=str)

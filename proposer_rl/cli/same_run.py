@@ -62,11 +62,13 @@ def as_begun(config: RunConfig, path: Path) -> RunConfig:
         ConfigError: if the folder's ``config.json`` is no JSON.
         StorageError: if it cannot be read.
     """
+    if config.precision != "auto":
+        return config
     files = (path / "config.json", path / "lifetime_0" / "config.json")
     begun = next((stored_config(file) for file in files if file.is_file()), None)
-    if config.precision != "auto" or not isinstance(begun, dict):
-        return config
-    return config.model_copy(update={"precision": begun.get("precision", "auto")})
+    precision = begun.get("precision") if isinstance(begun, dict) else None
+    known = precision in ("fp32", "bf16")
+    return config.model_copy(update={"precision": precision}) if known else config
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
