@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Locator, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    Download,
+    Locator,
+    expect,
+    sync_playwright,
+)
 from playwright.sync_api import Page as Tab
 
 from proposer_rl.cli.build import make_task
@@ -97,12 +104,18 @@ def drag(tab: Tab, *cells: tuple[int, int], button: Any = "left") -> None:
 
 def saved(tab: Tab, folder: Path) -> list[str]:
     """The level on the page, by way of its Save button."""
-    with tab.expect_download() as download:
-        tab.get_by_role("button", name="Save", exact=True).click()
-    file = folder / download.value.suggested_filename
-    download.value.save_as(file)
+    file = folder / "saved.txt"
+    download(tab).save_as(file)
     (level,) = read_levels(file).values()
     return str(level.to_text()).splitlines()
+
+
+def download(tab: Tab) -> Download:
+    """What Save gives; if nothing, whether it was not heard, refused or not downloaded."""
+    with tab.expect_download() as started, tab.expect_response(re.compile("/file$")) as answer:
+        tab.get_by_role("button", name="Save", exact=True).click()
+    assert answer.value.ok
+    return started.value
 
 
 def success(
@@ -347,9 +360,7 @@ def test_a_maze_seen_through_a_window_is_drawn_watched_and_played(view_tab: Tab)
     tab.get_by_role("radio", name="wall").click()
     drag(tab, (2, 0), (2, 3))
     expect(status).to_contain_text("success")
-    with tab.expect_download() as download:
-        tab.get_by_role("button", name="Save", exact=True).click()
-    rows = download.value.path().read_text().split()[-5:]
+    rows = download(tab).path().read_text().split()[-5:]
     assert rows == [".....", "^....", "####.", ".....", "....G"]
     expect(table.locator("tr").nth(2)).to_contain_text("9")  # two turns and seven moves
     for kind in ("greedy", "sampled"):
