@@ -521,7 +521,8 @@ def test_everything_in_an_update_stays_on_the_device(
     assert {leaf.device.type for leaf in leaves} == {"meta"}
 
 
-def test_an_exact_evaluation_stays_on_the_device() -> None:
+def test_an_exact_evaluation_stays_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     agent = TASK.learner([Streams(0)]).agent.to("meta")
     measured = TASK.target.sample(6, torch.Generator()).to("meta")
     with Crossings() as crossings:

@@ -248,6 +248,14 @@ def shortest_path_logits(level: Level) -> Tensor:
     return logits
 
 
+@pytest.mark.parametrize(("moves", "expected"), [(25, 1 - 25 * 0.01), (26, -25 * 0.01)])
+def test_by_default_an_episode_has_the_papers_25_moves(moves: int, expected: float) -> None:
+    corridor = Level.from_text(f"S{'.' * (moves - 1)}G")
+    reached = ExactEvaluator(greedy=True)(corridor, shortest_path_logits(corridor))["return"]
+    assert reached.item() == pytest.approx(expected, abs=1e-5)
+    assert optimal_return(corridor).item() == pytest.approx(expected, abs=1e-5)
+
+
 @settings(max_examples=30)
 @given(max_steps=st.integers(1, 15), seed=st.integers(0, 10_000))
 def test_the_optimum_is_reached_on_a_shortest_path_and_passed_by_no_policy(
