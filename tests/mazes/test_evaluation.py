@@ -321,6 +321,14 @@ def test_what_is_differentiated_is_what_is_evaluated() -> None:
         assert torch.equal(evaluator.differentiable(levels, logits)["return"], expected["return"])
 
 
+def test_logits_of_half_precision_are_evaluated_in_single() -> None:
+    levels, logits = random_levels(6, 4, 5, 0.3, 0), random_logits(6, 4, 4, 5, scale=3.0)
+    rounded = logits.to(torch.bfloat16)
+    found = ExactEvaluator()(levels, rounded)["return"]
+    expected = ExactEvaluator()(levels, rounded.float())["return"]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
 def test_double_precision_is_kept() -> None:
     levels, logits = random_levels(2, 3, 3, 0.2, 3), random_logits(2, 4, 3, 3).double()
     result = ExactEvaluator(max_steps=8, step_penalty=0.05)(levels, logits)
