@@ -104,8 +104,9 @@ def drag(tab: Tab, *cells: tuple[int, int], button: Any = "left") -> None:
 
 def saved(tab: Tab, folder: Path) -> list[str]:
     """The level on the page, by way of its Save button."""
-    file = folder / "saved.txt"
-    download(tab).save_as(file)
+    given = download(tab)
+    file = folder / given.suggested_filename
+    given.save_as(file)
     (level,) = read_levels(file).values()
     return str(level.to_text()).splitlines()
 
