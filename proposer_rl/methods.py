@@ -170,13 +170,16 @@ def task_difficulty(parts: Parts) -> ProposerCurriculum:
     return proposer(parts, rewards.task_difficulty)
 
 
-def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
+def frozen_proposer(
+    parts: Parts, checkpoint: str | None, choose: Choose = None
+) -> ProposerCurriculum:
     """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
 
     Args:
         parts: the task, and the settings of the Proposer's network and actions, which must be those
             of that run.
         checkpoint: a checkpoint of that run, or its folder for the newest.
+        choose: see :func:`_choice`.
 
     Raises:
         ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
@@ -201,6 +204,7 @@ def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
         meta_episode_length=chosen.meta_episode_length,
         action_repeat=chosen.action_repeat,
         own_action=chosen.own_action,
+        choice=_choice(task, choose),
     )
 
 

@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from proposer_rl.curricula import (
+    Choice,
     Curriculum,
     Improvement,
     Proposal,
@@ -14,6 +15,7 @@ from proposer_rl.curricula import (
     ProposerTrainer,
     SamplingCurriculum,
     ScheduleCurriculum,
+    Scorer,
 )
 from proposer_rl.curricula.proposer import explained_share
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, load_agent
@@ -29,6 +31,7 @@ from proposer_rl.models import (
 )
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
 from tests.meta.test_env import SPACE, E, K, L, P, meta_env, mixture
 from tests.tiny import TASK, learners
 
@@ -327,6 +330,32 @@ def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> N
         expected = learnt.propose(solver, number, update(number)).levels
         assert (loaded.propose(solver, number, update(number)).levels == expected).all()
     assert (weights(learnt) == before).all()
+
+
+@pytest.mark.parametrize("mix", [False, True])
+def test_a_frozen_ones_solver_trains_on_the_most_learnable_of_more_proposals(mix: bool) -> None:
+    learnt, solver = proposer(mix=mix), learners(1)
+    frozen = ProposerCurriculum(
+        learnt.agent,
+        learnt.view,
+        learnt.actions,
+        meta_episode_length=L,
+        action_repeat=1,
+        own_action="sample",
+        choice=Choice(Scorer(TASK, "learnability", "exact"), times=4, temperature=1e-5),
+    )
+    proposal = frozen.propose(solver, 0, update(0))
+    action = frozen.state_dict()["action"]
+    many, bins = learnt.actions.levels(action, 4 * P, update(0))
+    if not mix:  # each level that the action names, four times
+        assert torch.equal(bins.sort().values, action.repeat_interleave(4, 1).sort().values)
+    assert proposal.evaluations == frozen.view.validation_levels + 4 * P
+
+    def learnability(levels: Levels) -> torch.Tensor:
+        success = TASK.performance(solver.agent, levels, torch.Generator())["success"]
+        return (success * (1 - success)).sort(descending=True).values
+
+    torch.testing.assert_close(learnability(proposal.levels), learnability(many)[:, :P])
 
 
 def test_a_fresh_solvers_cycle_is_not_the_last_ones() -> None:

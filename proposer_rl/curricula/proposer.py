@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
+from proposer_rl.curricula.choice import Choice
 from proposer_rl.learning import PPO, located
 from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.copies import Copies, CopiesHere
@@ -36,6 +37,8 @@ class ProposerCurriculum(Curriculum):
         own_action: the action for the Solver itself: a ``"sample"`` of the policy, or its
             ``"mode"``, without exploration.
         trainer: how it learns; None to leave it as it is.
+        choice: of the levels that the Solver trains on, among several times as many; None for all.
+            Copies train on all.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class ProposerCurriculum(Curriculum):
         action_repeat: int,
         own_action: Literal["sample", "mode"],
         trainer: ProposerTrainer | None = None,
+        choice: Choice | None = None,
     ) -> None:
         self.agent = agent
         self.view = view
@@ -56,6 +60,7 @@ class ProposerCurriculum(Curriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
+        self.choice = choice
         self.trains_copies = trainer is not None
         self._began = 0  # the Solver's updates at the start of this cycle
         self._action: Tensor | None = None
@@ -83,9 +88,10 @@ class ProposerCurriculum(Curriculum):
         if self._action is None or (updates - self._began) % self.action_repeat == 0:
             self._action = self._act(learner, updates - self._began, stream)
             evaluations = self.view.validation_levels
-        batch_size = learner.env.batch_size[1:].numel()
-        levels, _ = self.actions.levels(self._action, batch_size, [stream])
-        return Proposal(levels, evaluations=evaluations)
+        count = learner.env.batch_size[1:].numel() * (self.choice.times if self.choice else 1)
+        levels, _ = self.actions.levels(self._action, count, [stream])
+        proposal = Proposal(levels, evaluations=evaluations)
+        return self.choice(learner, proposal, streams)[1] if self.choice else proposal
 
     def state_dict(self) -> dict[str, Any]:
         """Where the cycle's levels come from, how far it is, the action that holds; the trainer."""
