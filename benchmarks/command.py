@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from dataclasses import asdict
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -67,7 +67,7 @@ def run(names: list[str], options: Options, threads: int | None, output: Path) -
     """
     chosen = selected(names, options.size == "full", options.device.startswith("cuda"))
     content: dict[str, Any] = {
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(options.device),
         "versions": versions(),
         "options": asdict(options),

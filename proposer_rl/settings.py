@@ -7,10 +7,9 @@ A rule that joins several settings stands where the object is built that needs i
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar, dataclass_transform
 
 from annotated_types import Ge, Gt, Interval, Le, Len
-from typing_extensions import dataclass_transform
 
 T = TypeVar("T")
 

@@ -73,7 +73,8 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
         "jaxued": None,
         "runs": [],
     }
-    assert content["machine"]["cores"] and content["versions"]["torch"] == torch.__version__
+    assert content["machine"]["cores"]
+    assert content["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
     assert "error" in content["benchmarks"]["absent"]
     measured = content["benchmarks"]["shortest_paths"]
     assert measured["seconds"] > 0 and measured["threads"] == 1

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -16,11 +17,6 @@ import pytest
 import yaml
 
 from tests.processes import python
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -104,7 +100,8 @@ def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -
     assert distribution.metadata["License-Expression"] == "MIT"
     assert [file.name for file in distribution.files or [] if file.name == "LICENSE"]
     top = {Path(str(file)).parts[0] for file in distribution.files or []}
-    assert top == {"proposer_rl", distribution._path.name, ".."}  # .. for bin/
+    # Some versions of pip also list the commands in bin/, from there.
+    assert top - {".."} == {"proposer_rl", distribution._path.name}
 
 
 def test_a_source_archive_holds_no_results_and_no_tests(installed: Installed) -> None:

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import os
 import sys
+from argparse import ArgumentParser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
@@ -39,7 +42,8 @@ def _compose_and_run() -> None:
     _refuse_pickles(sys.argv)
     BEGUN.clear()
     try:
-        _main()
+        with _unchecked_help():
+            _main()
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
@@ -48,6 +52,20 @@ def _compose_and_run() -> None:
             raise
         remove_traces()
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
+
+
+@contextmanager
+def _unchecked_help() -> Iterator[None]:
+    """Hydra gives one help text that is no string (up to 1.3.8), which Python 3.14 refuses."""
+    if sys.version_info < (3, 14):
+        yield
+        return
+    checked = ArgumentParser._check_help
+    ArgumentParser._check_help = lambda self, action: None
+    try:
+        yield
+    finally:
+        ArgumentParser._check_help = checked
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")

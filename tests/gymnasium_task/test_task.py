@@ -6,6 +6,8 @@ import base64
 import io
 import json
 import shutil
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,11 @@ from tests.gymnasium_task.toys import PARAMETERS, TINY, Walk, walk_task
 from tests.same_run import assert_same_run
 from tests.test_docs import TRAIN, write_files
 from tests.tiny import composed
+
+NO_BOX2D = pytest.mark.skipif(
+    sys.version_info >= (3, 14) and find_spec("Box2D") is None,
+    reason="Box2D would have to be compiled for this Python",
+)
 
 
 def picture(record: dict[str, Any]) -> np.ndarray:
@@ -224,7 +231,11 @@ def test_of_images_and_continuous_actions_it_learns(image: bool) -> None:
 
 @pytest.mark.parametrize(
     ("name", "shape", "answers"),
-    [("cartpole", (4,), 2), ("lunar_lander", (8,), 4), ("minigrid", (7, 7, 3), 7)],
+    [
+        ("cartpole", (4,), 2),
+        pytest.param("lunar_lander", (8,), 4, marks=NO_BOX2D),
+        ("minigrid", (7, 7, 3), 7),
+    ],
 )
 def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: int) -> None:
     task: Any = make_task(composed(f"task={name}", "+method=target", *TINY))
