@@ -14,7 +14,7 @@ from benchmarks.results import Result, Row, Spread, Unit
 from proposer_rl.runs.machine import processor
 
 HEADER = ["what", "against", "measured", "from – to", "target", "reached"]
-PACKAGES = ("proposer_rl", "torch", "torchrl", "tensordict", "gymnasium", "networkx", "scipy")
+PACKAGES = ("proposer_rl", "torchrl", "tensordict", "gymnasium", "networkx", "scipy")
 
 
 def machine(device: str) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def machine(device: str) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Python's and the packages'; those that are not installed are left out."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "torch": str(torch.__version__)}
     for package in PACKAGES:
         try:
             found[package] = version(package)

@@ -263,8 +263,8 @@ class Experiment:
 
     def _record(self, levels: Any, update: Update) -> None:
         """Append how the training went and samples of its levels, for every copy."""
-        training = {key: float(value) for key, value in update.metrics.items()}
-        for seed, values in self._per_copy(self.task.statistics(levels, update.rollout)):
+        told = self.task.statistics(levels, update.rollout), update.metrics
+        for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
             self._append("training.csv", seed, {**values, **training})
         some = slice(RECORDED_LEVELS)
         for copy, seed in enumerate(self.seeds):

@@ -149,6 +149,12 @@ def proposer(
         )
     streams = Streams(parts.seeds[0], "proposer")
     env = meta_env(task, chosen, streams, reward, range(chosen.rollouts), parts.on_update)
+    unknown = [name for name in chosen.observes if name not in env.observation_spec.keys()]
+    if unknown:
+        raise ValueError(
+            f"proposer.observes={chosen.observes}: this task does not tell {', '.join(unknown)}; "
+            "return and progress are there"
+        )
     with streams.as_default("weights"):
         agent = proposer_agent(task, chosen)
     numbers = PPOSettings(horizon=env.steps, **asdict(chosen.ppo))
@@ -192,11 +198,17 @@ def frozen_proposer(
     agent = proposer_agent(task, chosen)
     learnt = _curriculum_state(Path(checkpoint))
     try:
+        observed = [name for name in learnt["observed"] if name != "probes"]
         load_agent(agent, TensorDict(learnt["proposer"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
         ) from error
+    if observed != chosen.observes:
+        raise ValueError(
+            f"proposer.observes={chosen.observes}: the Proposer of checkpoint={checkpoint} has "
+            f"learnt with {observed}"
+        )
     return ProposerCurriculum(
         agent,
         solver_view(task, chosen),

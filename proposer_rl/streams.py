@@ -60,7 +60,8 @@ class Streams:
         For code that takes no generator, such as the initialisation of layers.
         """
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self._seed_of(*key))
+            # torch.manual_seed would seed the generators of GPUs, too.
+            torch.default_generator.manual_seed(self._seed_of(*key))
             yield
 
     def _seed_of(self, *key: str | int) -> int:

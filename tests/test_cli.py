@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from proposer_rl.cli.config import methods
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -46,7 +47,7 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     assert [sample["updates"] for sample in samples] == [2, 4, 6]
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["method"] == method and summary["updates_to_threshold"] == [None]
-    assert summary["versions"]["torchrl"]
+    assert summary["versions"]["torchrl"] and summary["versions"]["torch"] == torch.__version__
     assert (folder / "run.png").stat().st_size > 10_000
     if method in LEARN_FROM_COPIES:
         cycles = read_jsonl(folder / "cycles.jsonl")
@@ -73,6 +74,22 @@ def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train,
     assert train(*arguments, "hydra.run.dir=run") == 2
     assert f"error: curriculum: {said}\n" in capsys.readouterr().err
     assert not Path("run").exists()
+
+
+def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
+    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt") == 0
+    arguments = ["+method=frozen_proposer", *SMOKE, "checkpoint=learnt", "hydra.run.dir=run"]
+    assert train(*arguments, "proposer.observes=[return,progress]") == 2
+    said = "the Proposer of checkpoint=learnt has learnt with ['log_success', 'progress']"
+    assert said in capsys.readouterr().err and not Path("run").exists()
+    assert train(*arguments, "schedule.updates=4") == 0
+    # The checkpoint moves on, and the Proposer that this run began with does not.
+    began = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
+    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt", "schedule.updates=9") == 0
+    assert train(*arguments) == 0
+    ended = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
+    for name, entry in began.items():
+        assert torch.equal(entry["value"], ended[name]["value"])
 
 
 def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:

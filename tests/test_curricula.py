@@ -18,7 +18,7 @@ from proposer_rl.curricula import (
     Scorer,
 )
 from proposer_rl.curricula.proposer import explained_share
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, load_agent
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, agent_weights, load_agent
 from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.models import (
     ActorCritic,
@@ -64,6 +64,19 @@ def proposer(
     advantage = LeaveOneOutBaseline(1.0) if mix else None
     ppo = PPO(env, proposer_agent(mix), settings, advantage=advantage)
     return ProposerTrainer(ppo, advance=advance).curriculum(own_action)
+
+
+def frozen(learnt: ProposerCurriculum, choice: Choice | None = None) -> ProposerCurriculum:
+    """The same Proposer, learning no more."""
+    return ProposerCurriculum(
+        learnt.agent,
+        learnt.view,
+        learnt.actions,
+        meta_episode_length=learnt.meta_episode_length,
+        action_repeat=learnt.action_repeat,
+        own_action=learnt.own_action,
+        choice=choice,
+    )
 
 
 def weights(curriculum: ProposerCurriculum) -> TensorDict:
@@ -335,21 +348,14 @@ def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> N
 @pytest.mark.parametrize("mix", [False, True])
 def test_a_frozen_ones_solver_trains_on_the_most_learnable_of_more_proposals(mix: bool) -> None:
     learnt, solver = proposer(mix=mix), learners(1)
-    frozen = ProposerCurriculum(
-        learnt.agent,
-        learnt.view,
-        learnt.actions,
-        meta_episode_length=L,
-        action_repeat=1,
-        own_action="sample",
-        choice=Choice(Scorer(TASK, "learnability", "exact"), times=4, temperature=1e-5),
-    )
-    proposal = frozen.propose(solver, 0, update(0))
-    action = frozen.state_dict()["action"]
+    choice = Choice(Scorer(TASK, "learnability", "exact"), times=4, temperature=1e-5)
+    curriculum = frozen(learnt, choice)
+    proposal = curriculum.propose(solver, 0, update(0))
+    action = curriculum.state_dict()["action"]
     many, bins = learnt.actions.levels(action, 4 * P, update(0))
     if not mix:  # each level that the action names, four times
         assert torch.equal(bins.sort().values, action.repeat_interleave(4, 1).sort().values)
-    assert proposal.evaluations == frozen.view.validation_levels + 4 * P
+    assert proposal.evaluations == curriculum.view.validation_levels + 4 * P
 
     def learnability(levels: Levels) -> torch.Tensor:
         success = TASK.performance(solver.agent, levels, torch.Generator())["success"]
@@ -371,17 +377,7 @@ def test_a_frozen_one_sees_the_next_solver_through_levels_of_its_life() -> None:
     """As one that has seen no other Solver."""
     lives = [[Streams(0, *scope)] for scope in ((), ("lifetime", 1))]
     first, second = learners(1), TASK.learner([Streams(1, "solver")])
-    old, fresh = (
-        ProposerCurriculum(
-            learnt.agent,
-            learnt.view,
-            learnt.actions,
-            meta_episode_length=4,
-            action_repeat=2,
-            own_action="sample",
-        )
-        for learnt in (proposer(**HELD), proposer(**HELD))
-    )
+    old, fresh = (frozen(proposer(**HELD)) for _ in range(2))
     old.improve(first, 5, lives[0])
     for updates in (5, 6, 7):  # the last begins an action that is to hold for one more
         old.propose(first, updates, update(updates))
@@ -396,6 +392,31 @@ def test_a_frozen_one_sees_the_next_solver_through_levels_of_its_life() -> None:
             assert (looked_at == TASK.target.sample(len(looked_at), generator)).all()
         seen.append(levels)
     assert all((one == other).all() for one, other in zip(*seen, strict=True))
+
+
+def test_a_frozen_one_goes_on_with_its_own_weights() -> None:
+    """Whatever has become of the checkpoint that they came from."""
+    curriculum = frozen(proposer())
+    state, before = curriculum.state_dict(), agent_weights(curriculum.agent)
+    resumed = frozen(proposer())
+    for weight in resumed.agent.parameters():
+        weight.data.zero_()
+    resumed.load_state_dict(state)
+    assert (agent_weights(resumed.agent) == before).all()
+
+
+def test_a_cycle_beyond_the_episodes_that_it_learnt_in_begins_another(monkeypatch) -> None:
+    curriculum, solver, seen = frozen(proposer(**HELD)), learners(1), []
+    observe = curriculum.view.observe
+
+    def noted(agent: ActorCritic, progress: float, *place: int) -> TensorDict:
+        seen.append(progress)
+        return observe(agent, progress, *place)
+
+    monkeypatch.setattr(curriculum.view, "observe", noted)
+    for number in range(10):
+        curriculum.propose(solver, number, update(number))
+    assert seen == [0, 0.5, 0, 0.5, 0]  # four updates of an episode, two of an action
 
 
 def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:

@@ -70,29 +70,16 @@ def test_a_run_is_a_plain_loop_of_updates(tmp_path: Path) -> None:
     assert not (tmp_path / "cycles.jsonl").exists()
 
 
-# PPO's own metrics in training.csv are means over the population.
-PER_COPY = {
-    "metrics.csv": ["id_success", "id_return", "id_greedy_success", "id_greedy_return"],
-    "training.csv": [
-        "obstacle_fraction",
-        "path_length",
-        "path_length_sd",
-        "solvable",
-        "train_success",
-    ],
-}
-
-
 def test_seeds_in_one_population_are_those_of_separate_runs(tmp_path: Path) -> None:
     experiment(tmp_path / "both", 1, 2).run()
     for seed in (1, 2):
         experiment(tmp_path / str(seed), seed).run()
-        for table, names in PER_COPY.items():
+        for table in ("metrics.csv", "training.csv"):
             rows = read_csv(tmp_path / "both" / table)
             together = [row for row in rows if row["seed"] == seed]
             for row, alone in zip(together, read_csv(tmp_path / str(seed) / table), strict=True):
-                for name in names:
-                    assert row[name] == pytest.approx(alone[name], rel=1e-4, abs=1e-6), name
+                for name in alone.keys() - {"seconds"}:
+                    assert row[name] == pytest.approx(alone[name], rel=1e-3, abs=1e-6), name
 
 
 def test_the_paths_that_are_recorded_are_legal(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,13 @@ from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.mazes.task import MazeTask
+from proposer_rl.meta.rewards import performance_gain
+from proposer_rl.methods import Parts, proposer
 from proposer_rl.report.decision import EXACT, GRADIENTS, TARGET
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
-from tests.tiny import composed
+from proposer_rl.settings import ProposerSettings
+from tests.tiny import TASK, composed
 
 NEEDS = needs([CONFIG_FOLDER])
 REUSED = "frozen_proposer"  # of another run's checkpoint
@@ -31,6 +35,15 @@ class Watched:
     def __getattr__(self, name: str) -> Any:
         self._asked.append(name)
         return getattr(self._distribution, name)
+
+
+def test_a_proposer_observes_what_the_task_tells() -> None:
+    task = copy.copy(TASK)
+    task.performance = lambda *given: TASK.performance(*given).exclude("success")
+    chosen = ProposerSettings(rollouts=2, validation_levels=4, probe_levels=2)
+    said = r"proposer\.observes=\['log_success', 'progress'\]: this task does not tell log_success"
+    with pytest.raises(ValueError, match=said):
+        proposer(Parts(task, chosen, [0]), performance_gain)
 
 
 def test_every_method_says_what_it_needs() -> None:

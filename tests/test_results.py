@@ -28,6 +28,7 @@ TABLES = [
     ("docs/replay.md", 240, "sampled", "ID success", 11),
     ("README.md", 400, "medium", "ID success", 5),
     ("docs/comparison.md", 400, "medium", "ID success", 5),
+    ("docs/proposer.md", 400, "medium", "ID success", 6),
     ("docs/comparison.md", 750, "paper", "ID success", 4),
     (GYMNASIUM, 40, "cartpole", "target success", 4),
     (GYMNASIUM, 80, "lunar_lander", "target success", 4),

@@ -35,6 +35,15 @@ def test_code_without_a_generator_draws_from_the_stream_inside_only() -> None:
         assert torch.equal(torch.rand(3), inside)
 
 
+def test_the_generators_of_gpus_are_left_alone(monkeypatch) -> None:
+    def seeded(seed: int) -> None:
+        raise AssertionError("a GPU's generator was seeded")
+
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeded)
+    with Streams(1).as_default("weights"):
+        torch.rand(1)
+
+
 def test_each_network_has_the_weights_of_its_own_stream() -> None:
     def make() -> torch.Tensor:
         return torch.rand(3)

@@ -37,7 +37,7 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     """What the run is, and what it is made with: method, seeds, machine, versions."""
     device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
-    packages = ("proposer_rl", "torch", "torchrl", "tensordict", "hydra-core")
+    packages = ("proposer_rl", "torchrl", "tensordict", "hydra-core")
     parameters = sum(p.numel() for p in experiment.learner.agent.parameters())
     return {
         "method": config.method,
@@ -54,7 +54,11 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "collector": config.compute.collector,
         "workers": config.compute.workers,
-        "versions": {"python": platform.python_version()} | {p: version(p) for p in packages},
+        "versions": {
+            "python": platform.python_version(),
+            "torch": str(torch.__version__),  # with its build, which not all of its wheels tell
+            **{package: version(package) for package in packages},
+        },
     }
 
 

@@ -54,17 +54,18 @@ class Choice:
             The places of the chosen ones, int64 [K, P], and their proposal, whose costs are those
             of the candidates and of scoring them.
         """
-        scorer, (levels, frames, evaluations) = self._scorer, candidates
-        method = scorer.play if scorer.from_episodes else scorer.ask
-        scored, cost = method(learner, levels, streams, "choice")
+        levels = candidates.levels
+        scored, frames, evaluations = self._scorer(learner, levels, streams, "choice")
         index = draw_without_replacement(
             scored.score / self._temperature,
             levels.shape[1] // self.times,
             [s.generator("choice") for s in streams],
         )
-        frames += cost if scorer.from_episodes else 0
-        evaluations += 0 if scorer.from_episodes else cost
-        return index, Proposal(levels_at(levels, index), frames, evaluations)
+        return index, Proposal(
+            levels_at(levels, index),
+            candidates.frames + frames,
+            candidates.evaluations + evaluations,
+        )
 
 
 def draw_without_replacement(

@@ -71,7 +71,7 @@ class ProblemProposer(Curriculum):
         self.agent, self.task = agent, task
         whole("epochs", settings.epochs, 1)
         real("learning_rate", settings.learning_rate, above=0)
-        real("entropy_coeff", settings.entropy_coeff)
+        real("entropy_coeff", settings.entropy_coeff, least=0)
         self._settings = settings
         self._choice = choice
         self._probe_levels = probe_levels
@@ -169,6 +169,7 @@ class ProblemProposer(Curriculum):
                 | {key: value.clone() for key, value in moments.get(name, {}).items()}
                 for name, parameter in self.agent.named_parameters()
             },
+            "observed": self.agent.in_keys,
             "proposed": self._proposed.clone(),
             "told": dict(self._told),
         }

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
 from proposer_rl.curricula.choice import Choice
-from proposer_rl.learning import PPO, located
+from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.copies import Copies, CopiesHere
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -94,12 +94,16 @@ class ProposerCurriculum(Curriculum):
         return self.choice(learner, proposal, streams)[1] if self.choice else proposal
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the cycle's levels come from, how far it is, the action that holds; the trainer."""
+        """Where the cycle's levels come from, how far it is, the action that holds; the agent."""
+        agent = (
+            agent_weights(self.agent) if self.trainer is None else self.trainer.learner.snapshot()
+        )
         return {
             "streams": self.view.streams.address,
             "began": self._began,
             "action": self._action,
-            "proposer": None if self.trainer is None else self.trainer.learner.snapshot().to_dict(),
+            "proposer": agent.to_dict(),
+            "observed": self.agent.in_keys,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -108,8 +112,11 @@ class ProposerCurriculum(Curriculum):
         self._began = int(state["began"])
         action = state["action"]
         self._action = None if action is None else action.to(self.view.task.device)
-        if self.trainer is not None:
-            self.trainer.learner.restore(TensorDict(state["proposer"], batch_size=[]))
+        agent = TensorDict(state["proposer"], batch_size=[])
+        if self.trainer is None:
+            load_agent(self.agent, agent)
+        else:
+            self.trainer.learner.restore(agent)
 
     def close(self) -> None:
         """Let go of the copies that are elsewhere."""
@@ -117,7 +124,8 @@ class ProposerCurriculum(Curriculum):
             self.trainer.copies.close()
 
     def _act(self, learner: PPO, updates: int, stream: Streams) -> Tensor:
-        progress = updates / self.meta_episode_length
+        # A cycle may be longer than the episodes that it learnt in: then another one begins.
+        progress = updates % self.meta_episode_length / self.meta_episode_length
         # -1: before all episodes of the copies, whose numbers begin at 0.
         state = self.view.observe(learner.agent, progress, -1, updates)
         distribution = self.agent.distribution(self.agent(state))

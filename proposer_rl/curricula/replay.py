@@ -197,18 +197,19 @@ class ReplayCurriculum(Curriculum):
         """Score new levels as long as it takes; whether the next batch is replayed, bool [K]."""
         batches = 0
         while True:
-            warm = self._scored >= self._warm
-            if warm and not bool(self.buffer["filled"].any(-1).all()):
+            draws = [s.generator("replay", batches) for s in streams]
+            chance = torch.stack([torch.rand((), generator=g) for g in draws])
+            replayed = chance < self._probability
+            if self._synchronous:
+                replayed = torch.full_like(replayed, batches > 0)
+            replayed &= self._scored >= self._warm
+            if bool((replayed & ~self.buffer["filled"].any(-1)).any()):
                 raise DivergedError(
                     f"solver.ppo.horizon={learner.settings.horizon}: on none of {self._scored} new "
                     "levels did an episode end within it, so that none has a score"
                 )
-            draws = [s.generator("replay", batches) for s in streams]
-            chance = torch.stack([torch.rand((), generator=g) for g in draws])
-            if self._train_on_new:
-                return (chance < self._probability) & warm
-            if warm and (batches > 0 if self._synchronous else bool(chance < self._probability)):
-                return torch.ones(len(streams), dtype=torch.bool)
+            if self._train_on_new or bool(replayed.all()):
+                return replayed
             self._add(learner, self._fresh(streams, "explore", batches), streams, batches)
             batches += 1
 
@@ -231,10 +232,8 @@ class ReplayCurriculum(Curriculum):
         self, learner: PPO, levels: Levels, streams: Sequence[Streams], purpose: str | int
     ) -> Scored:
         """Score levels [K, n] that nobody trains on, and note what it cost."""
-        scorer, levels = self.scorer, levels.to(self.task.device)
-        method = scorer.play if scorer.from_episodes else scorer.ask
-        scored, cost = method(learner, levels, streams, purpose)
-        self._cost[not scorer.from_episodes] += cost
+        scored, *cost = self.scorer(learner, levels.to(self.task.device), streams, purpose)
+        self._cost = [so_far + more for so_far, more in zip(self._cost, cost, strict=True)]
         return scored
 
     def _score_all(self, learner: PPO, streams: Sequence[Streams]) -> None:
@@ -319,8 +318,8 @@ class ReplayCurriculum(Curriculum):
             "levels": self._pictures(),
         }
         if self._last is not None:
-            distinct = [len(slots.unique()) for slots in self._last["slot"]]
-            metrics["distinct_levels"] = distinct
+            keys = level_keys(self._last["level"])
+            metrics["distinct_levels"] = [len(own.unique()) for own in keys]
         self._told = {"updates": 0, "replayed": 0}
         return Improvement(metrics)
 

@@ -124,7 +124,7 @@ class Scorer:
             from evaluation, the episodes of which ``max_mc`` takes the expected highest return.
 
     Attributes:
-        from_episodes: whether :meth:`play` scores levels, else :meth:`ask`.
+        from_episodes: whether levels are scored by playing on them.
 
     Raises:
         TypeError: if the task lacks what the score needs.
@@ -191,20 +191,28 @@ class Scorer:
         score = score.double().where(count > 0, -torch.inf)
         return Scored(score.cpu(), best.float().cpu(), solved.cpu())
 
-    def play(
+    def __call__(
         self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
-    ) -> tuple[Scored, int]:
-        """Score levels [K, n] that nobody trains on, n a multiple of P, by playing on them.
+    ) -> tuple[Scored, int, int]:
+        """Score levels [K, n] that nobody trains on; from episodes n is a multiple of P.
 
         Args:
             learner: the Solvers.
             levels: of each.
             streams: of the present update.
-            purpose: below which actions are drawn.
+            purpose: below which is drawn what actions, or a task's performance, draw at random.
 
         Returns:
-            The scores, and the frames that they cost each Solver.
+            The scores, and the frames and evaluations that they cost each Solver.
         """
+        if self.from_episodes:
+            return *self._play(learner, levels, streams, *purpose), 0
+        scored = self._ask(learner, levels, streams, *purpose)
+        return scored, 0, levels.shape[1]
+
+    def _play(
+        self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
+    ) -> tuple[Scored, int]:
         scored, frames = [], 0
         for batch, some in enumerate(levels.split(self.task.batch_size, 1)):
             played = []
@@ -217,23 +225,12 @@ class Scorer:
         return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True))), frames
 
     @torch.no_grad()
-    def ask(
+    def _ask(
         self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
-    ) -> tuple[Scored, int]:
-        """Score levels [K, n] by what the task says of them.
-
-        Args:
-            learner: the Solvers.
-            levels: of each.
-            streams: of the present update.
-            purpose: below which is drawn what a task's performance draws at random.
-
-        Returns:
-            The scores, and the evaluations that they cost each Solver.
-        """
+    ) -> Scored:
         found = []
         for batch, some in enumerate(levels.split(AT_ONCE, 1)):
             generator = streams[0].generator("score", *purpose, batch)
             found.append(self._exact(learner, some, generator).double().cpu())
         score = torch.cat(found, 1)
-        return Scored(score, *unseen(score.shape)), score.shape[1]
+        return Scored(score, *unseen(score.shape))

@@ -63,7 +63,7 @@ class SelectionCurriculum(Curriculum):
 
     def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
         """Levels [K, P]: some of those kept, then new ones."""
-        cost = [0, 0]
+        cost = 0, 0
         if self.kept is None or updates % self._every == 0:
             cost = self._select(learner, streams)
         count = self.task.batch_size - self._new
@@ -75,16 +75,14 @@ class SelectionCurriculum(Curriculum):
             levels = torch.cat([levels, new], 1)
         return Proposal(levels, *cost)
 
-    def _select(self, learner: PPO, streams: Sequence[Streams]) -> list[int]:
+    def _select(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
         """Keep the best of new candidates; the frames and evaluations that it cost.
 
         Raises:
             DivergedError: if fewer have a score than are kept.
         """
-        scorer, space = self.scorer, self.task.space
-        levels = fresh_levels(space, self._candidates, streams, "candidates")
-        method = scorer.play if scorer.from_episodes else scorer.ask
-        scored, cost = method(learner, levels, streams)
+        levels = fresh_levels(self.task.space, self._candidates, streams, "candidates")
+        scored, frames, evaluations = self.scorer(learner, levels, streams)
         known = int(scored.score.isfinite().sum(-1).min())
         if known < self._keep:
             raise DivergedError(
@@ -95,7 +93,7 @@ class SelectionCurriculum(Curriculum):
         best = scored.score.sort(dim=-1, descending=True, stable=True)
         self.scores = best.values[:, : self._keep]
         self.kept = levels_at(levels.cpu(), best.indices[:, : self._keep])
-        return [cost, 0] if scorer.from_episodes else [0, cost]
+        return frames, evaluations
 
     def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
         """Tell of the scores of what is kept, and show the first Solver's best."""

@@ -10,7 +10,7 @@ from proposer_rl.learning.rollout import (
     first_episode_success,
     succeeded,
 )
-from proposer_rl.learning.snapshot import load_agent
+from proposer_rl.learning.snapshot import agent_weights, load_agent
 
 __all__ = [
     "PPO",
@@ -19,6 +19,7 @@ __all__ = [
     "MakeLoss",
     "RolloutPolicy",
     "Update",
+    "agent_weights",
     "first_episode_return",
     "first_episode_success",
     "load_agent",

@@ -14,6 +14,7 @@ Nothing of this has run on a GPU yet: it is tested with a recorder for the CPU a
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
@@ -56,7 +57,9 @@ class CudaGraphs:
         with torch.cuda.device(self._device):
             stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
             stream.wait_stream(current)
-            with torch.cuda.stream(stream):
+            with torch.cuda.stream(stream), warnings.catch_warnings():
+                # Adam's, of steps that are not recorded: these two are for the sake of the others.
+                warnings.filterwarnings("ignore", "This instance was constructed with capturable")
                 result = function()
             current.wait_stream(stream)
         return result
@@ -110,6 +113,7 @@ def recorded(task: T, recorder: Recorder | None = None) -> T:
 
     def learner(streams: object) -> Any:
         ppo = original.learner(streams)
+        ppo.prepare_for_graphs()
         ppo.collector.act = Captured(ppo.collector.act, recorder)
         ppo.train = Captured(ppo.train, recorder)
         return ppo

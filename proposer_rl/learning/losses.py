@@ -36,6 +36,9 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
 class CopiesClipLoss(ClipPPOLoss):
     """The clipped loss of every transition, with advantages standardised over each copy's batch.
 
+    ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
+    are means over all copies.
+
     Args:
         actor, critic: as :meth:`~proposer_rl.models.ActorCritic.readout` makes them.
         copies: K, or None for a single network.
@@ -62,25 +65,38 @@ class CopiesClipLoss(ClipPPOLoss):
             **numbers,
         )
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms and diagnostics of transitions [*B, T]."""
+        self._each: dict[str, Tensor] = {}
+        return super().forward(tensordict).update(self._each)
+
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
+        log_weight, distribution, kl_approx, correction = super()._log_weight(tensordict, adv_shape)
+        ratio = log_weight.detach()
+        clipped = ratio.clamp(*self._clip_bounds) != ratio
+        self._each |= {"kl_approx": kl_approx.detach(), "clip_fraction": clipped.to(ratio)}
+        return log_weight, distribution, kl_approx, correction
+
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
         # TorchRL's looks whether an entropy is finite, and waits: for discrete actions it is.
         if isinstance(dist, Categorical | Independent):
-            return dist.entropy().unsqueeze(-1)
-        return super()._get_entropy(dist, adv_shape)
+            entropy = dist.entropy().unsqueeze(-1)
+        else:
+            entropy = super()._get_entropy(dist, adv_shape)
+        self._each["entropy"] = entropy.detach()
+        return entropy
 
 
-def loss_terms(losses: TensorDictBase, copies: int | None) -> dict[str, Tensor]:
-    """The terms ``loss_...``, each the mean over a copy's own batch: [K], without copies []."""
-    return {
-        key: term.flatten(0 if copies is None else 1).mean(-1)
-        for key, term in losses.items()
-        if key.startswith("loss_")
-    }
+def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
+    """Means over each copy's own batch, [K], without copies []; a scalar counts for every copy."""
+    if copies is not None and not numbers.ndim:
+        return numbers.expand(copies)
+    return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
 def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
-    """Share of the targets' variance that the values explain, the mean over copies."""
+    """Share of the targets' variance that the values explain: [K], without copies []."""
     value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
-    return (1 - residual / total.clamp_min(1e-12)).mean()
+    return 1 - residual / total.clamp_min(1e-12)

@@ -28,19 +28,19 @@ from proposer_rl.learning.losses import (
     CopiesClipLoss,
     MakeLoss,
     explained_variance,
-    loss_terms,
     make_loss,
+    of_copies,
 )
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 
-TOLD = ("entropy", "kl_approx", "clip_fraction")  # by TorchRL's loss, of the whole batch
+TOLD = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, as far as a loss does
 
 
 class Update(NamedTuple):
-    """What one PPO update was made of: the rollout [*B, T] and the scalars of its training."""
+    """One PPO update: the rollout [*B, T] and its training's metrics, of K copies [K], else []."""
 
     rollout: TensorDictBase
     metrics: TensorDict
@@ -97,6 +97,7 @@ class PPO:
             )
         self.env, self.agent, self.settings = env, agent, settings
         self.collector = RolloutCollector(env, agent, settings.horizon)
+        steps = env.batch_size[0 if agent.copies is None else 1 :].numel() * settings.horizon
         self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
         clipped = partial(
             CopiesClipLoss,
@@ -104,7 +105,7 @@ class PPO:
             clip_epsilon=settings.clip_epsilon,
             entropy_coeff=settings.entropy_coeff,
             critic_coeff=settings.critic_coeff,
-            normalize_advantage=settings.normalize_advantage,
+            normalize_advantage=settings.normalize_advantage and steps > 1,
         )
         self._loss = make_loss(loss or clipped, agent)
         self._parameters = list(agent.parameters())
@@ -134,19 +135,20 @@ class PPO:
         Writes ``advantage`` and ``value_target`` into the rollout.
 
         Returns:
-            Scalars averaged over copies and gradient steps: the loss's weighted terms, for PPO
-            ``loss_objective``, ``loss_entropy`` and ``loss_critic``; ``entropy``, ``kl_approx`` and
-            ``clip_fraction``, as far as the loss tells them; ``explained_variance``, ``grad_norm``.
+            Of each copy [K], without copies [], means over its batch and the gradient steps: the
+            loss's weighted terms, for PPO ``loss_objective``, ``loss_entropy`` and ``loss_critic``;
+            ``entropy``, ``kl_approx`` and ``clip_fraction``, as far as the loss tells them;
+            ``explained_variance``, ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
         steps = rollout.exclude(*self.agent.level_keys)
         trained = self.train(TensorDict({"steps": steps, "level": level}))
         rollout.update(trained["steps"])
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
-        return TensorDict({key: taken.mean() for key, taken in self.gradient_steps.items()})
+        return self._last_training[1].mean(0)
 
     def train(self, batch: TensorDictBase) -> TensorDict:
-        """From ``steps`` [*B, T] on a ``level`` [*B] to what the ``gradient_steps`` [S] were like.
+        """From ``steps`` [*B, T] on a ``level`` [*B] to what ``gradient_steps`` [S(, K)] were like.
 
         Besides, of the ``steps`` what is computed here: values, advantages and targets.
         """
@@ -165,18 +167,23 @@ class PPO:
         with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
             steps = agent.decode(steps.copy(), agent.encode(level))
         losses = self._loss(steps)
-        terms = loss_terms(losses, copies)
+        metrics = {
+            key: of_copies(losses[key], copies)
+            for key in losses.keys()
+            if key.startswith("loss_") or key in TOLD
+        }
+        terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
         self._adam.zero_grad()
-        torch.stack(list(terms.values())).sum().backward()  # each copy's gradient is its own
+        torch.stack(terms).sum().backward()  # each copy's gradient is its own
         norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, copies)
         self._adam.step()
         return TensorDict(
             {
-                **{key: term.detach() for key, term in terms.items()},
-                **{key: losses[key].detach().mean() for key in TOLD if key in losses.keys()},
+                **{key: metric.detach() for key, metric in metrics.items()},
                 "explained_variance": explained_variance(steps, agent.value_key, copies),
                 "grad_norm": norm,
-            }
+            },
+            norm.shape,
         )
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:
@@ -186,10 +193,10 @@ class PPO:
         set_next_values(self.agent, rollout, context)
         return rollout
 
-    @property
-    def gradient_steps(self) -> TensorDictBase:
-        """Of the last training, [S]: what each step was like, for each copy [S, K] where told."""
-        return self._last_training[1]
+    def prepare_for_graphs(self) -> None:
+        """Let training be recorded as a CUDA graph; without, it need not be."""
+        for group in self._adam.param_groups:
+            group["capturable"] = self._parameters[0].is_cuda
 
     def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.

@@ -14,8 +14,7 @@ from proposer_rl.models import ActorCritic
 
 def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
     """Torch's Adam whose state, usually made at the first step, is there from the beginning."""
-    cuda = parameters[0].is_cuda
-    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=True, capturable=cuda)
+    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=True)
     for parameter in parameters:
         adam.state[parameter] = {
             "step": torch.zeros((), device=parameter.device),
@@ -74,6 +73,12 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
 
 def _batch(agent: ActorCritic) -> torch.Size:
     return torch.Size([] if agent.copies is None else [agent.copies])
+
+
+def agent_weights(agent: ActorCritic) -> TensorDict:
+    """A copy of an agent's weights alone, as :func:`load_agent` takes them, batch []."""
+    parameters = agent.named_parameters()
+    return TensorDict({name: {"value": value.detach().clone()} for name, value in parameters})
 
 
 def load_agent(agent: ActorCritic, snapshot: TensorDictBase) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import torch
 from tensordict import TensorDictBase
 
 from proposer_rl.learning import PPO, Update
@@ -17,12 +18,24 @@ class Trained(NamedTuple):
     Attributes:
         solver: its snapshot, batch [1].
         levels: of its last update, [1, P].
-        update: its last update, [1, P, T]; the metrics are means over all copies.
+        update: its last update, [1, P, T] and [1].
     """
 
     solver: TensorDictBase
     levels: Any
     update: Update
+
+    def to(self, device: torch.device | str) -> Trained:
+        """The same on another device."""
+        rollout, metrics = self.update
+        update = Update(rollout.to(device), metrics.to(device))
+        return Trained(self.solver.to(device), self.levels.to(device), update)
+
+
+def taken_out(env: SolverTrainingEnv, index: int) -> Trained:
+    """One of an environment's Solvers after its last update."""
+    own, (levels, (rollout, metrics)) = slice(index, index + 1), env.last_training
+    return Trained(env.solvers.snapshot()[own], levels[own], Update(rollout[own], metrics[own]))
 
 
 class Copies(Protocol):
@@ -67,9 +80,7 @@ class CopiesHere:
 
     def trained(self, copy: int) -> Trained:
         """See :meth:`Copies.trained`."""
-        levels, (rollout, metrics) = self._env.last_training
-        snapshot = self._env.solvers.snapshot()[[copy]]
-        return Trained(snapshot, levels[[copy]], Update(rollout[[copy]], metrics))
+        return taken_out(self._env, copy)
 
     def close(self) -> None:
         """Nothing is held outside."""

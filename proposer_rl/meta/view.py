@@ -67,7 +67,7 @@ class SolverView:
         Args:
             performance: on the validation levels, [K, E].
             probes: float [K, C, ...].
-            progress: the part of the cycle's updates that is done, in [0, 1].
+            progress: the part of the meta-episode that is over, in [0, 1].
 
         Returns:
             ``probes``; ``return``, and ``log_success`` where the task tells success: their means

@@ -72,7 +72,7 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
             learner, rollouts, *unseen((1, 2 * COPIES))
         )
         scorer = Scorer(task, name, "exact", EPISODES)
-        exact, cost = scorer.ask(learner, two.unsqueeze(0), [Streams(0)])
+        exact, _, cost = scorer(learner, two.unsqueeze(0), [Streams(0)])
         assert cost == 2
         shrunk = (EPISODES - 1) / EPISODES if name == "return_variance" else 1
         for each, expected in zip(sampled.score.view(2, -1), exact.score[0] * shrunk, strict=True):

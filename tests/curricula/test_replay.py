@@ -134,6 +134,10 @@ def test_plr_trains_on_new_levels_and_on_old_ones(name: str) -> None:
     assert 1 in old[2:] and min(old[2:]) < 1
     assert set(lived.frames) == {0}
     assert set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist()) <= seen
+    last = lived.levels[2::3]  # of each cycle
+    for told, levels in zip(lived.told[1:], last, strict=False):
+        if told:  # something has a score
+            assert told["distinct_levels"] == [len(level_keys(levels)[0].unique())]
 
 
 def streams_of(number: int) -> Streams:
@@ -359,6 +363,16 @@ def test_where_no_episode_ends_nothing_can_be_replayed() -> None:
     learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
     with pytest.raises(DivergedError, match=r"solver\.ppo\.horizon=1: on none of 8 new levels"):
         live(robust(), learner, [0], range(1))
+
+
+def test_new_levels_are_trained_on_whether_they_have_scores_or_not() -> None:
+    whole = solvers([0])
+    learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
+    curriculum = replay(train_on_new=True, synchronous=False, replay_probability=1e-6)
+    assert len(live(curriculum, learner, [0], range(4)).levels) == 4
+    curriculum = replay(train_on_new=True, synchronous=False, replay_probability=1.0)
+    with pytest.raises(DivergedError, match=r"solver\.ppo\.horizon=1: on none of 8 new levels"):
+        live(curriculum, learner, [0], range(4))
 
 
 def test_credit_is_refused_where_it_would_be_lost() -> None:

@@ -207,7 +207,7 @@ def test_exact_scores_are_those_of_the_definitions() -> None:
             ("learnability", chance * (1 - chance)),
             ("regret", best - known["return"][copy].double()),
         ):
-            found, cost = Scorer(TASK, name, "exact").ask(learner, levels, streams(2))
+            found, _, cost = Scorer(TASK, name, "exact")(learner, levels, streams(2))
             assert cost == 5
             torch.testing.assert_close(found.score[copy], expected, atol=1e-6, rtol=0)
 
@@ -216,7 +216,7 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
     learner = learners(2)
     levels = torch.stack([TASK.space.sample(8, torch.Generator().manual_seed(k)) for k in (0, 1)])
     scorer = Scorer(TASK, "learnability", "episodes", rollouts=3)
-    found, frames = scorer.play(learner, levels, streams(2), "why")
+    found, frames, _ = scorer(learner, levels, streams(2), "why")
     assert frames == 3 * 8 * 8
     for batch in range(2):
         some = levels[:, 4 * batch : 4 * batch + 4]

@@ -19,6 +19,7 @@ from tests.curricula.living import (
     live,
     solvers,
 )
+from tests.curricula.scripted import GivenScores
 from tests.tiny import TASK, evaluate
 
 P, T = 4, 8
@@ -63,18 +64,7 @@ def test_it_selects_every_few_updates_and_says_what_that_costs() -> None:
 def test_what_is_mastered_or_hopeless_is_not_kept_while_there_is_else() -> None:
     curriculum = selection(keep=3)
     found = torch.tensor([[0.0, 0.25, 0.0, 0.2, 0.0, -torch.inf, 0.1] + [0.0] * 9])
-    scored = type("Scored", (), {"score": found.double(), "best": found})
-
-    class Told:
-        """A scorer that knows."""
-
-        from_episodes, task = False, TASK
-
-        @staticmethod
-        def ask(*_: Any) -> Any:
-            return scored, 16
-
-    curriculum.scorer = Told()  # type: ignore[assignment]
+    curriculum.scorer = GivenScores(found)
     curriculum.propose(solvers([0]), 0, [Streams(0)])
     assert curriculum.scores[0].tolist() == pytest.approx([0.25, 0.2, 0.1])
 
@@ -84,7 +74,7 @@ def test_fewer_scores_than_are_kept_are_told() -> None:
     curriculum = selection(keep=3)
     found = torch.full((1, 16), -torch.inf)
     found[0, :2] = 0.1
-    curriculum.scorer.ask = lambda *_: (type("Scored", (), {"score": found}), 16)  # type: ignore
+    curriculum.scorer = GivenScores(found)
     with pytest.raises(DivergedError, match=r"horizon=8: on 2 of 16 .* fewer than 3 have"):
         curriculum.propose(solvers([0]), 0, [Streams(0)])
 

@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 
-from proposer_rl.learning import PPO, DivergedError, Update
+from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
@@ -28,7 +28,7 @@ from proposer_rl.meta.workers.engines import (
     start,
     stop,
 )
-from proposer_rl.meta.workers.remote import MakeEnv, Report, WorkerPolicy, make_worker_env
+from proposer_rl.meta.workers.remote import MakeEnv, WorkerPolicy, make_worker_env
 from proposer_rl.streams import Streams
 
 ATTEMPTS = 3
@@ -104,21 +104,11 @@ class CopiesInWorkers:
         return self._proposer.complete(self._together(rollout))
 
     def trained(self, copy: int) -> Trained:
-        """See :meth:`~proposer_rl.meta.copies.Copies.trained`.
-
-        Metrics that are told of every copy are means over the copies, the others over the workers.
-        """
+        """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
         assert self._collector is not None, "there has been no episode"
         orders = [(copy,)] * len(self._shares)
-        reports: list[Report] = self._collector.map_fn("env.report", orders)
-        own = next(report.copy for report in reports if report.copy)
-        steps = TensorDict.stack([report.gradient_steps for report in reports], 1)  # [S, W(, k)]
-        metrics = {
-            key: (taken.flatten(1)[:, self._first] if taken.ndim == 3 else taken).mean()
-            for key, taken in steps.items()
-        }
-        solver, levels, rollout = (entry.to(self._env.device) for entry in own)
-        return Trained(solver, levels, Update(rollout, TensorDict(metrics)))
+        found: list[Trained | None] = self._collector.map_fn("env.trained", orders)
+        return next(filter(None, found)).to(self._env.device)
 
     def close(self) -> None:
         """End the workers; the next episode starts others."""

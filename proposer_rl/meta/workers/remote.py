@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -10,23 +10,10 @@ from torch import Tensor
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
 from proposer_rl.learning.cuda_graphs import use
+from proposer_rl.meta.copies import Trained, taken_out
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.models import ActorCritic, uniform_noise
 from proposer_rl.streams import Streams
-
-
-class Report(NamedTuple):
-    """What a worker tells of the last update of an episode, on the CPU.
-
-    Attributes:
-        gradient_steps: of the training, [S]: what each step was like, for each of the worker's k
-            copies [S, k] where told.
-        copy: snapshot, levels and rollout of the copy that was asked for, each with a first
-            dimension of one; nothing from a worker that does not have it.
-    """
-
-    gradient_steps: TensorDictBase
-    copy: tuple[Any, ...]
 
 
 class WorkerEnv(SolverTrainingEnv):
@@ -57,15 +44,12 @@ class WorkerEnv(SolverTrainingEnv):
             self.on_update = tell
         super().fork(solver, streams)
 
-    def report(self, copy: int) -> Report:
-        """Tell of the last update, and all of one copy if it is here."""
-        levels, (rollout, _) = self.last_training
-        steps = self.solvers.gradient_steps.cpu().consolidate()
+    def trained(self, copy: int) -> Trained | None:
+        """The copy as its last update has left it, on the CPU; None if another worker has it."""
         if copy not in self._copies:
-            return Report(steps, ())
-        here = [copy - self._copies.start]
-        solver = self.solvers.snapshot()[here].cpu().consolidate()
-        return Report(steps, (solver, levels[here].cpu(), rollout[here].cpu()))
+            return None
+        own = taken_out(self, copy - self._copies.start).to("cpu")
+        return own._replace(solver=own.solver.consolidate())  # one thing to send, not hundreds
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:

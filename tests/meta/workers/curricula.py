@@ -91,7 +91,7 @@ def cycles(
         for value in metrics.values():
             numbers += value if isinstance(value, list) else [] if value is None else [value]
         numbers += update.rollout["next", "state_value"].flatten().tolist()
-        numbers += [float(update.metrics[name]) for name in ("loss_critic", "grad_norm")]
+        numbers += [float(value) for value in update.metrics.values()]
         between()
     for learner in (solver, curriculum.trainer.learner):
         for entry in learner.snapshot().values(True, True):
