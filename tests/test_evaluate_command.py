@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
+from torch.utils._pytree import tree_leaves
 
 from proposer_rl.cli.evaluate import SHOWN
 from proposer_rl.cli.instruments import evaluate as main
@@ -208,6 +210,48 @@ def test_several_runs_are_compared_by_their_means(
     shutil.rmtree(tmp_path / "runs" / "unreadable")
     monkeypatch.setattr("proposer_rl.cli.evaluate.load", None)  # nothing is left to be done
     assert evaluate(*both)[0] == 0
+
+
+def test_what_has_changed_is_evaluated_anew(evaluate, run: Path, tmp_path: Path) -> None:
+    """Runs of the same name that were replaced, and files of levels that were rewritten."""
+    levels, output = tmp_path / "levels.txt", tmp_path / "scores.csv"
+    shutil.copytree(run, tmp_path / "runs" / "kept")
+    shutil.copytree(run, replaced := tmp_path / "runs" / "replaced")
+    settings = json.loads((run / "config.json").read_text()) | {"method": "another"}
+    (replaced / "config.json").write_text(json.dumps(settings))
+    levels.write_text("[near]\nSG....\n......\n......\n......\n")
+    command = [tmp_path / "runs", "--levels", levels, "small", "-o", output]
+
+    def scores() -> dict[tuple[str, str, str], dict]:
+        assert evaluate(*command)[0] == 0
+        with output.open() as file:
+            rows = list(csv.DictReader(file))
+        found = {(row["run"], row["seed"], row["levels"]): row for row in rows}
+        assert len(found) == len(rows) == 2 * 2 * 2
+        return found
+
+    first = scores()
+    updates, values = load_latest(replaced / "checkpoints")
+    for tensor in tree_leaves(values["solver"]):
+        if isinstance(tensor, torch.Tensor):
+            tensor.zero_()
+    save_checkpoint(replaced / "checkpoints", updates, values)
+    second = scores()
+    changed = {place for place, row in second.items() if row != first[place]}
+    assert changed == {place for place in first if place[0] == "replaced"}
+    levels.write_text("[far]\nS.....\n......\n......\n.....G\n")
+    third = scores()
+    changed = {place for place, row in third.items() if row != second[place]}
+    assert changed == {place for place in first if place[2] == str(levels)}
+
+
+def test_scores_of_several_runs_are_not_written_over(evaluate, run: Path, tmp_path: Path) -> None:
+    output = tmp_path / "scores.csv"
+    assert evaluate(run, run, "--levels", "small", "-o", output)[0] == 0
+    before = output.read_bytes()
+    code, said = evaluate(run, "--levels", "small", "-o", output)
+    assert code == 2 and "has scores of several runs" in said
+    assert output.read_bytes() == before
 
 
 @pytest.mark.parametrize(

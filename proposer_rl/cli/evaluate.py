@@ -6,10 +6,12 @@ One run's are told level by level, those of several by their means, as a table o
 from __future__ import annotations
 
 import argparse
+import hashlib
 import io
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,11 +40,11 @@ from proposer_rl.report.generalisation import (
     whole,
     write_scores,
 )
-from proposer_rl.report.reading import begun, find_runs
+from proposer_rl.report.reading import UnreadableRun, begun, find_runs
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tables import to_csv
-from proposer_rl.runs.checkpoint import CheckpointError
+from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.pictures import pixels
 from proposer_rl.streams import Streams
@@ -104,6 +106,7 @@ def _holds_runs(options: argparse.Namespace) -> bool:
 def _one(options: argparse.Namespace) -> None:
     """One run, level by level."""
     (checkpoint,), name = options.checkpoint, next(iter(options.levels), None)
+    _refuse_table(options.output)
     found = evaluate(load(checkpoint), name, options.max_steps)
     _print(found)
     if options.output is not None and options.output.suffix == ".csv":
@@ -114,6 +117,13 @@ def _one(options: argparse.Namespace) -> None:
         write_rows(found.rows(), options.output)
     if options.pictures is not None:
         write_atomically(options.pictures, _sheet(found))
+
+
+def _refuse_table(output: Path | None) -> None:
+    """Scores of several runs, which may have taken hours, are not written over by those of one."""
+    with suppress(UnreadableRun):
+        if output is not None and output.is_file() and read_scores(output):
+            raise ConfigError(f"--output {output}: has scores of several runs; name another file")
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -137,7 +147,7 @@ def _compare(options: argparse.Namespace) -> None:
     failures = 0
     for run in tqdm(runs, leave=False, disable=None):
         try:
-            scores += _missing(run, names, scores, options.max_steps)
+            scores = _with_missing(run, names, scores, options.max_steps)
         except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
             if len(runs) == (failures := failures + 1):
                 raise
@@ -156,18 +166,47 @@ def _compare(options: argparse.Namespace) -> None:
         Console().print(table)
 
 
-def _missing(
-    run: Run, names: Sequence[str], scores: Sequence[RunScore], max_steps: int | None
+def _with_missing(
+    run: Run, names: Sequence[str], scores: list[RunScore], max_steps: int | None
 ) -> list[RunScore]:
-    """A run's scores on the sets on which there are none yet."""
-    todo = [name for name in names if scored(run, scores, name) is None]
+    """Scores with those of a run that there are none of yet, or that were of something else."""
+    digests = {name: _digest(run.folder, name) for name in names}
+    known = {name: scored(run, scores, name) for name in names}
+    todo = [
+        name
+        for name, score in known.items()
+        if score is None or digests[name] not in ("", score.digest)
+    ]
     if not todo:
-        return []
+        return scores
     loaded = load(run.folder)
-    return [score for name in todo for score in _summed(evaluate(loaded, name, max_steps), name)]
+    found = [
+        score
+        for name in todo
+        for score in _summed(evaluate(loaded, name, max_steps), name, digests[name])
+    ]
+    place = {score[:4] for score in found}
+    return [score for score in scores if score[:4] not in place] + found
 
 
-def _summed(found: Evaluation, name: str) -> list[RunScore]:
+def _digest(folder: Path, levels: str) -> str:
+    """Of a run's settings and newest checkpoint, and of the levels where they are a file.
+
+    Returns:
+        16 hexadecimal digits; nothing for a run without checkpoints, of which nothing can be told.
+    """
+    checkpoints = checkpoint_files(folder / "checkpoints")
+    if not checkpoints:
+        return ""
+    files = [folder / "config.json", checkpoints[-1][1], Path(levels)]
+    digest = hashlib.sha256()
+    for file in files:
+        if file.is_file():
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def _summed(found: Evaluation, name: str, digest: str) -> list[RunScore]:
     """The mean of each Solver."""
     summed = []
     for solver, seed in enumerate(found.seeds):
@@ -175,7 +214,7 @@ def _summed(found: Evaluation, name: str) -> list[RunScore]:
         means = {key: float(np.mean([results[key] for results in own])) for key in own[0]}
         success = means.get("success", math.nan)
         place = (found.run.name, seed, found.updates, name, len(own))
-        summed.append(RunScore(*place, success, means["return"]))
+        summed.append(RunScore(*place, success, means["return"], digest))
     return summed
 
 

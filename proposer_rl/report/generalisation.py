@@ -33,6 +33,7 @@ class Score(NamedTuple):
         size: how many levels it has.
         success: NaN where the task has none.
         returns: the mean return.
+        digest: of what it was measured on and with; empty where that is not known.
     """
 
     run: str
@@ -42,6 +43,7 @@ class Score(NamedTuple):
     size: int
     success: float
     returns: float
+    digest: str
 
 
 def write_scores(scores: Iterable[Score]) -> bytes:
@@ -67,6 +69,7 @@ def read_scores(file: Path) -> list[Score]:
                 int(row["size"]),
                 number(float(row["success"] or "nan")),
                 number(float(row["returns"] or "nan")),
+                row["digest"],
             )
             for row in rows
         ]

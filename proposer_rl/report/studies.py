@@ -49,7 +49,7 @@ class Group:
     @property
     def proposes(self) -> bool:
         """Whether a Proposer was trained."""
-        return any(map(_proposes, self.runs))
+        return any("total_reward" in cycle for run in self.runs for cycle in run.cycles)
 
     @property
     def logs(self) -> list[Run]:
@@ -215,19 +215,15 @@ def _setting(run: Run) -> dict[str, Any]:
     }
 
 
-def _proposes(run: Run) -> bool:
-    return any("total_reward" in cycle for cycle in run.cycles)
-
-
 def _variant(run: Run) -> dict[str, Any]:
-    """All that the outcome of a run depends on, but for the seed."""
-    curriculum, proposes = run.config.get("curriculum"), _proposes(run)
+    """All that the outcome of a run may depend on, but for the seed.
+
+    Of the settings alone, so that a run counts where it will when it is finished.
+    """
     ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the last
-    reused = isinstance(curriculum, Mapping) and curriculum.get("checkpoint") is not None
-    ignored |= set() if proposes or reused else {"proposer"}  # it had none
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
     kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
-    kept["cycle_length"] = run.config["schedule"].get("cycle_length") if run.cycles else None
+    kept["cycle_length"] = run.config["schedule"].get("cycle_length")
     kept["lifetime"] = run.lifetime
     return kept
 
@@ -258,8 +254,7 @@ def _without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     best: dict[str, Run] = {}
     notes = []
     for run in runs:
-        alone = {"seed": run.seed, "checkpoint": run.config.get("checkpoint")}
-        key = _key({**_setting(run), **_variant(run), **alone})
+        key = _key({**_setting(run), **_variant(run), "seed": run.seed})
         kept = best.setdefault(key, run)
         if kept is run:
             continue

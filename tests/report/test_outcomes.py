@@ -223,6 +223,18 @@ def test_a_method_that_is_slightly_worse_is_not_slightly_better(tmp_path: Path) 
     assert verdicts(study)[SLIGHTLY] == "undecided"
 
 
+def test_a_correction_for_many_methods_makes_no_difference_insignificant(tmp_path: Path) -> None:
+    """What is significant by itself is so however many other methods a report has."""
+    for seed in range(SEEDS):
+        ends = {"perf_gain": 0.9 + 0.01 * (seed + 1), "task_difficulty": 0.9 + 0.001 * seed}
+        ends |= {f"other_{i}": 0.6 + 0.1 * ((seed * i) % 5) for i in range(12)}
+        for name, end in ends.items():
+            write_run(tmp_path / f"{name}-{seed}", name, [seed], [0.0, end / 2, end])
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    (found,) = (finding for finding in findings(study) if finding.claim == SLIGHTLY)
+    assert found.verdict == "undecided" and "without correction" in found.evidence
+
+
 def test_a_pair_without_any_spread_does_not_hide_the_others(tmp_path: Path) -> None:
     ends = {"perf_gain": [0.9] * SEEDS, "task_difficulty": [0.9] * SEEDS}
     ends["target"] = [0.3 + 0.01 * seed for seed in range(SEEDS)]

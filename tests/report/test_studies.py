@@ -59,11 +59,13 @@ def test_many_differences_are_told_apart_by_numbers(tmp_path: Path) -> None:
     assert first == f'proposer.a.size=0, proposer.b.size=0, some_setting="{"one" * 9}"'
 
 
-def test_settings_of_a_proposer_do_not_part_runs_without_one(tmp_path: Path) -> None:
-    write_run(tmp_path / "a", "target", [0])
-    write_run(tmp_path / "b", "target", [1], proposer={"rollouts": 9})
+def test_a_run_that_has_only_begun_is_of_its_group(tmp_path: Path) -> None:
+    """What it has recorded so far decides nothing, for it will have recorded more at the end."""
+    for seed, (cycles, rollouts) in enumerate([(CYCLES, 2), ([], 2), (CYCLES, 9), ([], 9)]):
+        proposer = {"rollouts": rollouts}
+        write_run(tmp_path / str(seed), "mine", [seed], cycles=cycles, proposer=proposer)
     (study,), _ = read(tmp_path)
-    assert labels(study) == {"target": [0, 1]}
+    assert labels(study) == {"mine (rollouts=2)": [0, 1], "mine (rollouts=9)": [2, 3]}
 
 
 def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> None:
@@ -71,17 +73,18 @@ def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> Non
     for place, checkpoint, seed in [
         ("a", "lives/seed_0/lifetime_1", 5),
         ("b", "lives/seed_12/lifetime_1", 6),
-        ("c", "lives/seed_12/lifetime_1", 5),  # two Proposers on the same Solver both count
+        ("c", "lives/seed_12/lifetime_1", 5),  # on a Solver that has counted already
         ("d", "lives/seed_0/lifetime_2", 5),
         ("e", "3/0", 5),
         ("f", "/other/4/15", 5),
-        ("g", "4/16", 5),
+        ("g", "4/16", 6),
     ]:
         named = {"checkpoint": checkpoint, "curriculum": {"checkpoint": checkpoint}}
         write_run(tmp_path / place, "frozen_proposer", [seed], **named)
     (study,), notes = read(tmp_path)
     members = [sorted(run.folder.name for run in group.runs) for group in study.groups]
-    assert sorted(members) == [["a", "b", "c"], ["d"], ["e", "g"], ["f"]] and not notes
+    assert sorted(members) == [["a", "b"], ["d"], ["e", "g"], ["f"]]
+    assert notes == ["left out: c: the same settings and seed as a"]
 
 
 def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> None:
@@ -220,12 +223,3 @@ def test_seeds_trained_together_have_one_curriculum(tmp_path: Path) -> None:
     (group,) = study.groups
     assert group.seeds == [0, 1, 2] and not group.proposes
     assert sorted(run.folder.name for run in group.logs) == ["a", "b"]
-
-
-def test_a_reused_proposers_settings_tell_runs_apart(tmp_path: Path) -> None:
-    curriculum = {"checkpoint": "runs/seed_0"}
-    for i in range(2):
-        proposer = {"rollouts": i}
-        write_run(tmp_path / str(i), "frozen", curriculum=curriculum, proposer=proposer)
-    (study,), _ = read(tmp_path)
-    assert len(study.groups) == 2
