@@ -207,7 +207,7 @@ def _versions(run: Run) -> str:
     found = run.facts.get("versions")
     if not isinstance(found, dict):
         return "not recorded"
-    return ", ".join(f"{str(name)[:40]} {str(value)[:40]}" for name, value in found.items())
+    return ", ".join(f"{str(name)[:40]} {str(value)[:40]}" for name, value in sorted(found.items()))
 
 
 def _hardware(run: Run) -> str:

@@ -74,11 +74,11 @@ def test_a_copy_has_no_pictures_and_names_no_folder_of_the_machine(
     assert config["checkpoint"] == "5/checkpoints"
 
 
-def test_other_checkpoints_remain_others(tmp_path: Path) -> None:
+def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
     for life in range(3):
         given = f"{tmp_path}/lives/{life}/lifetime_2"
         own = {"checkpoint": given, "curriculum": {"_target_": "some.factory", "checkpoint": given}}
-        write_run(tmp_path / "runs" / str(life), "frozen_proposer", [5], **own)
+        write_run(tmp_path / "runs" / str(life), "frozen_proposer", [5 + life], **own)
     for folder in (tmp_path / "runs", published(tmp_path / "runs", tmp_path / "light")):
         (study,), notes = read_studies(find_runs([folder]), None)
         assert len(study.groups) == 1 and len(study.runs) == 3 and not notes
