@@ -14,8 +14,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from proposer_rl.cli.config import methods
+from proposer_rl.cli.outcome import quoted
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.checkpoint import load_latest
@@ -140,14 +144,34 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
     own.write_text((CONFIG_FOLDER / "method/target.yaml").read_text())
     arguments = ["+method=mine", *SMOKE, "lifetimes=2"]
     ends = [("hydra.run.dir=run", "run"), ("+sweep=quick hydra.sweep.dir=all seed=3", "all/")]
-    for given, folder in ends:
-        assert train("--config-dir", "own", *given.split(), *arguments) == 128 + signal.SIGTERM
+    for words, folder in ends:
+        assert train("--config-dir", "own", *words.split(), *arguments) == 128 + signal.SIGTERM
         (told,) = re.findall(r"To go on: (.*)", capsys.readouterr().out)
         path, command, *words = shlex.split(told)
         assert path.startswith("PYTHONPATH=own parts") and command == "bin/train"
         assert words[:2] == ["--config-dir", "own"] and {*arguments} <= {w.lower() for w in words}
         assert not any(word.startswith("+sweep") for word in words)
         assert folder in words[-1] and "lifetime_" not in words[-1]
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.text(st.characters(exclude_characters="\0\n\r$", codec="utf-8"), min_size=1))
+@example("runs/é").via("letters that Hydra's grammar has not")
+@example("a b=c,d").via("signs that it reads as its own")
+@example("NULL").via("what it takes for something else")
+@example("it's \\' \\").via("its quotes and escapes")
+def test_a_folder_is_given_to_hydra_as_it_is(folder: str) -> None:
+    parser = OverridesParser.create()
+    override = parser.parse_override(f"hydra.run.dir={quoted(folder)}")
+    assert str(override.value()) == folder
+
+
+@pytest.mark.parametrize("override", ["task.network=[1,2", "hydra.run.dir=runs/é"])
+def test_what_hydra_cannot_read_is_named(override: str, train, capsys) -> None:
+    assert train("+method=target", override) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {override}: cannot be read as KEY=VALUE")
+    assert len(error.splitlines()) == 1 and "https" not in error
 
 
 def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> None:

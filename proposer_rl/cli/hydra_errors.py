@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from hydra.errors import MissingConfigException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -31,6 +31,12 @@ def explained(error: Exception) -> str:
     if not_chosen and not_chosen[1] in ADDED:
         group, known = not_chosen[1], ", ".join(names(CONFIG_FOLDER, not_chosen[1]))
         return f"{group}: choose one with +{group}=NAME, NAME one of: {known}"
+    if isinstance(error, OverrideParseException):
+        said = one_line(error).partition(" See https:")[0]
+        return (
+            f"{error.override}: cannot be read as KEY=VALUE ({said}); a value with other signs "
+            "than letters, digits and /:-+.$%*@?|_ has quotes of its own: \"KEY='VALUE'\""
+        )
     return one_line(error)
 
 

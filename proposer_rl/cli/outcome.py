@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shlex
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from rich.console import Console
 from tqdm import tqdm
@@ -68,8 +72,18 @@ def to_go_on(path: Path) -> str:
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
     own = [word for word in overrides() if not word.startswith("+sweep=")]
-    words = shlex.join([*options, *own, f"hydra.run.dir={path}"])
+    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(path))}"])
     return " ".join([*before, "bin/train", words])
+
+
+def quoted(path: str) -> str:
+    """A path as Hydra's grammar of overrides takes it: in its quotes, where it has to be."""
+    with suppress(HydraException):
+        if OverridesParser.create().parse_override(f"hydra.run.dir={path}").value() == path:
+            return path
+    # Backslashes count before a quote only, where each stands for itself if doubled.
+    escaped = re.sub(r"(\\*)('|$)", lambda end: 2 * end[1] + end[2].replace("'", r"\'"), path)
+    return f"'{escaped}'"
 
 
 def _about(config: RunConfig) -> dict[str, str]:

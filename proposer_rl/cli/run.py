@@ -114,6 +114,8 @@ def run(experiment: Experiment, config: RunConfig) -> float:
         result = experiment.run()
     except DivergedError as error:
         kept = folder.path / "checkpoints"
+        if not checkpoint_files(kept):
+            raise
         raise DivergedError(
             f"{error}; the last checkpoints before it are kept in {kept}"
         ) from error

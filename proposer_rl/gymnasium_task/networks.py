@@ -74,11 +74,14 @@ def checked_spaces(seen: spaces.Space[Any], acts: spaces.Space[Any]) -> tuple[sp
             "[H, W, C]; a wrapper can make it one, such as "
             "task.wrappers=[gymnasium.wrappers.FlattenObservation]"
         )
-    if isinstance(acts, spaces.Discrete) or (isinstance(acts, spaces.Box) and len(acts.shape) == 1):
+    if isinstance(acts, spaces.Discrete):
+        return seen, acts
+    whole = not np.issubdtype(acts.dtype, np.floating)
+    if isinstance(acts, spaces.Box) and len(acts.shape) == 1 and not whole:
         return seen, acts
     raise ValueError(
-        f"action space {acts}: there is a policy for a Discrete one and for a Box [D]; a wrapper "
-        "can make it one"
+        f"action space {acts}: there is a policy for a Discrete one and for a Box [D] of floats; a "
+        "wrapper can make it one"
     )
 
 

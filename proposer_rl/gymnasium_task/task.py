@@ -48,7 +48,9 @@ SAMPLES = 6  # levels of each distribution that a reader is shown
 CPU = torch.device("cpu")
 KINDS = ("success", "return")
 
-RESERVED = (SEED, "updates")  # columns of tables, which parameters are, too
+# Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
+OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
+RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 
 
 class GymnasiumTask:
@@ -308,8 +310,8 @@ def _spaces(
     bins, target = {}, {}
     for name, settings in parameters.items():
         try:
-            if name in RESERVED:
-                raise ValueError("is a column of every table; choose another name")
+            if name in RESERVED or name.startswith("loss_"):
+                raise ValueError("is a column of what is told of training; choose another name")
             if not re.fullmatch(r"\w[\w .-]*", name):
                 raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = space_bins(settings), target_bins(settings)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from proposer_rl.report.progress import recorded_activity
-from proposer_rl.report.reading import begun
+from proposer_rl.report.reading import FAILURE, begun
 from proposer_rl.report.records import number, small_json
 from proposer_rl.runs.status import FILE, duration
 
@@ -69,6 +69,8 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
         if SUMMARY in files:
             said = _told(path / SUMMARY)
             finished.append((_settings(said), number(said.get("seconds"))))
+        elif FAILURE in files:
+            continue
         elif FILE in files and time.time() - (path / FILE).stat().st_mtime < GOING:
             activity = recorded_activity(path)
             seconds = activity.seconds_left if activity else None

@@ -47,7 +47,7 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ({"parameters": {}}, "parameters: at least one"),
         (
             {"parameters": {"seed": PARAMETERS["width"]}},
-            "parameters.seed: is a column of every table",
+            "parameters.seed: is a column of what is told of training",
         ),
         (
             {"parameters": {"width": ParameterSettings(values=[2.0, 1.0], target=1.0)}},
@@ -81,7 +81,15 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ),
         (
             {"parameters": {"updates": PARAMETERS["width"]}},
-            "parameters.updates: is a column of every table",
+            "parameters.updates: is a column of what is told of training",
+        ),
+        (
+            {"parameters": {"entropy": PARAMETERS["width"]}},
+            "parameters.entropy: is a column of what is told of training",
+        ),
+        (
+            {"wrappers": ["tests.gymnasium_task.test_task.with_whole_actions"]},
+            r"action space Box.*int64\): there is a policy for .* a Box \[D\] of floats",
         ),
         ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
         ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
@@ -104,6 +112,11 @@ def test_wrong_input_is_told_in_a_line(changed: dict[str, Any], message: str) ->
     with pytest.raises(ValueError, match=message) as caught:
         walk_task(**changed)
     assert "\n" not in str(caught.value)
+
+
+def with_whole_actions(env: Any) -> Any:
+    whole = gymnasium.spaces.Box(0, 1, (1,), np.int64)
+    return gymnasium.wrappers.TransformAction(env, lambda action: int(action[0]), whole)
 
 
 def as_dictionary(env: Any) -> Any:

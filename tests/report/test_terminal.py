@@ -139,7 +139,11 @@ def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> Non
         (folder / "progress.json").write_text(json.dumps(said))
     text = " ".join(watch(capsys, str(tmp_path)).split())
     assert "sweep: 3 of 6 runs left, about 11 min, 2 at a time" in text  # (100 + 500 + 700) / 2
-    (folder / "progress.json").unlink()
+    (folder / "error.json").write_text("{}")  # it has failed since, and is to be made anew
+    text = " ".join(watch(capsys, str(tmp_path)).split())
+    assert "sweep: 3 of 6 runs left, about 33 min" in text  # 100 + 500 + 4100 / 3
+    for name in ("progress.json", "error.json"):
+        (folder / name).unlink()
     write_planned(tmp_path, "target", 5, finished=False)
     for path in tmp_path.iterdir():
         if path.is_dir():
