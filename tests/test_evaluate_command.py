@@ -214,7 +214,8 @@ def test_several_runs_are_compared_by_their_means(
 
 def test_what_has_changed_is_evaluated_anew(evaluate, run: Path, tmp_path: Path) -> None:
     """Runs of the same name that were replaced, and files of levels that were rewritten."""
-    levels, output = tmp_path / "levels.txt", tmp_path / "scores.csv"
+    (deep := tmp_path / ("n" * 100)).mkdir()
+    levels, output = deep / "levels.txt", tmp_path / "scores.csv"
     shutil.copytree(run, tmp_path / "runs" / "kept")
     shutil.copytree(run, replaced := tmp_path / "runs" / "replaced")
     settings = json.loads((run / "config.json").read_text()) | {"method": "another"}
@@ -258,7 +259,8 @@ def test_scores_of_several_runs_are_not_written_over(evaluate, run: Path, tmp_pa
     ("arguments", "message"),
     [
         (["{run}", "{run}"], "--levels: name the sets"),
-        (["{run}", "--levels", "small", f"{'x' * 99}.txt"], "takes shorter names"),
+        (["{run}", "--levels", "small", f"{'x' * 1024}.txt"], "at most 1024 printable"),
+        (["{run}", "--levels", "small", "two\nlines.txt"], "takes names of one line"),
         (["{run}", "--levels", "small", "shapes", "--pictures", "x.png"], "--pictures: give one"),
         (["{run}", "--levels", "small", "shapes", "-o", "x.json"], "are written as .csv"),
         (["{run}", "{run}", "--levels", "nothing"], "must be one of: "),

@@ -30,8 +30,8 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
-from proposer_rl.report.generalisation import Score as RunScore
 from proposer_rl.report.generalisation import (
+    LONGEST_NAME,
     check_names,
     generalisation_table,
     read_scores,
@@ -40,6 +40,7 @@ from proposer_rl.report.generalisation import (
     whole,
     write_scores,
 )
+from proposer_rl.report.generalisation import Score as RunScore
 from proposer_rl.report.reading import UnreadableRun, begun, find_runs
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
@@ -134,8 +135,11 @@ def _compare(options: argparse.Namespace) -> None:
     if not names:
         raise ConfigError("--levels: name the sets of levels on which several runs are compared")
     for name in names:
-        if name != stored_name(name):
-            raise ConfigError(f"--levels {name}: the table of several runs takes shorter names")
+        if name != (stored := stored_name(name)):
+            raise ConfigError(
+                f"--levels {stored:.80}: the table of several runs takes names of one line, of at "
+                f"most {LONGEST_NAME} printable characters"
+            )
     if output is not None and output.suffix != ".csv":
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
     if options.max_steps is not None and output is not None:

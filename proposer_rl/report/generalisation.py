@@ -19,7 +19,7 @@ from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import read_bounded
 
 LARGEST_FILE = 2**24
-LONGEST_NAME = 80
+LONGEST_NAME = 1024  # characters; a file of levels is named by its path
 
 
 class Score(NamedTuple):
@@ -78,7 +78,7 @@ def read_scores(file: Path) -> list[Score]:
 
 
 def stored_name(levels: str) -> str:
-    """What of the name of a set of levels is kept: one line, and not a long one."""
+    """What of the name of a set of levels is kept: one line, of ``LONGEST_NAME`` characters."""
     return printable(levels)[:LONGEST_NAME]
 
 
