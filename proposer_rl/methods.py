@@ -48,6 +48,7 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
+from proposer_rl.runs.folder import PROPOSER
 from proposer_rl.settings import PPOSettings, ProblemSettings, ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -184,7 +185,7 @@ def frozen_proposer(
     Args:
         parts: the task, and the settings of the Proposer's network and actions, which must be those
             of that run.
-        checkpoint: a checkpoint of that run, or its folder for the newest.
+        checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
         choose: see :func:`_choice`.
 
     Raises:
@@ -403,12 +404,16 @@ def _one_solver(parts: Parts) -> None:
 
 
 def _curriculum_state(path: Path) -> State:
-    """The curriculum's part of a checkpoint, or of a run's newest one."""
+    """The curriculum's part of a checkpoint, or of a run's newest one, or what it left of it."""
     if not path.exists():
         raise CheckpointError(f"checkpoint={path}: there is no such file or folder")
     if path.is_dir():
         latest = load_latest(path / "checkpoints")
-        if latest is None:
-            raise CheckpointError(f"checkpoint={path}: the folder holds no checkpoints")
-        return latest[1]["curriculum"]
+        if latest is not None:
+            return latest[1]["curriculum"]
+        path = path / PROPOSER
+        if not path.exists():
+            raise CheckpointError(
+                f"checkpoint={path.parent}: the folder holds no checkpoints and no {PROPOSER}"
+            )
     return load_checkpoint(path)[1]["curriculum"]

@@ -70,7 +70,7 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     [
         ("null", "checkpoint=: name a run's folder or a checkpoint that has a Proposer"),
         ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
-        (".", "checkpoint=.: the folder holds no checkpoints"),
+        (".", "checkpoint=.: the folder holds no checkpoints and no proposer.pt"),
     ],
 )
 def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train, capsys) -> None:
@@ -94,6 +94,25 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     ended = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
     for name, entry in began.items():
         assert torch.equal(entry["value"], ended[name]["value"])
+
+
+@pytest.mark.parametrize("method", ["perf_gain", "first_order_proposer"])
+def test_what_a_proposer_has_learnt_is_a_file_of_its_own(method: str, train) -> None:
+    """Another run begins with it as it does with the whole run."""
+    assert train(f"+method={method}", *SMOKE, "hydra.run.dir=learnt") == 0
+    proposer = Path("learnt/proposer.pt")
+    (whole,) = sorted(Path("learnt/checkpoints").glob("*.pt"))[-1:]
+    assert proposer.stat().st_size < whole.stat().st_size / 2
+    again = ["+method=frozen_proposer", *SMOKE]
+    if method == "first_order_proposer":
+        again += ["proposer/action=problems", "proposer.observes=[]", "proposer.action_repeat=1"]
+    runs = {"of_run": "learnt", "of_file": str(proposer), "of_folder": "light"}
+    Path("light").mkdir()
+    shutil.copy(proposer, "light")
+    for name, checkpoint in runs.items():
+        assert train(*again, f"checkpoint={checkpoint}", f"hydra.run.dir={name}") == 0
+        assert not Path(name, "proposer.pt").exists()  # it is that of another run
+        assert tables(Path(name)) == tables(Path("of_run"))
 
 
 def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:

@@ -201,13 +201,11 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
         raise KeyError("enough")
 
     monkeypatch.setattr("proposer_rl.cli.run.parts", note)
-    assert train("+sweep=medium_lives", "seed=7") == 1
     assert train("+sweep=medium_frozen", "seed=107") == 1
     assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
-    frozen, learnt = "sweeps/medium/frozen_proposer-none-seed_107", "sweeps/medium_lives/107"
+    frozen = "sweeps/medium/frozen_proposer-none-seed_107"
     assert made == [
-        (learnt, None, 7, 3, "none"),
-        (frozen, f"{learnt}/lifetime_2", 107, 1, "none"),
+        (frozen, "results/medium/lives/0/lifetime_2", 107, 1, "none"),
         ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, 1, "paper_literal"),
     ]
 

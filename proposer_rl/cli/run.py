@@ -18,8 +18,13 @@ from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
-from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files, load_latest
-from proposer_rl.runs.folder import RunFolder, storage
+from proposer_rl.runs.checkpoint import (
+    CheckpointError,
+    checkpoint_bytes,
+    checkpoint_files,
+    load_latest,
+)
+from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
@@ -119,6 +124,9 @@ def run(experiment: Experiment, config: RunConfig) -> float:
         raise DivergedError(
             f"{error}; the last checkpoints before it are kept in {kept}"
         ) from error
+    if learnt := experiment.curriculum.learnt():
+        content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
+        write_atomically(folder.path / PROPOSER, content)
     folder.write_json(SUMMARY, {**facts, **result})
     announce(result, config, folder, draw_run(folder.path, title=run_name(config)))
     return _value(result, config)

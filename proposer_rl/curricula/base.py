@@ -104,6 +104,10 @@ class Curriculum:
         """
         return Improvement()
 
+    def learnt(self) -> dict[str, Any]:
+        """What runs on other Solvers can begin with, part of the state; empty if there is none."""
+        return {}
+
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
         return {}

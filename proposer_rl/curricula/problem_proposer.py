@@ -14,6 +14,7 @@ from torchrl.objectives import ClipPPOLoss
 from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.checks import real, whole
 from proposer_rl.curricula.choice import Choice
+from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.learning import PPO
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import PPOSettings
@@ -155,6 +156,10 @@ class ProblemProposer(Curriculum):
         metrics = {**self._told, "histogram": self._proposed.view(shape).tolist()}
         self._proposed = torch.zeros_like(self._proposed)
         return Improvement(metrics)
+
+    def learnt(self) -> dict[str, Any]:
+        """The Proposer, without its optimiser."""
+        return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's state, and what is told of the cycle."""

@@ -93,6 +93,10 @@ class ProposerCurriculum(Curriculum):
         proposal = Proposal(levels, evaluations=evaluations)
         return self.choice(learner, proposal, streams)[1] if self.choice else proposal
 
+    def learnt(self) -> dict[str, Any]:
+        """The Proposer, without its optimiser; nothing if it is frozen: others have it then."""
+        return {} if self.trainer is None else learnt_proposer(self.agent)
+
     def state_dict(self) -> dict[str, Any]:
         """Where the cycle's levels come from, how far it is, the action that holds; the agent."""
         agent = (
@@ -232,6 +236,11 @@ class ProposerTrainer:
             **{key: float(value) for key, value in training.items()},
             "histogram": proposed.unflatten(0, sides).tolist(),
         }
+
+
+def learnt_proposer(agent: ActorCritic) -> dict[str, Any]:
+    """A Proposer's weights and what it observes, as its curriculum's state has them."""
+    return {"proposer": agent_weights(agent).to_dict(), "observed": agent.in_keys}
 
 
 def explained_share(action: Tensor, rewards: Tensor) -> float | None:

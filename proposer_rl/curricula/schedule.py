@@ -49,6 +49,10 @@ class ScheduleCurriculum(Curriculum):
         """Improve the stage that the cycle begins with."""
         return self._stage(updates).improve(learner, updates, streams)
 
+    def learnt(self) -> dict[str, Any]:
+        """What the last stage that has learnt something has learnt."""
+        return next(filter(None, (stage.learnt() for stage in reversed(self._stages))), {})
+
     def state_dict(self) -> dict[str, Any]:
         """Those of the stages."""
         return {"stages": [stage.state_dict() for stage in self._stages]}

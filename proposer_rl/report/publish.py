@@ -12,7 +12,7 @@ from typing import Any
 from proposer_rl.report.build import OutputError
 from proposer_rl.report.reading import begun, find_runs, read_run
 from proposer_rl.report.records import anywhere
-from proposer_rl.runs.folder import read_jsonl, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, read_jsonl, storage, write_atomically
 
 BULK = ("checkpoints", "curriculum.jsonl")  # what no copy has
 UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
@@ -21,7 +21,8 @@ UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
 def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str]]:
     """Copy finished runs, without checkpoints, pictures of levels and this machine's folders.
 
-    Tables, and figures without levels in them, come out of the copies as they do of the runs.
+    Of a Proposer that has had several lifetimes what it has learnt comes along. Tables, and
+    figures without levels in them, come out of the copies as they do of the runs.
 
     Args:
         folders: of runs, or with runs in them.
@@ -78,7 +79,9 @@ def _light(folder: Path) -> dict[str, bytes]:
     run["task"].pop("samples", None)
     config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     reused = str(config.get("checkpoint") or "")
-    files = {name: (folder / name).read_bytes() for name in UNCHANGED if (folder / name).exists()}
+    # A Proposer that has learnt on several Solvers is meant for others.
+    names = (*UNCHANGED, PROPOSER) if config.get("lifetimes", 1) != 1 else UNCHANGED
+    files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
     files |= {"run.json": _json(run, reused), "config.json": _json(config, reused)}
     for name in ("cycles.jsonl", "levels.jsonl"):
         if (folder / name).exists():

@@ -68,9 +68,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
         raise CheckpointError(f"step must be at least 0 and keep at least 1, got {step} and {keep}")
     folder = Path(folder)
     path = folder / f"step_{step:09d}.pt"
-    payload = io.BytesIO()
-    torch.save(_plain(state, "state"), payload)
-    body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()
+    content = checkpoint_bytes(step, state)
     later = [old for number, old in checkpoint_files(folder) if number > step]
     for old in later:  # all of them damaged, or else this run is not theirs
         with suppress(_DamagedError):
@@ -82,13 +80,21 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
         folder.mkdir(parents=True, exist_ok=True)
         for leftover in folder.glob(".step_*.pt.tmp"):
             leftover.unlink()
-    write_atomically(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+    write_atomically(path, content)
     with storage(folder):
         for old in later:
             old.unlink()
         for _, old in checkpoint_files(folder)[:-keep]:
             old.unlink()
     return path
+
+
+def checkpoint_bytes(step: int, state: State) -> bytes:
+    """A checkpoint as a file's content; see :func:`save_checkpoint`."""
+    payload = io.BytesIO()
+    torch.save(_plain(state, "state"), payload)
+    body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()
+    return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
 def checkpoint_files(folder: Path) -> list[tuple[int, Path]]:

@@ -19,6 +19,8 @@ from pathlib import Path
 
 Number = int | float
 
+PROPOSER = "proposer.pt"  # what a run's curriculum has learnt, alone: a checkpoint without Solvers
+
 _PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 
 

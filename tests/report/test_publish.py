@@ -86,6 +86,16 @@ def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
     assert config["checkpoint"] == config["curriculum"]["checkpoint"] == "1/lifetime_2"
 
 
+def test_proposers_of_several_lifetimes_come_along(tmp_path: Path) -> None:
+    for name, lifetimes in {"alone": 1, "0/lifetime_1": 2}.items():
+        folder = write_run(tmp_path / "runs" / name, lifetimes=lifetimes)
+        (folder / "proposer.pt").write_bytes(name.encode())
+    light = published(tmp_path / "runs", tmp_path / "light")
+    found = {name: content for name, content in contents(light).items() if "proposer" in name}
+    assert found == {"0/lifetime_1/proposer.pt": b"0/lifetime_1"}
+    assert contents(published(light, light)) == contents(light)
+
+
 def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: Path) -> None:
     rows = {"a": {"success": [0.5], "return": [0.4]}, "b": {"return": [0.4]}}
     for name, row in rows.items():
