@@ -1,0 +1,100 @@
+"""Whole runs on a device that refuses to mix its tensors with the CPU's, as CUDA does."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.utils import backend_registration
+
+from proposer_rl.curricula import Curriculum, SamplingCurriculum
+from proposer_rl.learning import PPO, Update
+from proposer_rl.methods import Parts
+from proposer_rl.runs.folder import read_csv
+from tests.gymnasium_task.toys import TINY
+from tests.processes import ROOT
+from tests.test_kill import METHODS
+
+QUIET = ["+scale=smoke", "compute.progress=false"]
+CALLED = {
+    **{method: [f"+method={method}", *QUIET] for method in METHODS if "frozen" not in method},
+    "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
+    "with_a_choice": ["+method=hand_made", "+choose=learnability", *QUIET],
+    "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
+    "window": ["+method=perf_gain", "task=view_maze_smoke", "compute.progress=false"],
+    "gymnasium": ["+method=perf_gain", "task=cartpole", *TINY],
+}
+
+Run = Callable[..., str]
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this PyTorch knows no devices that are written in Python",
+)
+
+
+@pytest.fixture(scope="module")
+def run_there() -> Iterator[Run]:
+    """Makes a run on the device; returns what went wrong."""
+    command = [sys.executable, "-m", "tests.pretended_gpu"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as process:
+
+        def run(folder: Path, *overrides: str) -> str:
+            process.stdin.write(json.dumps([str(folder), *overrides]) + "\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        yield run
+        process.stdin.close()
+
+
+@pytest.mark.parametrize("name", CALLED)
+def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> None:
+    said = run_there(tmp_path, *CALLED[name])
+    assert said == "", said
+    assert read_csv(tmp_path / "metrics.csv")[-1]["updates"] in (4, 6)
+
+
+def test_a_frozen_proposer_comes_from_another_device(
+    run_there: Run, train: Callable[..., int], tmp_path: Path
+) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert train("+method=perf_gain", *QUIET, f"hydra.run.dir={here}") == 0
+    assert run_there(there, "+method=frozen_proposer", *QUIET, f"checkpoint={here}") == ""
+
+
+def test_what_is_computed_there_is_what_is_computed_here(
+    run_there: Run, train: Callable[..., int], tmp_path: Path
+) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert train(*CALLED["two_seeds"], f"hydra.run.dir={here}") == 0
+    assert run_there(there, *CALLED["two_seeds"]) == ""
+    for name in ("metrics.csv", "training.csv"):
+        for one, other in zip(read_csv(here / name), read_csv(there / name), strict=True):
+            assert {**one, "seconds": 0} == pytest.approx({**other, "seconds": 0}, abs=1e-5)
+
+
+class Careless(SamplingCurriculum):
+    """Forgets that a Solver's numbers may lie elsewhere."""
+
+    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
+        rewards = update.rollout["next", "reward"]
+        torch.zeros(rewards.shape).add_(rewards)
+
+
+def careless(parts: Parts, **_: Any) -> Curriculum:
+    return Careless(parts.task.target)
+
+
+def test_what_mixes_devices_is_refused(run_there: Run, tmp_path: Path) -> None:
+    said = run_there(
+        tmp_path, *CALLED["two_seeds"], "curriculum._target_=tests.test_devices.careless"
+    )
+    assert "on the CPU, others on the device" in said and "in observe" in said
