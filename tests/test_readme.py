@@ -121,7 +121,9 @@ def test_the_commands_about_runs_run(
             scores.parent.mkdir(parents=True, exist_ok=True)
             scores.write_bytes(write_scores([]))
         if "--seconds" in arguments:
-            write_seconds(Path(arguments[arguments.index("--seconds") + 1]), {"target": [1.0]})
+            after = arguments[arguments.index("--seconds") + 1 :]
+            for file in takewhile(lambda word: not word.startswith("-"), after):
+                write_seconds(Path(file), {"target": [1.0]})
         {"bin/report": report_main, "bin/watch": watch_main}[program](arguments)
 
 

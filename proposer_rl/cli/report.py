@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = _parser()
     options = parser.parse_args(arguments)
     for name in ("scores", "seconds"):
-        if getattr(options, name) is not None and options.pages is None:
+        if getattr(options, name) and options.pages is None:
             parser.error(f"--{name}: only the pages of the docs take them up; give --pages, too")
     if options.publish is not None and (options.threshold, options.baseline) != (None, None):
         parser.error("--publish: copies runs, so neither --threshold nor --baseline has a meaning")
@@ -118,8 +118,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seconds",
         type=Path,
+        nargs="+",
+        default=[],
         metavar="FILE",
-        help="of an update of each method, as bin/bench curricula --runs writes them: for --pages",
+        help="of an update of each method, as bin/bench curricula --runs writes them; further "
+        "files, of methods timed later beside some of those: for --pages",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

@@ -52,7 +52,7 @@ def write_pages(
     threshold: float | None = None,
     baseline: str | None = None,
     scores: Path | None = None,
-    seconds: Path | None = None,
+    seconds: Sequence[Path] = (),
 ) -> list[Path]:
     """Write the pages.
 
@@ -63,7 +63,7 @@ def write_pages(
         threshold: see :func:`~proposer_rl.report.build.write_report`.
         baseline: the same.
         scores: of the runs on further levels, as ``bin/eval`` writes them.
-        seconds: of the methods, as ``bin/bench curricula --runs`` writes them; None for what the
+        seconds: of the methods, as ``bin/bench curricula --runs`` writes them; none for what the
             runs took.
 
     Returns:
@@ -81,10 +81,10 @@ def write_pages(
     (study,) = studies
     if scores is not None:
         check_names(study.runs)
-    given = {"--scores": scores, "--seconds": seconds, "--pages": output}
-    more = [text for name, path in given.items() if path for text in (name, str(path))]
+    given = {"--scores": [scores] if scores else [], "--seconds": seconds, "--pages": [output]}
+    more = [text for name, paths in given.items() if paths for text in (name, *map(str, paths))]
     command = page.report_command(folders, threshold, baseline, *more)
-    ranked = study if seconds is None else timed(study, read_timing(seconds))
+    ranked = timed(study, read_timing(seconds)) if seconds else study
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
     pages = {

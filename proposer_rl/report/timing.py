@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,20 +24,41 @@ class Timing(NamedTuple):
 
     Attributes:
         seconds: of an update by the method's label, the curriculum's share included: medians.
-        machine: in words.
+        machine: in words; with those that were timed later, beside some of the others.
     """
 
     seconds: Mapping[str, float]
     machine: str
 
 
-def read_timing(file: Path) -> Timing:
-    """What ``bin/bench curricula --runs`` wrote.
+def read_timing(files: Sequence[Path]) -> Timing:
+    """What ``bin/bench curricula --runs`` wrote: of all methods, then of further ones.
+
+    A method that only a later file has takes as much longer than the methods that the files have in
+    common as it did when it was timed beside these (the median of the ratios).
 
     Raises:
-        UnreadableRun: if the file holds something else.
-        StorageError: if it cannot be read.
+        UnreadableRun: if a file holds something else, or methods that were timed beside none of
+            those before.
+        StorageError: if one cannot be read.
     """
+    found = _read(files[0])
+    for file in files[1:]:
+        other = _read(file)
+        common = [name for name in other.seconds if name in found.seconds]
+        if not common:
+            raise UnreadableRun(
+                f"--seconds {file}: has methods that were timed beside none of: "
+                f"{', '.join(found.seconds)}"
+            )
+        scale = float(np.median([found.seconds[name] / other.seconds[name] for name in common]))
+        new = {k: scale * value for k, value in other.seconds.items() if k not in found.seconds}
+        beside = f"{', '.join(new)} beside {', '.join(common)} on {other.machine}"
+        found = Timing({**found.seconds, **new}, f"{found.machine}; {beside}")
+    return found
+
+
+def _read(file: Path) -> Timing:
     try:
         found: Any = json.loads(read_bounded(file, LARGEST_FILE))
         measured, machine = found["benchmarks"][BENCHMARK], found["machine"]

@@ -283,7 +283,7 @@ def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     table.to_csv(slow, index=False)
     times = {"plr": [4.0, 5.0, 60.0], "accel": [1.0, 0.5, 1.5]}
     file = write_seconds(tmp_path / "seconds.json", times)
-    study = timed(study_of(tmp_path / "runs"), read_timing(file))
+    study = timed(study_of(tmp_path / "runs"), read_timing([file]))
     for run in study.runs:
         medians = {"plr": 5.0, "accel": 1.0}
         assert run.own_seconds.tolist() == [
@@ -295,6 +295,22 @@ def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
     assert "turns on one machine (abacus, threads: 3)" in text
     assert "--seconds seconds.json --pages pages" in text and "**accel**" in text
+
+
+def test_further_methods_are_timed_beside_some_of_the_others(tmp_path: Path) -> None:
+    """On a machine that is twice as fast for one of them, and four times for another."""
+    first = write_seconds(tmp_path / "first.json", {"plr": [4.0], "accel": [2.0], "sfl": [3.0]})
+    later = write_seconds(tmp_path / "later.json", {"plr": [2.0], "accel": [0.5], "ncc": [1.0]})
+    seconds, machine = read_timing([first, later])
+    assert seconds == {"plr": 4.0, "accel": 2.0, "sfl": 3.0, "ncc": 3.0}
+    assert machine == "abacus, threads: 3; ncc beside plr, accel on abacus, threads: 3"
+    write_methods(tmp_path / "runs", {"plr": FAST, "ncc": SLOW})
+    files = [str(first), str(later)]
+    main([str(tmp_path / "runs"), "--seconds", *files, "--pages", str(tmp_path / "pages")])
+    text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
+    assert "--seconds first.json later.json --pages pages" in text
+    with pytest.raises(UnreadableRun, match=r"other.json: has methods .* beside none of: plr"):
+        read_timing([first, write_seconds(tmp_path / "other.json", {"ncc": [1.0]})])
 
 
 @pytest.mark.parametrize(
@@ -374,7 +390,7 @@ def test_the_committed_pages_come_out_of_the_published_runs(
     monkeypatch.chdir(ROOT)
     medium = Path("results", "medium")
     folders = [str(medium / "runs"), "--scores", str(medium / "scores.csv")]
-    folders += ["--seconds", str(medium / "seconds.json")]
+    folders += ["--seconds", *map(str, sorted(medium.glob("seconds*.json")))]
     main([*folders, "--pages", str(tmp_path / "again")])
     for name in (CHOICE, CLAIMS):
         before, after = (
