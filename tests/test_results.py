@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
 from proposer_rl.report.findings import finding_table, findings
 from proposer_rl.report.outcomes import comparison_table, group_table, run_table
@@ -133,6 +134,18 @@ def number(cell: str) -> float | str:
         return float(cell)
     except ValueError:
         return cell
+
+
+def test_the_published_proposer_can_be_used(
+    train: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the mazes of its scale; it gives a beginner paths that are shorter than the target's."""
+    monkeypatch.chdir(ROOT)
+    learnt = OmegaConf.load(ROOT / "conf/sweep/medium_frozen.yaml").hydra.sweeper.params.checkpoint
+    few = ["solver.batch_size=64", "task.evaluation.levels=4", "schedule.updates=1"]
+    arguments = ["+method=frozen_proposer", "+scale=medium", f"checkpoint={learnt}", *few]
+    assert train(*arguments, "compute.progress=false", f"hydra.run.dir={tmp_path}") == 0
+    assert pd.read_csv(tmp_path / "training.csv")["path_length"].item() < 12
 
 
 # Pages whose numbers are all of runs whose tables are in the repository, prose and tables.
