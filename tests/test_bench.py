@@ -107,7 +107,7 @@ def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path
         assert train(f"+method={method}", "+scale=smoke", f"hydra.run.dir=runs/{method}") == 0
     assert bench("curricula", "--runs", "runs", "--repeats", "3", "--threads", "1") == 0
     assert "a Solver update of perf_gain, Smoke scale" in capsys.readouterr().out
-    timing = read_timing(tmp_path / "bench.json")
+    timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}
     assert timing.machine.endswith(", threads: 1")
 
