@@ -163,6 +163,13 @@ def test_a_schedule_trains_copies_where_a_stage_does() -> None:
     assert ScheduleCurriculum(stages, [1]).trains_copies
 
 
+def test_a_schedule_hands_on_what_its_last_stage_has_learnt() -> None:
+    stages = [Stage(name, []) for name in "abc"]
+    assert ScheduleCurriculum(stages, [1, 2]).learnt() == {}
+    stages[0].learnt, stages[1].learnt = (lambda: {"proposer": 0}), (lambda: {"proposer": 1})
+    assert ScheduleCurriculum(stages, [1, 2]).learnt() == {"proposer": 1}
+
+
 def test_a_proposer_may_begin_within_a_cycle() -> None:
     stages = [SamplingCurriculum(SPACE), proposer(mix=True, action_repeat=L)]
     curriculum = ScheduleCurriculum(stages, [1])
