@@ -116,9 +116,12 @@ def schedule(
         ValueError: for an unknown name, or as :class:`ScheduleCurriculum`.
     """
     known = parts.task.distributions
-    unknown = [name for name in distributions if name not in known]
-    if unknown:
-        raise ValueError(f"distributions must be among {sorted(known)}, got {unknown}")
+    if isinstance(distributions, str) or any(name not in known for name in distributions):
+        raise ValueError(
+            f"distributions must be a list of some of {sorted(known)}, got {distributions}"
+        )
+    if not isinstance(until, Sequence) or any(type(end) is not int for end in until):
+        raise ValueError(f"until must be a list of whole numbers, got {until!r}")
     choice = _choice(parts.task, choose)
     return ScheduleCurriculum(
         [SamplingCurriculum(known[name], choice) for name in distributions], until
@@ -295,7 +298,10 @@ def replay(
     )
     scorer = Scorer(parts.task, score, source, rollouts)
     space = parts.task.space
-    new = space if new_levels is None else SomeBins(space, new_levels)
+    try:
+        new = space if new_levels is None else SomeBins(space, new_levels)
+    except ValueError as error:
+        raise ValueError(f"new_levels: {error}") from error
     curriculum = ReplayCurriculum(scorer, rule, new, **numbers)
     curriculum.check(len(parts.seeds))
     return curriculum

@@ -27,6 +27,12 @@ Levels = Any
 """A tensordict or tensorclass of levels."""
 
 
+class NoSuccessError(ValueError):
+    """A task tells no success, and it was asked for; the message is a line that says what to do."""
+
+    exit_code = 2
+
+
 class Place(NamedTuple):
     """Where and how exactly a task computes; what makes a task is called with one.
 

@@ -247,7 +247,23 @@ WRONG_COMMANDS = [
     (["curriculum.tempo=3"], "curriculum.tempo: there is no such key; there are: none"),
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
     (["+method=hand_made", "hand_made.until=[3, 2]"], "2 stages need 1 ascending positive"),
-    (["+method=hand_made", "hand_made.distributions=[x]"], "among ['id', 'mix', 'ood'], got"),
+    (["+method=hand_made", "hand_made.distributions=[x]"], "some of ['id', 'mix', 'ood'], got"),
+    (
+        ["+method=hand_made", "curriculum.distributions=mix"],
+        "curriculum: distributions must be a list of some of ['id', 'mix', 'ood'], got mix",
+    ),
+    (
+        ["+method=hand_made", "curriculum.until=[a]"],
+        "curriculum: until must be a list of whole numbers, got ['a']",
+    ),
+    (
+        ["+method=hand_made", "curriculum.until=3"],
+        "curriculum: until must be a list of whole numbers, got 3",
+    ),
+    (
+        ["+method=perf_gain", "checkpoint=lives/0"],
+        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does",
+    ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum: method=perf_gain has no setting 'x'"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),
     (
@@ -303,7 +319,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=plr", *SMOKE, "curriculum.new_levels=3"],
-        "curriculum: must be values by the names of axes ['obstacle fraction', ",
+        "curriculum: new_levels: must be values by the names of axes ['obstacle fraction', ",
     ),
     (
         ["+method=first_order_proposer", *SMOKE, "curriculum.epochs=0"],

@@ -61,6 +61,8 @@ def smallest(arguments: list[str]) -> list[str]:
         own = OmegaConf.load(CONFIG_FOLDER / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
         if "task" in own and "," not in own.task:
             small += [f"task={own.task}", "schedule.updates=2"]
+        if "checkpoint" in own:
+            small += [f"checkpoint={own.checkpoint}"]
     tasks = [word.removesuffix("_quick") for word in small if word.startswith("task=")]
     if not tasks:  # scales are of mazes
         small = [*small, "+scale=smoke"] if "+scale=smoke" not in small else small
@@ -69,12 +71,12 @@ def smallest(arguments: list[str]) -> list[str]:
     else:
         small += TINY
     if any(word.startswith("+sweep=") for word in small):
-        # Of a sweep one run, in this process: there may be no cluster here. An ablation is one of
-        # the method that is given, or else of the sweep's own.
-        ablation = any(word.startswith("+ablation") for word in small)
-        given = r"launcher|^seed=" if ablation else r"launcher|^seed=|^\+method="
+        # Of a sweep one run, in this process: there may be no cluster here. An ablation or a
+        # checkpoint is for the method that is given, or else for the sweep's own.
+        own_method = any(word.startswith(("+ablation", "checkpoint=")) for word in small)
+        given = r"launcher|^seed=" if own_method else r"launcher|^seed=|^\+method="
         small = [word for word in small if not re.search(given, word)]
-        small += ["seed=0", *([] if ablation else ["+method=target"])]
+        small += ["seed=0", *([] if own_method else ["+method=target"])]
     return small
 
 

@@ -102,6 +102,12 @@ def read_config(config: DictConfig) -> RunConfig:
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
     checked = _validated(RunConfig, values)
+    read = (value for _, value in _leaves(checked.curriculum))
+    if checked.checkpoint is not None and checked.checkpoint not in read:
+        raise ConfigError(
+            f"checkpoint={checked.checkpoint}: method={checked.method} takes none; "
+            "frozen_proposer does"
+        )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
     return checked

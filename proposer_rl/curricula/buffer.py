@@ -55,7 +55,7 @@ class ReplayRule:
     """
 
     prioritization: Prioritization = "rank"
-    temperature: float = 0.3
+    temperature: float = 1.0
     best: int | None = None
     staleness: float = 0.3
 

@@ -21,6 +21,7 @@ from proposer_rl.task import (
     EpisodeLaw,
     ExactTask,
     Levels,
+    NoSuccessError,
     OptimalTask,
     Task,
 )
@@ -116,7 +117,10 @@ def _by_law(
 def _learnability(task: Task, learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
     performance = task.performance(learner.agent, levels, generator)
     if "success" not in performance.keys():
-        raise ValueError("learnability: this task tells no success, only the return")
+        raise NoSuccessError(
+            f"learnability: {type(task).__name__} tells no success, only the return; of the scores "
+            "regret and gradient norms take that"
+        )
     success = performance["success"]
     return success * (1 - success)
 

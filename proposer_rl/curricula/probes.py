@@ -11,15 +11,9 @@ from torch import Tensor
 from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import NoSuccessError, Task
 
 MEASURES = ("success", "return")
-
-
-class NoSuccessError(ValueError):
-    """The task tells no success; the message is one line that says what to do."""
-
-    exit_code = 2
 
 
 class Probes:

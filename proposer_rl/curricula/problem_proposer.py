@@ -16,6 +16,7 @@ from proposer_rl.curricula.checks import real, whole
 from proposer_rl.curricula.choice import Choice
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.learning import PPO
+from proposer_rl.learning.divergence import located, require_finite
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
@@ -193,15 +194,25 @@ class ProblemProposer(Curriculum):
         self._told = dict(state["told"])
 
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
-        """A few steps on all draws: the clipped objective of each problem, with its advantage."""
+        """A few steps on all draws: the clipped objective of each problem, with its advantage.
+
+        Raises:
+            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
+        """
+        steps = []
         for _ in range(self._settings.epochs):
             logits = self.agent(seen.copy())[self.agent.logits_key]  # [K, P, N]
             everywhere = logits.expand(len(played), -1, -1, -1)
             losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
             (losses["loss_objective"] + losses["loss_entropy"]).backward()
-            nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)
             self._adam.step()
+            terms = losses.select("loss_objective", "loss_entropy").detach()
+            steps.append(terms.set("grad_norm", norm))
+            with located("the Proposer"):  # before it draws from weights that are no numbers
+                weights, paid = dict(self.agent.named_parameters()), played["advantage"]
+                require_finite(paid.transpose(0, 1), TensorDict.stack(steps), weights, None)
         self._told |= {
             key: float(losses[key].detach()) for key in ("entropy", "kl_approx", "clip_fraction")
         }

@@ -78,7 +78,8 @@ class EvaluationSettings:
 
     Attributes:
         levels: of each distribution, the same in every run.
-        episodes: played on each level.
+        episodes: played on each level, with drawn actions: the most probable ones make the same
+            episode every time, since each begins with the level's own seed.
         actions: drawn from the policy, or the most probable ones.
         seed: of the levels and of the actions.
     """
@@ -87,3 +88,10 @@ class EvaluationSettings:
     episodes: Annotated[int, Ge(1)] = 1
     actions: Literal["sampled", "most_probable"] = "sampled"
     seed: Annotated[int, Ge(0)] = 0
+
+    def __post_init__(self) -> None:
+        if self.episodes > 1 and self.actions == "most_probable":
+            raise ValueError(
+                f"episodes={self.episodes}: with actions=most_probable all episodes on a level are "
+                "the same; leave episodes=1"
+            )

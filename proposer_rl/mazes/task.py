@@ -295,9 +295,12 @@ class MazeTask:
         if asked:
             for known, distribution in self.distributions.items():
                 if known.casefold() == asked[1].casefold():
-                    size = map(int, asked.group(2, 3))
+                    size = [int(cells) for cells in asked.group(2, 3)]
                     grid = named(f"--levels {name}", distribution.on_grid, *size)
+                    # The same levels and names however it was spelt.
+                    name = f"{known}@{size[0]}x{size[1]}"
                     drawn[name] = partial(self._fixed, name, grid)
+                    break
         there_are = (
             f"{', '.join(shipped_sets())}, a file that ends in {' or '.join(SUFFIXES)}, "
             f"a run's curriculum{RECORD}, or a distribution: {', '.join(self.distributions)}, as "

@@ -68,7 +68,8 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     Raises:
         DivergedError: if a Solver's success is exactly 0 on every level: then nothing points
             towards more of it.
-        ValueError: for another measure, or if the task tells no success.
+        NoSuccessError: if the task tells no success.
+        ValueError: for another measure.
     """
     if measure == "return":
         return mean_return(performance)

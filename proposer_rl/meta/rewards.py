@@ -10,6 +10,7 @@ from torch import Tensor
 
 from proposer_rl.learning import first_episode_success
 from proposer_rl.models import ActorCritic
+from proposer_rl.task import NoSuccessError
 
 LEAST_SUCCESS = 1e-3
 """Below it, success hardly counts in :func:`log_success`."""
@@ -87,11 +88,12 @@ def log_success(performance: TensorDictBase) -> Tensor:
     """log(success + 0.001) of every level, float [*B].
 
     Raises:
-        ValueError: if the task tells no success.
+        NoSuccessError: if the task tells no success.
     """
     if "success" not in performance.keys():
-        raise ValueError(
-            "log_success: this task tells no success, only the return; "
-            "take the reward performance_gain, and observe return"
+        raise NoSuccessError(
+            "log_success: this task tells no success, only the return. A Proposer's reward: give "
+            "curriculum.reward._target_=proposer_rl.meta.rewards.performance_gain and "
+            "proposer.observes=[return]; first-order gain: curriculum.measure=return"
         )
     return (performance["success"] + LEAST_SUCCESS).log()

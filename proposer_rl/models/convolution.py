@@ -39,10 +39,15 @@ class Conv3x3(nn.Conv2d):
 class _ProductGradient(torch.autograd.Function):
     """``F.conv2d`` with padding 1, and its weight gradient as one matrix product."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: Any, maps: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(maps, weight)
+    def forward(maps: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         return F.conv2d(maps, weight, bias, padding=1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:2])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:

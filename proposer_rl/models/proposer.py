@@ -55,7 +55,7 @@ class ProposerNetwork(nn.Module):
         encoder: from probes [*B, ...] of any kind to their features [*B, context]: a
             :class:`MapEncoder` for maps, an MLP for vectors.
         context: number of the encoder's features; the context g is ``context + numbers`` wide.
-        numbers: how many numbers, of about 0 to 1, are observed beside the probes.
+        numbers: how many numbers are observed beside the probes.
         hidden: width of the value's MLP.
     """
 

@@ -239,6 +239,14 @@ def test_what_is_evicted_leaves_nothing_behind() -> None:
     assert buffer["level", "a"].tolist() == [[1, 2]]  # what was given stays as it was
 
 
+def test_what_was_reached_on_a_level_does_not_fall_when_it_comes_again() -> None:
+    buffer = filled([1, 2], [0.9, 0.1], 4, RANK)
+    after = insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
+    assert after["score"][0, :2].tolist() == pytest.approx([0.2, 0.8])
+    assert after["best"][0, :2].tolist() == pytest.approx([0.9, 0.8])
+    assert after["solved"][0, :2].tolist() == [True, True]
+
+
 def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2], [0.5, 0.1], 2, rule)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.curricula.exact_scores import expected_best, return_variance
+from proposer_rl.curricula.exact_scores import exact_score, expected_best, return_variance
 from proposer_rl.curricula.scores import Scored, Scorer, unseen
 from proposer_rl.mazes import Level
 from proposer_rl.mazes.evaluation import optimal_return
 from proposer_rl.mazes.occupancy import episode_law
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import EpisodeLaw
+from proposer_rl.task import EpisodeLaw, NoSuccessError
+from tests.curricula.scripted import Scripted
 from tests.tiny import tiny_task
 
 UNIFORM, NO_VALUES = torch.full((4, 1, 2), 0.25), torch.zeros(1, 2)
@@ -78,3 +80,12 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
         for each, expected in zip(sampled.score.view(2, -1), exact.score[0] * shrunk, strict=True):
             error = float(each.std()) / math.sqrt(COPIES)
             assert float(each.mean()) == pytest.approx(float(expected), abs=4 * error)
+
+
+def test_learnability_needs_a_task_that_tells_success() -> None:
+    task: Any = Scripted(torch.rand(1, 3), told="return")
+    task.exact_performance = True
+    ask = exact_score(task, "learnability", 1)
+    with pytest.raises(NoSuccessError, match="Scripted tells no success, only the return") as no:
+        ask(task, torch.tensor([[0, 1]]), torch.Generator())
+    assert no.value.exit_code == 2

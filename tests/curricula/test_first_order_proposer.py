@@ -14,6 +14,8 @@ from torch import Tensor, nn
 
 from proposer_rl.curricula import Choice
 from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
+from proposer_rl.curricula.problem_proposer import Worth
+from proposer_rl.learning import DivergedError
 from proposer_rl.learning.ppo import PPOSettings
 from proposer_rl.models import (
     ProblemHead,
@@ -57,6 +59,20 @@ def proposer(task: Seen, choice: Choice | None = None, **settings: Any) -> First
         target_levels=3,
         measure="return",
     )
+
+
+@pytest.mark.parametrize(
+    ("paid", "told"),
+    [(torch.inf, "copy 0: reward is"), (1e38, "loss_objective of gradient step 0")],
+)
+def test_numbers_that_went_wrong_are_told_where_they_arise(
+    paid: float, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task)
+    monkeypatch.setattr(curriculum, "worth", lambda *_: Worth(torch.full((1, P), paid), {}))
+    with pytest.raises(DivergedError, match=f"^the Proposer: {told}"):
+        curriculum.propose(task, 0, [Streams(0, 0)])
 
 
 def test_it_learns_to_choose_what_the_target_needs() -> None:

@@ -13,8 +13,8 @@ from proposer_rl.curricula.learning_progress import (
     progress_shares,
     stretched,
 )
-from proposer_rl.curricula.probes import NoSuccessError
 from proposer_rl.streams import Streams
+from proposer_rl.task import NoSuccessError
 from tests.curricula.scripted import Scripted, played, step
 
 N = 4

@@ -83,8 +83,12 @@ def test_fewer_scores_than_are_kept_are_told() -> None:
 def test_the_mixture_is_exact(new: float, fresh: int) -> None:
     curriculum = selection(new=new)
     proposal = curriculum.propose(solvers([0]), 0, [Streams(0)])
-    kept = torch.isin(level_keys(proposal.levels), level_keys(curriculum.kept))
+    keys = level_keys(proposal.levels)
+    kept = torch.isin(keys, level_keys(curriculum.kept))
     assert bool(kept[0, : P - fresh].all()) and proposal.levels.batch_size == (1, P)
+    if fresh:
+        drawn = level_keys(fresh_levels(TASK.space, fresh, [Streams(0)], "levels"))
+        assert torch.equal(keys[:, P - fresh :], drawn)
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,12 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
     file = str(tmp_path / "halls.txt")
     assert named(TASK, file) == {"long": 10} and named(TASK, file, 4) == {"long": 4}
     assert set(named(TASK, "ID").values()) == {8}
-    assert list(named(TASK, "ID@6x6").values()) == list(named(TASK, "id@6x6").values())
+    agent = learners(1).agent
+    usual, *others = (
+        [(score.level, score.results) for score in TASK.scores(agent, name, None)]
+        for name in ("id@6x6", "ID@6x6", "id@06x6")
+    )
+    assert usual[0][0] == "id@6x6_000" and others == [usual, usual]
     shapes = named(TASK, "shapes")
     assert shapes["corridor_8"] == 2 * 34 and min(shapes.values()) >= 8
     with pytest.raises(

@@ -15,6 +15,7 @@ from proposer_rl.meta.rewards import (
     performance_gain,
     task_difficulty,
 )
+from proposer_rl.task import NoSuccessError
 
 
 def performance(**values: list[list[float]]) -> TensorDict:
@@ -46,8 +47,9 @@ def test_log_success_gain_is_the_increase_of_the_mean_logarithm() -> None:
 
 def test_log_success_needs_a_task_that_tells_success() -> None:
     only_return = performance(**{"return": [[1.0]]})
-    with pytest.raises(ValueError, match=r"tells no success.*take the reward performance_gain"):
+    with pytest.raises(NoSuccessError, match=r"tells no success.*rewards\.performance_gain") as no:
         log_success_gain(step(only_return, only_return))
+    assert no.value.exit_code == 2
 
 
 def rollout(*episodes: str) -> TensorDict:

@@ -41,6 +41,20 @@ def test_small_maps_of_many_channels_in_bf16_take_the_product(
     assert layer.weight.grad.dtype == torch.float32
 
 
+def test_copies_can_take_the_product_all_at_once() -> None:
+    tensors = [torch.randn(2, 4, 3, 5, 5), torch.randn(2, 6, 3, 3, 3), torch.randn(2, 6)]
+    tensors = [tensor.double().requires_grad_() for tensor in tensors]
+    each = torch.stack([_ProductGradient.apply(*(t[k] for t in tensors)) for k in range(2)])
+    together = torch.vmap(_ProductGradient.apply)(*tensors)
+    torch.testing.assert_close(together, each)
+    for one, other in zip(
+        torch.autograd.grad(together.square().sum(), tensors),
+        torch.autograd.grad(each.square().sum(), tensors),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)
+
+
 def test_in_float32_it_is_pytorchs_own() -> None:
     layer, maps = Conv3x3(8, 16), torch.randn(4, 8, 2, 2)
     expected = nn.functional.conv2d(maps, layer.weight, layer.bias, padding=1)
