@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
-from proposer_rl.cli.evaluate import SHOWN
+from proposer_rl.cli.evaluate import SHOWN, load
 from proposer_rl.cli.instruments import evaluate as main
 from proposer_rl.mazes.level_files import shipped_levels
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
@@ -246,6 +246,59 @@ def test_what_has_changed_is_evaluated_anew(evaluate, run: Path, tmp_path: Path)
     assert changed == {place for place in first if place[2] == str(levels)}
 
 
+def named(run: Path, folder: Path, *names: str) -> Path:
+    """A folder with copies of a run under other names, each a method of its own."""
+    for name in names:
+        shutil.copytree(run, folder / name)
+        settings = json.loads((run / "config.json").read_text()) | {"method": name}
+        (folder / name / "config.json").write_text(json.dumps(settings))
+    return folder
+
+
+def test_two_commands_may_add_to_one_table(
+    evaluate, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second begins and ends while the first, which has read the table, is at its first run."""
+    folders = [named(run, tmp_path / "one", "a", "b"), named(run, tmp_path / "two", "c", "d")]
+    output = tmp_path / "scores.csv"
+
+    def command(folder: Path) -> list[object]:
+        return [folder, "--levels", "small", "-o", output]
+
+    def meanwhile(checkpoint: Path) -> object:
+        monkeypatch.setattr("proposer_rl.cli.evaluate.load", load)
+        assert evaluate(*command(folders[1]))[0] == 0
+        return load(checkpoint)
+
+    monkeypatch.setattr("proposer_rl.cli.evaluate.load", meanwhile)
+    assert evaluate(*command(folders[0]))[0] == 0
+    with output.open() as file:
+        found = [(row["run"], row["seed"]) for row in csv.DictReader(file)]
+    assert sorted(found) == [(name, seed) for name in "abcd" for seed in "35"]
+    before = output.read_bytes()
+    monkeypatch.setattr("proposer_rl.cli.evaluate.load", None)  # nothing is left to be done
+    assert evaluate(tmp_path, "--levels", "small", "-o", output)[0] == 0
+    assert output.read_bytes() == before
+
+
+def test_runs_that_are_not_finished_are_left_out_and_named(
+    evaluate, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, output = named(run, tmp_path / "runs", "done", "going"), tmp_path / "scores.csv"
+    (folder / "going" / "summary.json").unlink()
+    main([*map(str, folder.iterdir()), "--levels", "small", "-o", str(output)])
+    said = capsys.readouterr()
+    assert said.err.splitlines() == ["left out: going: not finished"]
+    with output.open() as file:
+        assert {row["run"] for row in csv.DictReader(file)} == {"done"}
+    going, other = folder / "going", tmp_path / "other.csv"
+    for arguments in ([going, going, "--levels", "small"], [going, "--levels", "small", "id"]):
+        code, said = evaluate(*arguments, "-o", other)
+        assert code == 2 and f"{going}: no run is finished" in said and len(said.splitlines()) == 1
+    assert not other.exists()
+    assert evaluate(going, "--levels", "small")[0] == 0  # one on one set, as it is by now
+
+
 def test_scores_of_several_runs_are_not_written_over(evaluate, run: Path, tmp_path: Path) -> None:
     output = tmp_path / "scores.csv"
     assert evaluate(run, run, "--levels", "small", "-o", output)[0] == 0
@@ -265,9 +318,20 @@ def test_scores_of_several_runs_are_not_written_over(evaluate, run: Path, tmp_pa
         (["{run}", "--levels", "small", "shapes", "-o", "x.json"], "are written as .csv"),
         (["{run}", "{run}", "--levels", "nothing"], "must be one of: "),
         (["{run}", "--levels", "id@1x2"], "--levels id@1x2: "),
+        (
+            ["{file}", "--levels", "id", "ood"],
+            ".pt: is a file; several runs or sets of levels take",
+        ),
+        (["{run}", "{file}", "--levels", "id"], ".pt: is a file; several runs or sets of levels"),
+        (["{run}", "nowhere", "--levels", "id"], "nowhere: there is no such folder"),
+        (["{run}", "{run}", "--levels", "id", "-o", "{table}"], "holds no scores of runs"),
     ],
 )
-def test_wrong_comparisons_get_one_line(arguments, message, run: Path, evaluate) -> None:
-    code, said = evaluate(*(word.format(run=run) for word in arguments))
+def test_wrong_comparisons_get_one_line(
+    arguments, message, run: Path, tmp_path: Path, evaluate
+) -> None:
+    (table := tmp_path / "table.csv").write_text("run\n" + "x" * 2**18)  # longer than csv reads
+    places = {"run": run, "file": next((run / "checkpoints").glob("*.pt")), "table": table}
+    code, said = evaluate(*(word.format(**places) for word in arguments))
     assert code == 2 and said.startswith("error: ") and message in said
     assert len(said.splitlines()) == 1

@@ -47,6 +47,7 @@ from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.lock import taking_turns
 from proposer_rl.runs.pictures import pixels
 from proposer_rl.streams import Streams
 from proposer_rl.task import Score, ScoringTask, Task
@@ -129,7 +130,50 @@ def _refuse_table(output: Path | None) -> None:
 
 def _compare(options: argparse.Namespace) -> None:
     """Several runs on sets of levels: a table of methods; what the output has is not done again."""
+    _check_comparison(options)
     output, names = options.output, options.levels
+    studies, notes = read_studies(find_runs(options.checkpoint), None)
+    scores = _stored(output)
+    runs = whole(group for study in studies for group in study.groups)
+    if not runs:
+        raise ConfigError(
+            f"{', '.join(map(str, options.checkpoint))}: no run is finished; several runs or sets "
+            "of levels are compared at the runs' ends, only one run on one set before"
+        )
+    going = {run.folder for study in studies for run in study.runs} - {run.folder for run in runs}
+    notes += [f"left out: {folder.name}: not finished" for folder in sorted(going)]
+    check_names(runs)
+    failures = 0
+    for run in tqdm(runs, leave=False, disable=None):
+        try:
+            missing = _missing(run, names, scores, options.max_steps)
+        except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
+            if len(runs) == (failures := failures + 1):
+                raise
+            notes.append(f"left out: {error}")
+        else:
+            scores = _added(missing, scores, output)
+    for note in notes:
+        print(note, file=sys.stderr)
+    for study in studies:
+        found = generalisation_table(study, [score for score in scores if score.levels in names])
+        table = Table(box=SIMPLE_HEAD, title=Text(study.title), caption=found.note)
+        for column in found.columns:
+            table.add_column(Text(column), justify="left" if column == "method" else "right")
+        for row in found.texts():
+            table.add_row(*map(Text, row))
+        Console().print(table)
+
+
+def _check_comparison(options: argparse.Namespace) -> None:
+    """Refuse what several runs or sets of levels cannot be asked for, before anything is read."""
+    output, names = options.output, options.levels
+    for path in options.checkpoint:
+        if path.is_file():
+            raise ConfigError(
+                f"{path}: is a file; several runs or sets of levels take folders of runs only: "
+                "give a checkpoint alone, with one set"
+            )
     if options.pictures is not None:
         raise ConfigError("--pictures: give one run and one set of levels")
     if not names:
@@ -144,36 +188,34 @@ def _compare(options: argparse.Namespace) -> None:
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
     if options.max_steps is not None and output is not None:
         raise ConfigError(f"--max-steps: --output {output} would not tell it; leave one out")
-    studies, notes = read_studies(find_runs(options.checkpoint), None)
-    scores = read_scores(output) if output is not None and output.exists() else []
-    runs = whole(group for study in studies for group in study.groups)
-    check_names(runs)
-    failures = 0
-    for run in tqdm(runs, leave=False, disable=None):
-        try:
-            scores = _with_missing(run, names, scores, options.max_steps)
-        except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
-            if len(runs) == (failures := failures + 1):
-                raise
-            notes.append(f"left out: {error}")
-        if output is not None:
-            write_atomically(output, write_scores(scores))
-    for note in notes:
-        print(note, file=sys.stderr)
-    for study in studies:
-        found = generalisation_table(study, [score for score in scores if score.levels in names])
-        table = Table(box=SIMPLE_HEAD, title=Text(study.title), caption=found.note)
-        for column in found.columns:
-            table.add_column(Text(column), justify="left" if column == "method" else "right")
-        for row in found.texts():
-            table.add_row(*map(Text, row))
-        Console().print(table)
 
 
-def _with_missing(
+def _stored(output: Path | None) -> list[RunScore]:
+    return read_scores(output) if output is not None and output.exists() else []
+
+
+def _added(found: list[RunScore], scores: list[RunScore], output: Path | None) -> list[RunScore]:
+    """Scores with those found in place of older ones, as they then stand in the output.
+
+    Where there is one it counts as it is by now: other processes may have added to it.
+    """
+    if output is None or not found:
+        return _replaced(scores, found)
+    with taking_turns(output):
+        scores = _replaced(_stored(output), found)
+        write_atomically(output, write_scores(scores))
+    return scores
+
+
+def _replaced(scores: list[RunScore], found: list[RunScore]) -> list[RunScore]:
+    place = {score[:4] for score in found}
+    return [score for score in scores if score[:4] not in place] + found
+
+
+def _missing(
     run: Run, names: Sequence[str], scores: list[RunScore], max_steps: int | None
 ) -> list[RunScore]:
-    """Scores with those of a run that there are none of yet, or that were of something else."""
+    """Scores of a run that there are none of yet, or that were of something else."""
     digests = {name: _digest(run.folder, name) for name in names}
     known = {name: scored(run, scores, name) for name in names}
     todo = [
@@ -182,15 +224,13 @@ def _with_missing(
         if score is None or digests[name] not in ("", score.digest)
     ]
     if not todo:
-        return scores
+        return []
     loaded = load(run.folder)
-    found = [
+    return [
         score
         for name in todo
         for score in _summed(evaluate(loaded, name, max_steps), name, digests[name])
     ]
-    place = {score[:4] for score in found}
-    return [score for score in scores if score[:4] not in place] + found
 
 
 def _digest(folder: Path, levels: str) -> str:

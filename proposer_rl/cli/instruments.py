@@ -80,8 +80,8 @@ def _evaluate_parser() -> argparse.ArgumentParser:
         "checkpoint",
         nargs="+",
         type=Path,
-        help="a run's folder, or one of its checkpoints; several, or a folder with runs in it, for "
-        "a table of methods",
+        help="a run's folder, or one of its checkpoints; several folders of runs, or one with runs "
+        "in it, for a table of methods, which takes no checkpoints",
     )
     parser.add_argument(
         "--levels",
@@ -91,7 +91,7 @@ def _evaluate_parser() -> argparse.ArgumentParser:
         help="a distribution of the run such as id or ood; where the task has files of levels also "
         "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
         "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
-        "on another one; several for a table of methods",
+        "on another one; several for a table of methods, of runs' folders",
     )
     parser.add_argument(
         "--max-steps",

@@ -73,7 +73,7 @@ def read_scores(file: Path) -> list[Score]:
             )
             for row in rows
         ]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (csv.Error, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableRun(f"{file}: holds no scores of runs as bin/eval writes them") from error
 
 

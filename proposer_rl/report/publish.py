@@ -15,7 +15,7 @@ from proposer_rl.report.records import anywhere
 from proposer_rl.runs.folder import PROPOSER, read_jsonl, storage, write_atomically
 
 BULK = ("checkpoints", "curriculum.jsonl")  # what no copy has
-UNCHANGED = ("metrics.csv", "training.csv", "summary.json")
+UNCHANGED = ("metrics.csv", "training.csv")
 
 
 def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str]]:
@@ -82,7 +82,9 @@ def _light(folder: Path) -> dict[str, bytes]:
     # A Proposer that has learnt on several Solvers is meant for others.
     names = (*UNCHANGED, PROPOSER) if config.get("lifetimes", 1) != 1 else UNCHANGED
     files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
-    files |= {"run.json": _json(run, reused), "config.json": _json(config, reused)}
+    summary = (folder / "summary.json").read_text(encoding="utf-8")  # repeats the run's command
+    texts = {"run.json": _json(run), "config.json": _json(config), "summary.json": summary}
+    files |= {name: _anywhere(text, reused).encode() for name, text in texts.items()}
     for name in ("cycles.jsonl", "levels.jsonl"):
         if (folder / name).exists():
             rows = map(_without_bulk, read_jsonl(folder / name))
@@ -96,15 +98,18 @@ def _without_bulk(row: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in row.items() if key not in dropped}
 
 
-def _json(value: Any, reused: str) -> bytes:
-    """A file's content; of a checkpoint that the run began with the last two parts of its path.
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=1) + "\n"
+
+
+def _anywhere(text: str, reused: str) -> str:
+    """JSON without this machine's folders; of a checkpoint begun with the path's last two parts.
 
     Seeds of Proposers are called by the folders above their last lifetimes.
     """
-    text = json.dumps(value, indent=1)
     if os.path.isabs(reused):
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
-    return (anywhere(text) + "\n").encode()
+    return anywhere(text)
 
 
 def _replace(folder: Path, files: Mapping[str, bytes]) -> None:

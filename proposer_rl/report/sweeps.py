@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 
 from proposer_rl.report.progress import recorded_activity
 from proposer_rl.report.reading import FAILURE, begun
 from proposer_rl.report.records import number, small_json
+from proposer_rl.runs.folder import read_bounded
 from proposer_rl.runs.status import FILE, duration
 
 PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder
 SUMMARY = "summary.json"
 GOING = 600.0  # seconds since a run that goes on has said so
 SEEDS = ("seed=", "seeds=")  # two runs that differ in nothing else take as long
+# What does not say what a run is; `precision=auto` goes on in whichever a run was begun in.
+ASIDE = ("+sweep=", "compute.", "logger", "hydra.", "precision=")
+LARGEST_PLAN = 2**20  # bytes
 
 
 class Left(NamedTuple):
@@ -51,51 +58,101 @@ class Left(NamedTuple):
 def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
     """What is left of the sweep in a folder; None where nothing is known of a plan.
 
+    A run is finished where one has ended that was given the plan's settings for it and no others,
+    by this sweep or by a command of its own: an ablation is not the run without it. What does not
+    say what a run is (``ASIDE``) counts only where it is swept, and what the plan computes, as
+    ``${scale}``, not at all.
+
     A run takes as long as the mean of the finished ones that differ from it in the seed alone, or
     else of all; one that goes on what it says itself.
 
     Args:
-        folder: of the sweep.
+        folder: of the sweep, with its plan.
         planned: of each run the settings in which it differs from others.
 
     Raises:
         UnreadableRun: if there is no such folder.
     """
-    if not planned:
+    plan = _plan(folder) if planned else None
+    if plan is None:
         return None
-    finished: list[tuple[set[str], float]] = []
-    going: list[tuple[set[str], float]] = []
+    asked, aside = _asked(planned, plan)
+    finished: set[frozenset[str]] = set()
+    spent: defaultdict[frozenset[str], list[float]] = defaultdict(list)
+    going: list[tuple[frozenset[str], float]] = []
     for path, files in begun(folder):
         if SUMMARY in files:
             said = _told(path / SUMMARY)
-            finished.append((_settings(said), number(said.get("seconds"))))
+            settings = _settings(said.get("overrides"), aside)
+            finished.add(settings)
+            if math.isfinite(took := number(said.get("seconds"))):
+                spent[_but_for_the_seed(settings)].append(took)
         elif FAILURE in files:
             continue
         elif FILE in files and time.time() - (path / FILE).stat().st_mtime < GOING:
             activity = recorded_activity(path)
             seconds = activity.seconds_left if activity else None
             rest = math.nan if seconds is None else seconds
-            going.append((_settings(_told(path / "run.json")), rest))
-    spent = [(settings, seconds) for settings, seconds in finished if math.isfinite(seconds)]
+            going.append((_settings(_told(path / "run.json").get("overrides"), aside), rest))
+    every = [took for alike in spent.values() for took in alike]
     runs, unlike, total = 0, 0, 0.0
-    for own in map(set, planned):
-        if any(own <= settings for settings, _ in finished):
+    for own in asked:
+        if own in finished:
             continue
         runs += 1
-        told = [rest for settings, rest in going if own <= settings and math.isfinite(rest)]
-        kind = {word for word in own if not word.startswith(SEEDS)}
-        like = [seconds for settings, seconds in spent if kind <= settings]
+        told = [rest for settings, rest in going if own == settings and math.isfinite(rest)]
+        like = spent.get(_but_for_the_seed(own), [])
         unlike += not told and not like
-        known = told[:1] or like or [seconds for _, seconds in spent]
+        known = told[:1] or like or every
         total += float(np.mean(known)) if known else math.nan
     at_once = max(len(going), 1)
     seconds = None if math.isnan(total) else total / at_once
     return Left(runs, len(planned), seconds, at_once, unlike)
 
 
-def _settings(said: dict[str, object]) -> set[str]:
-    found = said.get("overrides")
-    return {word for word in found if isinstance(word, str)} if isinstance(found, list) else set()
+def _asked(
+    planned: Sequence[Collection[str]], plan: Mapping[str, str]
+) -> tuple[list[frozenset[str]], tuple[str, ...]]:
+    """What counts of the settings of each planned run, and how those begin that do not count."""
+    swept = {word.partition("=")[0] for word in planned[0]}
+    shared = {key: value for key, value in plan.items() if key not in swept}
+    aside = [start for start in ASIDE if not any(f"{key}=".startswith(start) for key in swept)]
+    # Hydra's `range(3,4)` and `${scale}`: what becomes of them is not in the plan.
+    aside += [f"{key}=" for key, value in shared.items() if "(" in value or "$" in value]
+    words = [f"{key}={value}" for key, value in shared.items()]
+    return [_settings([*own, *words], tuple(aside)) for own in planned], tuple(aside)
+
+
+def _plan(folder: Path) -> dict[str, str] | None:
+    """What the runs of a sweep are given, by key and as it was written: what is swept, too.
+
+    Returns:
+        None where the plan cannot be understood, such as while it is written.
+    """
+    try:
+        hydra = yaml.safe_load(read_bounded(folder / PLAN, LARGEST_PLAN))["hydra"]
+        given = (str(word).partition("=") for word in hydra["overrides"]["task"])
+        # What stands on the command line replaces what the sweep's file says.
+        found = {**(hydra["sweeper"]["params"] or {}), **{key: value for key, _, value in given}}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
+        return None
+    return {str(key): str(value) for key, value in found.items()}
+
+
+def _settings(words: object, aside: tuple[str, ...]) -> frozenset[str]:
+    """What of a command's words counts, spelt alike: Hydra makes 0.001 of 1e-3, True of true."""
+    found = set()
+    for word in words if isinstance(words, list) else ():
+        if isinstance(word, str) and not word.startswith(aside):
+            key, _, value = "".join(word.split()).partition("=")
+            with suppress(ValueError):
+                value = str(float(value))
+            found.add(f"{key}={value.lower()}")
+    return frozenset(found)
+
+
+def _but_for_the_seed(settings: Iterable[str]) -> frozenset[str]:
+    return frozenset(word for word in settings if not word.startswith(SEEDS))
 
 
 def _told(path: Path) -> dict[str, object]:

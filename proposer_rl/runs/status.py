@@ -6,7 +6,7 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,9 +77,14 @@ class Status:
     def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
         """While a run goes on: tell of it in its folder, and call ``show`` as often."""
         self._folder, self._show = folder, show
-        yield
-        (folder / FILE).unlink(missing_ok=True)  # a run that is over does nothing
-        self._folder = None
+        try:
+            yield
+        finally:
+            self._folder = None
+            # A run that is over does nothing, however it ended; and why it did is to be told, not
+            # that a file of no worth stays.
+            with suppress(OSError):
+                (folder / FILE).unlink()
 
     def plan(self, left: Mapping[str, int]) -> None:
         """Say how many units of each phase are left."""

@@ -126,12 +126,11 @@ def write_run(
         "device": "cpu",
         "overrides": [f"+method={method}", f"seed={seeds[0]}", "hydra.run.dir=x"],
         "arguments": {"config_dir": None, "pythonpath": None},
-        "task": task,
         **(facts or {}),
     }
-    run.write_json("run.json", {**identity, "planned_updates": updates})
+    run.write_json("run.json", {**identity, "planned_updates": updates, "task": task})
     if finished:
-        run.write_json("summary.json", {"updates": updates})
+        run.write_json("summary.json", {**identity, "updates": updates})
     return folder
 
 

@@ -25,6 +25,7 @@ def runs(tmp_path: Path) -> Path:
     cycles = [{**cycle(i, [0.1, 0.2], [[8 - i, 1, 1], [1, 1, 1 + i]]), **told} for i in range(2)]
     curves = {"perf_gain": [0.0, 0.8, 0.9], "target": [0.0, 0.3, 0.6]}
     arguments = {"config_dir": f"{SECRET}/conf", "pythonpath": SECRET}
+    reused = f"{SECRET}/runs/5/checkpoints"
     for method, curve in curves.items():
         for seed in range(5):
             write_run(
@@ -34,8 +35,8 @@ def runs(tmp_path: Path) -> Path:
                 [value - 0.01 * seed for value in curve],
                 cycles=cycles if method == "perf_gain" else (),
                 levels=[0.1 * seed, *curve[1:]],
-                facts={"arguments": arguments},
-                checkpoint=f"{SECRET}/runs/5/checkpoints",
+                facts={"arguments": arguments, "overrides": [f"checkpoint={reused}"]},
+                checkpoint=reused,
             )
     return tmp_path / "runs"
 
@@ -72,6 +73,10 @@ def test_a_copy_has_no_pictures_and_names_no_folder_of_the_machine(
     assert not any("curriculum.jsonl" in name or "checkpoint" in name for name in found)
     config = json.loads(found["target_0/config.json"])
     assert config["checkpoint"] == "5/checkpoints"
+    for name in ("run.json", "summary.json"):
+        facts = json.loads(found[f"target_0/{name}"])
+        assert facts["overrides"] == ["checkpoint=5/checkpoints"]
+        assert facts["arguments"] == {"config_dir": "conf", "pythonpath": "code"}
 
 
 def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:

@@ -79,15 +79,27 @@ def test_nothing_is_said_of_a_rest_whose_largest_part_is_unknown(tmp_path: Path)
             assert status.activity() == Activity("improve", 0, 0, None, True)
 
 
-def test_a_run_that_breaks_leaves_what_it_was_doing(tmp_path: Path) -> None:
-    status = Status()
-    with (
-        pytest.raises(KeyboardInterrupt),
-        status.of_run(tmp_path, lambda: None),
-        status.phase("update"),
-    ):
-        raise KeyboardInterrupt
-    assert json.loads((tmp_path / FILE).read_text())["doing"] == "update"
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, ArithmeticError])
+def test_a_run_that_stops_or_breaks_does_nothing_any_more(
+    stop: type[BaseException], tmp_path: Path
+) -> None:
+    status = Status(clock=(clock := Clock()))
+    with pytest.raises(stop), status.of_run(tmp_path, lambda: None), status.phase("update"):
+        assert json.loads((tmp_path / FILE).read_text())["doing"] == "update"
+        raise stop
+    assert not list(tmp_path.iterdir())
+    clock.pass_(10)
+    status.tick("cleaning up", 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_why_a_run_broke_is_told_though_its_folder_cannot_be_changed(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with pytest.raises(ArithmeticError), Status().of_run(folder, lambda: None):
+        folder.rename(tmp_path / "moved")
+        folder.touch()  # what is in a file cannot be removed
+        raise ArithmeticError
 
 
 @pytest.mark.parametrize(
