@@ -114,6 +114,33 @@ def test_the_columns_by_seed_have_the_numbers_of_the_measurements() -> None:
         )
 
 
+def test_the_table_of_differences_has_those_of_the_comparisons() -> None:
+    folder = ROOT / "results" / "medium" / "tables"
+    known = pd.read_csv(folder / "comparisons.csv")
+    known = known[known["outcome"] == "ID success, mean over 400 updates"]
+    text = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8")
+    head, _, *found = text[text.index("| method | over `dom") :].partition("\n\n")[0].splitlines()
+    others = [cell.strip().removeprefix("over ").strip("`") for cell in head.split("|")[2:-1]]
+    assert len(found) == len(pd.read_csv(folder / "methods.csv"))
+    for line in found:
+        method, *cells = (cell.strip() for cell in line.strip("| ").split(" | "))
+        method = method.strip("`").replace("`, `", ", ")
+        for other, cell in zip(others, cells, strict=True):
+            if method == other:
+                assert cell == "–"
+                continue
+            (row,) = known[
+                (known["first"].isin([method, other])) & (known["second"].isin([method, other]))
+            ].to_dict("records")
+            given, *verdict = cell.partition(", undecided")[:2]
+            low, high = row["difference, low"], row["difference, high"]
+            sign = 1 if row["first"] == method else -1
+            ends = sorted([sign * low, sign * high])
+            expected = f"{sign * row['difference']:+.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
+            assert given == expected.replace("-", "−"), (method, other)
+            assert bool(verdict[0]) == (row["verdict"] == "undecided"), (method, other)
+
+
 @pytest.mark.parametrize("runs", sorted((ROOT / "results").glob("*/runs")), ids=str)
 def test_the_tables_come_out_of_the_published_runs(runs: Path) -> None:
     """To the last digit but one: processors may round a sum differently."""

@@ -34,7 +34,8 @@ SITUATIONS: Mapping[str, Collection[str]] = {
     "no target, episodes alone": (),
 }
 STEADY = 1.5  # how many times one run of a method may cost what another does
-UNITS = dict(zip(COSTS, ("million frames, the curriculum's too", "seconds"), strict=True))
+FRAMES, SECONDS = COSTS
+UNITS = {FRAMES: "million frames, the curriculum's too", SECONDS: "seconds"}
 
 
 class Choice(NamedTuple):
@@ -119,7 +120,7 @@ def choose(
     study: Study,
     usable: Sequence[Group],
     outcome: Outcome,
-    found: Mapping[tuple[str, str], Decision],
+    found: Sequence[Mapping[tuple[str, str], Decision]],
     unsteady: float = 1.0,
 ) -> Choice | None:
     """The best of some methods by an outcome; None where none has a value.
@@ -130,7 +131,8 @@ def choose(
         study: the runs.
         usable: the methods.
         outcome: of which more is better.
-        found: what was decided by it of every pair.
+        found: what was decided by it of every pair, once or by several timings: two are told apart
+            where all do.
         unsteady: the :func:`spread` of what is scarce.
     """
     means = {group.label: outcome.values(group) for group in usable}
@@ -141,8 +143,11 @@ def choose(
     if not ranked:
         return None
     best, *others = [group for group in ranked if len(means[group.label]) >= FEWEST] or ranked
-    pairs = [between(found, best, other) for other in others]
-    level = [other.label for other, decision in pairs if decision.winner != best.label]
+    level = [
+        other.label
+        for other in others
+        if any(between(each, best, other)[1].winner != best.label for each in found)
+    ]
     doubt = ""
     if len(means[best.label]) < FEWEST:
         doubt = f"it takes {FEWEST} seeds of each to decide"
@@ -153,13 +158,23 @@ def choose(
     return Choice(best, write(mean_interval(means[best.label])), level, len(others), doubt)
 
 
-def choices(study: Study, needs: Needs) -> dict[str, dict[str, Choice | None]]:
+def choices(
+    study: Study, needs: Needs, rounds: Sequence[Study] = ()
+) -> dict[str, dict[str, Choice | None]]:
     """The best method, by what there is and then by what is scarce.
 
     Methods that need something else besides are left out.
+
+    Args:
+        study: the runs.
+        needs: of methods whose runs recorded none.
+        rounds: the runs by the seconds of single rounds of timing, of whose error the tests over
+            seeds know nothing.
     """
     ranked = budgets(study)
-    found = {scarce: decisions(study, outcome) for scarce, outcome in ranked.items()}
+    found = {scarce: [decisions(study, outcome)] for scarce, outcome in ranked.items()}
+    for each in rounds:
+        found[SECONDS].append(decisions(each, budgets(each)[SECONDS]))
     return {
         there: {
             scarce: choose(

@@ -170,7 +170,11 @@ def _learn_at_once(study: Study) -> Evidence | None:
         return "too few seeds", text
     soon = [majority(soon, count) for soon, count, _ in found]
     late = holm([majority(count - soon, count) for soon, count, _ in found])
-    return _either(max(soon), min(late)), text
+    verdict = _either(max(soon), min(late))
+    if verdict == "contradicted" and not any(_started(study, one)[0] for one in study.compared):
+        # Too soon for a Solver of this size, whatever it is given: that tells of no method.
+        return "undecided", f"{text}; nor does any run of any method here"
+    return verdict, text
 
 
 def _started(study: Study, group: Group) -> tuple[int, int, str]:
@@ -183,6 +187,10 @@ def _started(study: Study, group: Group) -> tuple[int, int, str]:
         f"{group.label} gets to {STARTED:.0%} within {limit:.0f} updates in {soon} of {len(known)} "
         "runs (tested against a half)"
     )
+    reached = sorted(run.updates for run in known if run.reached)
+    if reached:
+        span = dict.fromkeys(f"{updates:.0f}" for updates in (reached[0], reached[-1]))
+        text += f", in {len(reached)} after {' to '.join(span)}"
     return soon, len(known), text
 
 

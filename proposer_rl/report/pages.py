@@ -84,11 +84,11 @@ def write_pages(
     given = {"--scores": [scores] if scores else [], "--seconds": seconds, "--pages": [output]}
     more = [text for name, paths in given.items() if paths for text in (name, *map(str, paths))]
     command = page.report_command(folders, threshold, baseline, *more)
-    ranked = timed(study, read_timing(seconds)) if seconds else study
+    ranked, *rounds = timed(study, read_timing(seconds)) if seconds else [study]
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
     pages = {
-        CHOICE: _choice(ranked, needs, files),
+        CHOICE: _choice(ranked, rounds, needs, files),
         CLAIMS: _claims(ranked, needs, others, files),
     }
     for name, parts in pages.items():
@@ -98,9 +98,11 @@ def write_pages(
     return [output / name for name in pages]
 
 
-def _choice(study: Study, needs: Needs, files: dict[str, bytes]) -> list[str]:
+def _choice(
+    study: Study, rounds: Sequence[Study], needs: Needs, files: dict[str, bytes]
+) -> list[str]:
     """The page for who wants to use a curriculum."""
-    found = choices(study, needs)
+    found = choices(study, needs, rounds)
     named = {c.best.label for row in found.values() for c in row.values() if c and not c.doubt}
     named |= {study.baseline.label}
     shown = replace(study, groups=tuple(g for g in study.groups if g.label in named))
@@ -154,7 +156,8 @@ def _budgets(study: Study) -> str:
     if study.timed:
         seconds = (
             "Seconds are updates times what an update of the method takes, all methods timed in "
-            f"turns on one machine ({study.timed}); measuring the Solver takes more."
+            f"turns on one machine ({study.timed}): medians of the rounds, by which methods are "
+            "told apart only where each round alone says the same; measuring the Solver takes more."
         )
     names = "; ".join(outcome.name for outcome in budgets(study).values())
     return (

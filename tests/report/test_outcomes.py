@@ -188,6 +188,20 @@ def test_findings_that_fail_are_contradicted(tmp_path: Path) -> None:
     assert found[SLIGHTLY] == "contradicted"
 
 
+def test_what_no_method_does_soon_is_not_held_against_one(tmp_path: Path) -> None:
+    """Where a Solver learns from nothing at first, that it does not says nothing of a Proposer."""
+    late, latest = [0.0, 0.0, 0.2, 0.5, 0.7, 0.9], [0.0, 0.0, 0.0, 0.0, 0.2, 0.9]
+    curves = {"perf_gain": late, "task_difficulty": late, "target": latest}
+    study = study_of(tmp_path / "nobody", **curves)
+    assert verdicts(study)[STALL] == "supported" and verdicts(study)[SOON] == "undecided"
+    (told,) = (finding.evidence for finding in findings(study) if finding.claim == SOON)
+    assert "perf_gain gets to 10% within 10 updates in 0 of 6 runs" in told
+    assert "in 6 after 20;" in told and told.endswith("nor does any run of any method here")
+    curves["hand_made"] = FAST
+    found = verdicts(study_of(tmp_path / "somebody", **curves))
+    assert found[STALL] == "supported" and found[SOON] == "contradicted"
+
+
 def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Path) -> None:
     names = ("task_difficulty", "perf_gain", "target")  # the second is the best by a little
     for folder, factor, expected in (("a", 1.0, "supported"), ("b", 0.05, "undecided")):
