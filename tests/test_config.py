@@ -262,7 +262,8 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=perf_gain", "checkpoint=lives/0"],
-        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does",
+        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does, "
+        "and a run goes on with hydra.run.dir=FOLDER",
     ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum: method=perf_gain has no setting 'x'"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum: reward must be a function of a"),

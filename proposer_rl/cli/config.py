@@ -106,7 +106,7 @@ def read_config(config: DictConfig) -> RunConfig:
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
             f"checkpoint={checked.checkpoint}: method={checked.method} takes none; "
-            "frozen_proposer does"
+            "frozen_proposer does, and a run goes on with hydra.run.dir=FOLDER"
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
