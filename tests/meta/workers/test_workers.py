@@ -18,7 +18,7 @@ from proposer_rl.meta.workers import copies as copies_module
 from proposer_rl.streams import Streams
 from tests.meta.workers.curricula import COPIES, cycles, make, within, workers
 
-SECONDS = 300  # against waiting for ever; Ray takes over 120 on a core that others share
+SECONDS = 120
 LENGTH = 3  # updates of an episode at smoke scale
 
 
