@@ -5,18 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
-from importlib import invalidate_caches
-from importlib.machinery import PathFinder
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1, SIGUSR2
 
 import pytest
-import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 
-from proposer_rl.cli.start import hide_what_is_not_there
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.lock import locked
 from tests.processes import Ended, Processes
@@ -196,22 +189,3 @@ def test_numbers_that_go_wrong_end_the_run_and_the_last_good_checkpoint_stays(
         diverged.output,
     ), diverged.output
     assert checkpoints(tmp_path) == before
-
-
-def test_a_package_that_is_being_installed_beside_a_run_does_not_end_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """tensordict looks for pandas at every output of a module, and imports what it finds."""
-    layer = TensorDictModule(torch.nn.Linear(2, 1), ["a"], ["b"])
-    for name in [name for name in sys.modules if name.partition(".")[0] == "pandas"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(sys, "path", [str(tmp_path)])
-    monkeypatch.setattr(sys, "meta_path", [PathFinder])
-    hide_what_is_not_there()
-    (tmp_path / "pandas").mkdir()
-    (tmp_path / "pandas" / "__init__.py").write_text("raise ImportError('not built')\n")
-    invalidate_caches()
-    assert layer(TensorDict({"a": torch.zeros(3, 2)}, [3]))["b"].shape == (3, 1)
-    monkeypatch.delitem(sys.modules, "pandas")
-    with pytest.raises(ImportError, match="not built"):  # what a run that does not hide it meets
-        layer(TensorDict({"a": torch.zeros(3, 2)}, [3]))
