@@ -23,9 +23,9 @@ from tensordict import TensorDict
 
 from proposer_rl import PPO, Curriculum, Proposal, SamplingCurriculum, Streams
 from proposer_rl.learning import Update, first_episode_success
-from proposer_rl.mazes import Level
 from proposer_rl.methods import Parts
 from proposer_rl.task import Distribution
+from proposer_rl.tasks.mazes import Level
 
 
 class Again(Curriculum):

@@ -20,8 +20,8 @@ from small_mazes import report, small_task, train
 from torch import Tensor, nn
 
 from proposer_rl import ExactEvaluator, SamplingCurriculum, Streams, generate_levels
-from proposer_rl.mazes import planes
 from proposer_rl.models import cell_logits, orthogonal_
+from proposer_rl.tasks.mazes import planes
 
 
 class Iterated(nn.Module):

@@ -19,16 +19,16 @@ from proposer_rl import (
     SolverSettings,
     Streams,
 )
-from proposer_rl.mazes.settings import (
+from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.settings import LearningSettings, ProposerSettings
+from proposer_rl.tasks.mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
     NetworkSettings,
     SpaceSettings,
 )
-from proposer_rl.mazes.task import MazeTask
-from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.settings import LearningSettings, ProposerSettings
+from proposer_rl.tasks.mazes.task import MazeTask
 
 CYCLE = 10  # updates between two improvements of a curriculum
 

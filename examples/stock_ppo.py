@@ -20,7 +20,7 @@ from torchrl.modules import MLP, ConvNet, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from proposer_rl.mazes import Level, MazeEnv, generate_levels
+from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
 
 MAZES, STEPS, EPOCHS, MINIBATCH = 64, 20, 4, 320
 

@@ -10,8 +10,6 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
-from proposer_rl.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
-from proposer_rl.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success_gain, performance_gain, task_difficulty
@@ -28,6 +26,8 @@ from proposer_rl.models import (
 from proposer_rl.settings import PPOSettings, Schedule, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Place, Task
+from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 
 __all__ = [
     "PPO",

@@ -54,7 +54,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
 Made = TypeVar("Made", bound=Curriculum)
-Choose = Mapping[str, Any] | None
+Filter = Mapping[str, Any] | None
 
 
 class Workers(NamedTuple):
@@ -91,18 +91,18 @@ class Parts(NamedTuple):
     workers: Workers | None = None
 
 
-def target(parts: Parts, choose: Choose = None) -> Curriculum:
+def target(parts: Parts, filter: Filter = None) -> Curriculum:
     """Train on the target distribution itself (the paper's baseline)."""
-    return SamplingCurriculum(parts.task.target, _choice(parts.task, choose))
+    return SamplingCurriculum(parts.task.target, _choice(parts.task, filter))
 
 
-def domain_randomization(parts: Parts, choose: Choose = None) -> Curriculum:
+def domain_randomization(parts: Parts, filter: Filter = None) -> Curriculum:
     """Train on levels drawn evenly from the Proposer's space."""
-    return SamplingCurriculum(parts.task.space, _choice(parts.task, choose))
+    return SamplingCurriculum(parts.task.space, _choice(parts.task, filter))
 
 
 def schedule(
-    parts: Parts, distributions: Sequence[str], until: Sequence[int], choose: Choose = None
+    parts: Parts, distributions: Sequence[str], until: Sequence[int], filter: Filter = None
 ) -> Curriculum:
     """Train on named distributions one after another: a curriculum by hand.
 
@@ -110,7 +110,7 @@ def schedule(
         parts: the task.
         distributions: names, in order.
         until: updates after which each but the last ends.
-        choose: see :func:`_choice`.
+        filter: see :func:`_choice`.
 
     Raises:
         ValueError: for an unknown name, or as :class:`ScheduleCurriculum`.
@@ -122,7 +122,7 @@ def schedule(
         )
     if not isinstance(until, Sequence) or any(type(end) is not int for end in until):
         raise ValueError(f"until must be a list of whole numbers, got {until!r}")
-    choice = _choice(parts.task, choose)
+    choice = _choice(parts.task, filter)
     return ScheduleCurriculum(
         [SamplingCurriculum(known[name], choice) for name in distributions], until
     )
@@ -181,7 +181,7 @@ def task_difficulty(parts: Parts) -> ProposerCurriculum:
 
 
 def frozen_proposer(
-    parts: Parts, checkpoint: str | None, choose: Choose = None
+    parts: Parts, checkpoint: str | None, filter: Filter = None
 ) -> ProposerCurriculum:
     """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
 
@@ -189,7 +189,7 @@ def frozen_proposer(
         parts: the task, and the settings of the Proposer's network and actions, which must be those
             of that run.
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
-        choose: see :func:`_choice`.
+        filter: see :func:`_choice`.
 
     Raises:
         ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
@@ -220,7 +220,7 @@ def frozen_proposer(
         meta_episode_length=chosen.meta_episode_length,
         action_repeat=chosen.action_repeat,
         own_action=chosen.own_action,
-        choice=_choice(task, choose),
+        choice=_choice(task, filter),
     )
 
 
@@ -239,9 +239,9 @@ def _of_bins(
         require: refuses a task that it cannot do with, whatever is chosen from it.
     """
 
-    def factory(parts: Parts, choose: Choose = None, **numbers: Any) -> Made:
+    def factory(parts: Parts, filter: Filter = None, **numbers: Any) -> Made:
         require(parts.task)
-        return make(parts.task, choice=_choice(parts.task, choose), **numbers)
+        return make(parts.task, choice=_choice(parts.task, filter), **numbers)
 
     return factory
 
@@ -252,26 +252,26 @@ learning_progress = _of_bins(LearningProgressCurriculum)
 currot = _of_bins(TransportCurriculum)
 
 
-def _choice(task: Task, choose: Choose) -> Choice | None:
+def _choice(task: Task, filter: Filter) -> Choice | None:
     """Which of more levels are trained on.
 
-    ``choose`` has ``score``, ``source`` and ``rollouts`` of :class:`Scorer`, ``times`` and
+    ``filter`` has ``score``, ``source`` and ``rollouts`` of :class:`Scorer`, ``times`` and
     ``temperature`` of :class:`Choice`; None for all.
 
     Raises:
         ValueError: if it has not these, or a value is wrong.
     """
-    if choose is None:
+    if filter is None:
         return None
     scored, drawn = ("score", "source", "rollouts"), ("times", "temperature")
-    if not isinstance(choose, Mapping) or {*choose} != {*scored, *drawn}:
+    if not isinstance(filter, Mapping) or {*filter} != {*scored, *drawn}:
         keys = ", ".join((*drawn, *scored))
-        raise ValueError(f"choose must be null or have {keys}, and nothing else, got {choose!r}")
+        raise ValueError(f"filter must be null or have {keys}, and nothing else, got {filter!r}")
     try:
-        scorer = Scorer(task, *(choose[name] for name in scored))
-        return Choice(scorer, **{name: choose[name] for name in drawn})
+        scorer = Scorer(task, *(filter[name] for name in scored))
+        return Choice(scorer, **{name: filter[name] for name in drawn})
     except ValueError as error:
-        raise ValueError(f"choose.{error}") from error
+        raise ValueError(f"filter.{error}") from error
 
 
 def replay(
@@ -323,7 +323,7 @@ def first_order_proposer(
     step: float = 1.0,
     measure: str = "log_success",
     copies: int = 0,
-    choose: Choose = None,
+    filter: Filter = None,
     **numbers: Any,
 ) -> FirstOrderProposer:
     """Train on the draws of a policy that is paid for each problem, to first order.
@@ -336,7 +336,7 @@ def first_order_proposer(
         step: the same.
         measure: the same.
         copies: the same.
-        choose: see :func:`_choice`.
+        filter: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
     require_gradients(parts.task)
@@ -346,7 +346,7 @@ def first_order_proposer(
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        choice=_choice(parts.task, choose),
+        choice=_choice(parts.task, filter),
         target_levels=target_levels,
         step=step,
         measure=measure,
@@ -356,12 +356,12 @@ def first_order_proposer(
     )
 
 
-def paired(parts: Parts, choose: Choose = None, **numbers: Any) -> PairedProposer:
+def paired(parts: Parts, filter: Filter = None, **numbers: Any) -> PairedProposer:
     """Train on the draws of a policy that is paid the regret against a second Solver.
 
     Args:
         parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
-        choose: see :func:`_choice`.
+        filter: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
@@ -370,7 +370,7 @@ def paired(parts: Parts, choose: Choose = None, **numbers: Any) -> PairedPropose
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        choice=_choice(parts.task, choose),
+        choice=_choice(parts.task, filter),
         streams=Streams(parts.seeds[0], "antagonist"),
     )
 

@@ -169,7 +169,7 @@ class Schedule:
 
 
 @settings
-class HandMadeSettings:
+class HandDesignedSettings:
     """A curriculum by hand.
 
     Attributes:

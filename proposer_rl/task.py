@@ -4,7 +4,8 @@ A task is any object with these members; nothing is inherited. What it takes as 
 business: a tensordict or tensorclass of any content, whose batch shape alone is looked at. K are
 Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
 
-:class:`~proposer_rl.mazes.task.MazeTask` is one, ``examples/mountain_car.py`` another. Methods that
+:class:`~proposer_rl.tasks.mazes.task.MazeTask` is one, ``examples/mountain_car.py`` another.
+Methods that
 need more of a task than all of them have ask for it by name, with the optional parts below.
 """
 

@@ -124,7 +124,7 @@ def serve() -> None:
     from proposer_rl.cli import train
 
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
-    for module in ("proposer_rl.cli.run", "proposer_rl.mazes.task", "pandas"):
+    for module in ("proposer_rl.cli.run", "proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
 
     for line in sys.stdin:

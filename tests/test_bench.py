@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.__main__ import main
-from benchmarks.ceiling import convolutions
-from benchmarks.curricula import Training
-from benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
-from benchmarks.plain import PlainPPO, PlainUNet
-from benchmarks.plain_env import PlainMaze
-from benchmarks.profiling import kind_of
-from benchmarks.registry import BENCHMARKS, measure, selected
-from benchmarks.report import number, summary
-from benchmarks.results import Options, Result, Row, Spread
-from benchmarks.scales import PAPER, QUICK, TINY, Solvers
-from benchmarks.timing import interleave, ratio, threads
-from proposer_rl.mazes import MazeEnv, generate_levels
 from proposer_rl.report.timing import read_timing
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import MazeEnv, generate_levels
+from research.benchmarks.__main__ import main
+from research.benchmarks.ceiling import convolutions
+from research.benchmarks.curricula import Training
+from research.benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
+from research.benchmarks.plain import PlainPPO, PlainUNet
+from research.benchmarks.plain_env import PlainMaze
+from research.benchmarks.profiling import kind_of
+from research.benchmarks.registry import BENCHMARKS, measure, selected
+from research.benchmarks.report import number, summary
+from research.benchmarks.results import Options, Result, Row, Spread
+from research.benchmarks.scales import PAPER, QUICK, TINY, Solvers
+from research.benchmarks.timing import interleave, ratio, threads
 from tests.commands import call
 from tests.report.folders import write_run
 
@@ -56,7 +56,9 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
     bench, capsys, monkeypatch, tmp_path: Path
 ) -> None:
     # In the worker's own process nothing but the arguments can be changed from here.
-    monkeypatch.setattr("benchmarks.command.selected", lambda *_: ["absent", "shortest_paths"])
+    monkeypatch.setattr(
+        "research.benchmarks.command.selected", lambda *_: ["absent", "shortest_paths"]
+    )
     monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
     arguments = ["--tiny", "--repeats", "1", "--threads", "1", "--precision", "fp32"]
     assert bench(*arguments, "--output", "b.json") == 1

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.__main__ import main
-from benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
-from benchmarks.peer import jaxued_maze, played
-from benchmarks.timing import threads
-from benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
-from proposer_rl.mazes.view.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from research.benchmarks.__main__ import main
+from research.benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
+from research.benchmarks.peer import jaxued_maze, played
+from research.benchmarks.timing import threads
+from research.benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
 from tests.commands import call
-from tests.mazes.view.oracles import random_levels
+from tests.tasks.view_mazes.oracles import random_levels
 
 DRAWINGS = ["v#..\n.#G.", "..<#\nG...", "G#.^\n....", "...G\n.>#."]
 JAXUED = os.environ.get("JAXUED_PYTHON")

@@ -216,7 +216,7 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkey
     command = ["+method=target", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*command) == 0
     assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
-    monkeypatch.setattr("proposer_rl.mazes.task.faster_precision", lambda *_: "bf16")
+    monkeypatch.setattr("proposer_rl.tasks.mazes.task.faster_precision", lambda *_: "bf16")
     assert train(*command, "schedule.updates=4") == 0
     assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
     assert train(*command, "schedule.updates=4", "precision=bf16") == 2
@@ -237,7 +237,7 @@ def test_lives_go_on_in_the_precision_that_they_began_with(train, monkeypatch) -
     command = ["+method=perf_gain", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
     assert train(*command, "lifetimes=2") == 0
     shutil.rmtree("run/lifetime_1")  # as if the run had been stopped between the lives
-    monkeypatch.setattr("proposer_rl.mazes.task.faster_precision", lambda *_: "bf16")
+    monkeypatch.setattr("proposer_rl.tasks.mazes.task.faster_precision", lambda *_: "bf16")
     assert train(*command, "lifetimes=2") == 0
     assert json.loads(Path("run/lifetime_1/config.json").read_text())["precision"] == "fp32"
 

@@ -107,7 +107,10 @@ WRONG = [
         "task.evaluation.levels=0",
         "task.evaluation.levels=0: input should be greater than or equal to 1",
     ),
-    ("hand_made.until=[0]", "hand_made.until.0=0: input should be greater than or equal to 1"),
+    (
+        "hand_designed.until=[0]",
+        "hand_designed.until.0=0: input should be greater than or equal to 1",
+    ),
     (
         "task.distributions.id.specifications=[]",
         "specifications=[]: list should have at least 1 item",
@@ -246,18 +249,21 @@ WRONG_COMMANDS = [
     (["+sweep=none"], "sweep/none: unknown; choose one of: ablations, curricula, gymnasium"),
     (["curriculum.tempo=3"], "curriculum.tempo: there is no such key; there are: none"),
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
-    (["+method=hand_made", "hand_made.until=[3, 2]"], "2 stages need 1 ascending positive"),
-    (["+method=hand_made", "hand_made.distributions=[x]"], "some of ['id', 'mix', 'ood'], got"),
+    (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (
-        ["+method=hand_made", "curriculum.distributions=mix"],
+        ["+method=hand_designed", "hand_designed.distributions=[x]"],
+        "some of ['id', 'mix', 'ood'], got",
+    ),
+    (
+        ["+method=hand_designed", "curriculum.distributions=mix"],
         "curriculum: distributions must be a list of some of ['id', 'mix', 'ood'], got mix",
     ),
     (
-        ["+method=hand_made", "curriculum.until=[a]"],
+        ["+method=hand_designed", "curriculum.until=[a]"],
         "curriculum: until must be a list of whole numbers, got ['a']",
     ),
     (
-        ["+method=hand_made", "curriculum.until=3"],
+        ["+method=hand_designed", "curriculum.until=3"],
         "curriculum: until must be a list of whole numbers, got 3",
     ),
     (
@@ -282,28 +288,28 @@ WRONG_COMMANDS = [
         "curriculum: must make a Curriculum, but makes int",
     ),
     (
-        ["+choose=learnability", "+method=target"],
-        "+method: must come before +choose, or it would undo it",
+        ["+filter=learnability", "+method=target"],
+        "+method: must come before +filter, or it would undo it",
     ),
     (
-        ["+method=plr", *SMOKE, "+choose=learnability"],
-        "curriculum: method=plr has no setting 'choose'",
+        ["+method=plr", *SMOKE, "+filter=learnability"],
+        "curriculum: method=plr has no setting 'filter'",
     ),
     (
-        ["+method=target", *SMOKE, "curriculum.choose={times: 4}"],
-        "curriculum: choose must be null or have times, temperature, score, source, rollouts",
+        ["+method=target", *SMOKE, "curriculum.filter={times: 4}"],
+        "curriculum: filter must be null or have times, temperature, score, source, rollouts",
     ),
     (
-        ["+method=target", *SMOKE, "+choose=learnability", "curriculum.choose.times=1"],
-        "curriculum: choose.times must be a whole number from 2 to 1,000,000, got 1",
+        ["+method=target", *SMOKE, "+filter=learnability", "curriculum.filter.times=1"],
+        "curriculum: filter.times must be a whole number from 2 to 1,000,000, got 1",
     ),
     (
-        ["+method=target", *SMOKE, "+choose=learnability", "curriculum.choose.score=luck"],
-        "curriculum: choose.score='luck': from source=exact there are",
+        ["+method=target", *SMOKE, "+filter=learnability", "curriculum.filter.score=luck"],
+        "curriculum: filter.score='luck': from source=exact there are",
     ),
     (
-        ["task=cartpole", "+method=target", "+choose=learnability"],
-        "curriculum: choose.source=exact: GymnasiumTask tells performance by playing",
+        ["task=cartpole", "+method=target", "+filter=learnability"],
+        "curriculum: filter.source=exact: GymnasiumTask tells performance by playing",
     ),
     (["+score=sampled", "+method=sfl"], "+method: must come before +score, or it would undo it"),
     (
@@ -642,7 +648,7 @@ def test_a_run_that_runs_out_of_memory_says_so_in_one_line(
     def measure(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("proposer_rl.mazes.task.MazeTask.measure", measure)
+    monkeypatch.setattr("proposer_rl.tasks.mazes.task.MazeTask.measure", measure)
     assert train("+method=target", *SMOKE) == 2
     told = capsys.readouterr().err.splitlines()[-1]
     assert told == f"error: the run does not fit in memory: {said}"

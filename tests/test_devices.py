@@ -17,15 +17,15 @@ from proposer_rl.curricula import Curriculum, SamplingCurriculum
 from proposer_rl.learning import PPO, Update
 from proposer_rl.methods import Parts
 from proposer_rl.runs.folder import read_csv
-from tests.gymnasium_task.toys import TINY
 from tests.processes import ROOT
+from tests.tasks.gymnasium.toys import TINY
 from tests.test_kill import METHODS
 
 QUIET = ["+scale=smoke", "compute.progress=false"]
 CALLED = {
     **{method: [f"+method={method}", *QUIET] for method in METHODS if "frozen" not in method},
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
-    "with_a_choice": ["+method=hand_made", "+choose=learnability", *QUIET],
+    "with_a_choice": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", "compute.progress=false"],
     "gymnasium": ["+method=perf_gain", "task=cartpole", *TINY],

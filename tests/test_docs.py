@@ -29,7 +29,7 @@ def programs() -> dict[str, list[str]]:
     found = {}
     for file in (ROOT / "bin").iterdir():
         started = re.search(
-            r'-m ((?:proposer_rl|benchmarks).*) "', file.read_text(encoding="utf-8")
+            r'-m ((?:proposer_rl|research).*) "', file.read_text(encoding="utf-8")
         )
         if started:
             found[file.name] = started[1].split()

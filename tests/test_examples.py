@@ -16,10 +16,10 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.mazes import Level
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import Level
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"

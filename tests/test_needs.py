@@ -12,18 +12,18 @@ import pytest
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.mazes.task import MazeTask
 from proposer_rl.meta.rewards import performance_gain
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.report.decision import EXACT, GRADIENTS, TARGET
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import ProposerSettings
+from proposer_rl.tasks.mazes.task import MazeTask
 from tests.tiny import TASK, composed
 
 NEEDS = needs([CONFIG_FOLDER])
 REUSED = "frozen_proposer"  # of another run's checkpoint
-SMALL = ["+scale=smoke", "compute.progress=false", "schedule.updates=2", "hand_made.until=[1]"]
+SMALL = ["+scale=smoke", "compute.progress=false", "schedule.updates=2", "hand_designed.until=[1]"]
 
 
 class Watched:

@@ -138,7 +138,7 @@ def test_levels_and_the_gymnasium_environment_come_along(
 ) -> None:
     said = installed("proposer-eval", "--help", folder=tmp_path)
     assert "that comes along: shapes" in " ".join(said.split())
-    code = "import gymnasium; print(gymnasium.make('proposer_rl.mazes:proposer_rl/Maze-v0'))"
+    code = "import gymnasium; print(gymnasium.make('proposer_rl.tasks.mazes:proposer_rl/Maze-v0'))"
     process = python(code, path=installed.site, folder=tmp_path)
     assert process.returncode == 0, process.stderr
     assert "proposer_rl/Maze-v0" in process.stdout

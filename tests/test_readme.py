@@ -21,8 +21,8 @@ from proposer_rl.cli.watch import main as watch_main
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.generalisation import write_scores
 from tests.commands import call, trained_run
-from tests.gymnasium_task.toys import TINY
 from tests.report.folders import write_run, write_seconds
+from tests.tasks.gymnasium.toys import TINY
 
 DOCS = Path(__file__).parents[1] / "docs"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

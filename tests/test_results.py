@@ -25,7 +25,7 @@ GYMNASIUM = "docs/your_gymnasium_environment.md"
 TABLES = [
     ("docs/comparison.md", 240, "curricula", "ID success", 20),
     ("docs/first_order.md", 240, "curricula", "ID success", 8),
-    ("docs/choice.md", 240, "curricula", "ID success", 8),
+    ("docs/filtering.md", 240, "curricula", "ID success", 8),
     ("docs/replay.md", 240, "sampled", "ID success", 11),
     ("README.md", 400, "medium", "ID success", 5),
     ("docs/comparison.md", 400, "medium", "ID success", 5),
@@ -176,7 +176,7 @@ def test_the_published_proposer_can_be_used(
 
 
 # Pages whose numbers are all of runs whose tables are in the repository, prose and tables.
-PROSE = ["README.md", "docs/choice.md", "docs/comparison.md", "docs/replay.md", GYMNASIUM]
+PROSE = ["README.md", "docs/filtering.md", "docs/comparison.md", "docs/replay.md", GYMNASIUM]
 NUMBER = r"[−]?\d*\.\d+"
 INTERVAL = re.compile(rf"\+?(?P<shown>{NUMBER} \[{NUMBER}, {NUMBER}\])")
 P_VALUE = re.compile(r",? \(?(?:undecided, )?p = (0?\.\d+)")

@@ -12,7 +12,6 @@ import pytest
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import CONFIG_FOLDER
 from proposer_rl.curricula import ProposerCurriculum
-from proposer_rl.mazes.settings import MazeSettings
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import (
     ComputeSettings,
@@ -23,6 +22,7 @@ from proposer_rl.settings import (
     SolverSettings,
 )
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes.settings import MazeSettings
 from tests.tiny import composed
 
 ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))

@@ -42,7 +42,7 @@ def measured(folder: Path, seed: int) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("method", ["target", "hand_made"])
+@pytest.mark.parametrize("method", ["target", "hand_designed"])
 def test_seeds_side_by_side_give_what_they_give_alone(method: str, train) -> None:
     assert train(f"+method={method}", *SMOKE, "seeds=[2,0]", "hydra.run.dir=together") == 0
     for seed in (2, 0):
@@ -80,7 +80,7 @@ def states(folder: Path) -> dict[str, float]:
 def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
     train, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    sweep = ["-m", "+method=target,hand_made", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    sweep = ["-m", "+method=target,hand_designed", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
     updates = []
     original = Experiment._update
 
@@ -146,7 +146,7 @@ def test_a_run_counts_as_finished_if_it_was_given_the_same(
     own = ["+method=perf_gain", "+scale=medium", *more]
     others = {
         "+ablation=probes_0": [*own, "seed=0", "+ablation=probes_0"],
-        "+choose=learnability": [*own, "seed=0", "+choose=learnability"],
+        "+filter=learnability": [*own, "seed=0", "+filter=learnability"],
         "another number": [*own, "seed=0", "pool.capacity=7"],
         "another method": ["+method=sfl", *own[1:], "seed=0"],
         "another seed": [*own, "seed=7"],
@@ -197,7 +197,7 @@ def test_a_failed_run_is_listed_and_tried_again(
     assert "failed: 0_target_seed_0: the disk is on fire" in printed.out
     assert "2 runs: 1 finished, 1 failed" in printed.out
     assert "Traceback" in printed.err and "error: the disk is on fire" in printed.err
-    assert train("-m", "+method=hand_made", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 0
+    assert train("-m", "+method=hand_designed", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 0
     assert "4 runs: 3 finished, 1 failed" in capsys.readouterr().out  # not in the second sweep
     assert train(*sweep) == 0
     assert "4 runs: 4 finished" in capsys.readouterr().out

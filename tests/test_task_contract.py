@@ -15,7 +15,7 @@ from PIL import Image
 
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
-from tests.gymnasium_task.toys import walk_task
+from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import mountain_cars, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5

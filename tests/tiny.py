@@ -13,29 +13,29 @@ from tensordict import TensorDictBase
 
 from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig, read_config
 from proposer_rl.learning import PPO
-from proposer_rl.mazes import Level, planes
-from proposer_rl.mazes.evaluation import ExactEvaluator
-from proposer_rl.mazes.settings import (
+from proposer_rl.models import ActorCritic, cell_logits
+from proposer_rl.settings import PPOSettings, SolverSettings
+from proposer_rl.streams import Streams
+from proposer_rl.task import Place, Task
+from proposer_rl.tasks.mazes import Level, planes
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
+from proposer_rl.tasks.mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
     MazeSettings,
     NetworkSettings,
     SpaceSettings,
 )
-from proposer_rl.mazes.task import MazeTask
-from proposer_rl.mazes.view.settings import EvaluationSettings as ViewEvaluationSettings
-from proposer_rl.mazes.view.settings import (
+from proposer_rl.tasks.mazes.task import MazeTask
+from proposer_rl.tasks.view_mazes.settings import EvaluationSettings as ViewEvaluationSettings
+from proposer_rl.tasks.view_mazes.settings import (
     PerfectSettings,
     ScatteredSettings,
     ViewMazeSettings,
     ViewNetworkSettings,
 )
-from proposer_rl.mazes.view.settings import SpaceSettings as ViewSpaceSettings
-from proposer_rl.mazes.view.task import ViewMazeTask
-from proposer_rl.models import ActorCritic, cell_logits
-from proposer_rl.settings import PPOSettings, SolverSettings
-from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.tasks.view_mazes.settings import SpaceSettings as ViewSpaceSettings
+from proposer_rl.tasks.view_mazes.task import ViewMazeTask
 
 EXAMPLES = str(Path(__file__).parents[1] / "examples")
 EVALUATE = ExactEvaluator(max_steps=8)

@@ -22,7 +22,7 @@ from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ComputeSettings,
-    HandMadeSettings,
+    HandDesignedSettings,
     LoggerSettings,
     PoolSettings,
     ProposerSettings,
@@ -69,7 +69,7 @@ class RunConfig(BaseModel):
     seed: Annotated[int, Field(ge=0)]
     seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     precision: Literal["auto", "fp32", "bf16"]
-    hand_made: HandMadeSettings
+    hand_designed: HandDesignedSettings
     pool: PoolSettings
     solver: SolverSettings
     proposer: ProposerSettings

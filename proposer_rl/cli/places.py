@@ -18,7 +18,7 @@ GROUPS = {
     "+scale=": "how much is computed",
     "+as=": "the numbers of another library, for methods that keep levels",
     "+score=": "where the scores of levels come from",
-    "+choose=": "which of more levels are trained on",
+    "+filter=": "which of more levels are trained on",
     "+ablation=": "what is changed of a method",
     "+sweep=": "many runs",
 }

@@ -98,7 +98,7 @@ def exact_score(task: Task, name: str, episodes: int) -> Asks:
     if not task.exact_performance:
         raise ValueError(
             f"source=exact: {kind} tells performance by playing, which is not exact; give "
-            "source=episodes, as +score=sampled and +choose=learnability_sampled do"
+            "source=episodes, as +score=sampled and +filter=learnability_sampled do"
         )
     return partial(_regret if name == "regret" else _learnability, task)
 

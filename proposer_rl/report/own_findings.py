@@ -25,7 +25,7 @@ from proposer_rl.runs.columns import is_rate
 
 # The methods, by the labels of their groups.
 OURS, PROPOSER, LITERAL = "first_order_gain", "first_order_proposer", "perf_gain, paper_literal"
-EVEN, BY_HAND, NONE = "domain_randomization", "hand_made", "target"
+EVEN, BY_HAND, NONE = "domain_randomization", "hand_designed", "target"
 
 
 def own_findings(study: Study, needs: Needs) -> list[tuple[str, Evidence | None]]:

@@ -169,7 +169,7 @@ def _budgets(study: Study) -> str:
         f"good. Brackets: 95 % intervals, from {FEWEST} seeds on. *No target*: the method is not "
         "told it; what is measured is success on it all the same. *Exact evaluation*: the task can "
         "say how a Solver does on a level without playing it, with gradients. Some methods that "
-        "need it here run on episodes, too, with `+score=sampled`, `+choose=learnability_sampled` "
+        "need it here run on episodes, too, with `+score=sampled`, `+filter=learnability_sampled` "
         "or where a task is measured by playing; so they have not been compared here. "
         f"{seconds}"
     )

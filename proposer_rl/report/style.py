@@ -25,7 +25,7 @@ METHODS = {
     "task_difficulty": BLUE,
     "target": BLACK,
     "domain_randomization": GREEN,
-    "hand_made": ORANGE,
+    "hand_designed": ORANGE,
 }
 # For every other method or variant: Paul Tol's muted scheme without near doubles, with marks.
 FURTHER = ("#332288", "#882255", "#44AA99", "#AA4499", "#999933", "#88CCEE", "#CC6677")

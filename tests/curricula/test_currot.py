@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.transport import step_towards
-from proposer_rl.mazes import SpecificationSpace
-from proposer_rl.mazes.settings import DistributionSettings, SpaceSettings
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import SpecificationSpace
+from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task
 

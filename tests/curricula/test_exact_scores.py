@@ -11,12 +11,12 @@ from tensordict import TensorDictBase
 
 from proposer_rl.curricula.exact_scores import exact_score, expected_best, return_variance
 from proposer_rl.curricula.scores import Scored, Scorer, unseen
-from proposer_rl.mazes import Level
-from proposer_rl.mazes.evaluation import optimal_return
-from proposer_rl.mazes.occupancy import episode_law
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import EpisodeLaw, NoSuccessError
+from proposer_rl.tasks.mazes import Level
+from proposer_rl.tasks.mazes.evaluation import optimal_return
+from proposer_rl.tasks.mazes.occupancy import episode_law
 from tests.curricula.scripted import Scripted
 from tests.tiny import tiny_task
 

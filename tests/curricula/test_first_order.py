@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
 from proposer_rl.learning.ppo import PPO, Update
-from proposer_rl.mazes import Level, SpecificationSpace, shortest_path_length
-from proposer_rl.mazes.distributions import LevelDistribution
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import Level, SpecificationSpace, shortest_path_length
+from proposer_rl.tasks.mazes.distributions import LevelDistribution
 from tests.meta import test_first_order as exact
 
 BINS, P = 6, 16

@@ -24,9 +24,9 @@ from proposer_rl.curricula.buffer import (
 from proposer_rl.curricula.replay import _lineage
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
-from proposer_rl.mazes import planes
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import planes
 from tests.curricula.living import (
     check_a_new_life_begins,
     check_each_lives_alone,

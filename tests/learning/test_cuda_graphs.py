@@ -13,10 +13,10 @@ from torch.cuda._utils import _get_device_index
 
 from proposer_rl.learning.cuda_graphs import WARM_UPS, Captured, recorded, use
 from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes import Level, planes
-from proposer_rl.mazes.evaluation import ExactEvaluator
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import Level, planes
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from tests.graphs import HostRead, NoHostReads, Tapes
 from tests.learning.test_ppo import learner, levels, train
 from tests.tiny import tiny_view_task

@@ -18,13 +18,13 @@ from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import PPO
 from proposer_rl.learning.rollout import set_values
-from proposer_rl.mazes.view.env import ViewMazeEnv
-from proposer_rl.mazes.view.network import OBSERVED, view_network
-from proposer_rl.mazes.view.settings import ViewNetworkSettings
 from proposer_rl.meta.first_order import surrogate
 from proposer_rl.models import Population, memory_actor_critic
 from proposer_rl.settings import PPOSettings
-from tests.mazes.view.oracles import random_levels
+from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
+from proposer_rl.tasks.view_mazes.settings import ViewNetworkSettings
+from tests.tasks.view_mazes.oracles import random_levels
 
 K, P, T, M = 2, 3, 14, 8
 SETTINGS = PPOSettings(horizon=T, epochs=3, learning_rate=1e-2)

@@ -14,8 +14,6 @@ from torch.nn.functional import unfold
 
 from proposer_rl.learning.divergence import DivergedError
 from proposer_rl.learning.ppo import PPO, PPOSettings
-from proposer_rl.mazes import Level, MazeEnv, generate_levels, planes
-from proposer_rl.mazes.evaluation import ExactEvaluator
 from proposer_rl.meta.first_order import (
     alignment,
     bin_scores,
@@ -28,6 +26,8 @@ from proposer_rl.meta.first_order import (
 )
 from proposer_rl.models import ActorCritic, Population, UNet, categorical
 from proposer_rl.models.maps import cell_logits, read_maps
+from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, planes
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 
 EVALUATE = ExactEvaluator(max_steps=8)
 RATE = 1e-3

@@ -10,11 +10,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning.ppo import PPO
-from proposer_rl.mazes import Level
 from proposer_rl.meta import gradient_norms
 from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import Level
 from tests.meta.test_first_order import central_differences, learner, performance, some_levels
 from tests.tiny import TASK
 

@@ -23,12 +23,12 @@ from playwright.sync_api import Page as Tab
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
-from proposer_rl.mazes.evaluation import ExactEvaluator
-from proposer_rl.mazes.level_files import read_levels, shipped_levels
-from proposer_rl.mazes.levels import Level, planes
 from proposer_rl.models import cell_logits
-from tests.mazes.oracles import path_length
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
+from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
+from proposer_rl.tasks.mazes.levels import Level, planes
 from tests.play.pages import Page, served
+from tests.tasks.mazes.oracles import path_length
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 OPTIONS = [

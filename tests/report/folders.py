@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.results import Result, Row, Spread
 from proposer_rl.runs.folder import RunFolder
+from research.benchmarks.results import Result, Row, Spread
 
 EVERY = 10  # updates between two evaluations
 

@@ -55,10 +55,10 @@ def study_of(folder: Path, seeds: int = SEEDS, **curves: list[float]) -> Study:
 
 
 def test_a_better_method_is_found_by_the_primary_outcome_alone(tmp_path: Path) -> None:
-    first, *others = comparison_table(study_of(tmp_path, target=SLOW, hand_made=FAST)).rows
-    assert (first["first"], first["second"]) == ("hand_made", "target")
+    first, *others = comparison_table(study_of(tmp_path, target=SLOW, hand_designed=FAST)).rows
+    assert (first["first"], first["second"]) == ("hand_designed", "target")
     assert first["outcome"] == "ID success, mean over 50 updates"
-    assert first["verdict"] == "hand_made is better"
+    assert first["verdict"] == "hand_designed is better"
     assert first["seeds needed"] is None and first["P(first better)"].estimate == 1
     areas = [(np.sum(base) - (base[0] + base[-1]) / 2) / 5 for base in (FAST, SLOW)]
     scale = np.mean([1 - 0.01 * seed for seed in range(SEEDS)])
@@ -77,14 +77,17 @@ def curve_last(base: list[float]) -> list[float]:
 
 def test_equal_methods_are_undecided_and_more_seeds_are_asked_for(tmp_path: Path) -> None:
     for seed in range(SEEDS):
-        write_run(tmp_path / f"a{seed}", "hand_made", [seed], curve_of(SLOW, SEEDS - seed))
+        write_run(tmp_path / f"a{seed}", "hand_designed", [seed], curve_of(SLOW, SEEDS - seed))
     first, *_ = comparison_table(study_of(tmp_path, target=SLOW)).rows
     assert first["verdict"] == "undecided" and first["p (Holm)"] > 0.05
     assert first["seeds needed"] > SEEDS
 
 
 def test_methods_that_learnt_nothing_do_not_beat_each_other(tmp_path: Path) -> None:
-    low = {"target": [value / 20 for value in SLOW], "hand_made": [value / 20 for value in FAST]}
+    low = {
+        "target": [value / 20 for value in SLOW],
+        "hand_designed": [value / 20 for value in FAST],
+    }
     first, *_ = comparison_table(study_of(tmp_path, **low)).rows
     assert first["p (Holm)"] < 0.05 and first["verdict"] == "nothing learnt"
 
@@ -113,10 +116,10 @@ def test_runs_with_the_same_seeds_are_compared_in_pairs(tmp_path: Path) -> None:
 
 
 def test_a_short_run_does_not_count_whether_it_got_there_or_not(tmp_path: Path) -> None:
-    write_run(tmp_path / "short_fast", "hand_made", [98], [0.0, 0.9], finished=False)
-    write_run(tmp_path / "short_slow", "hand_made", [99], [0.0, 0.0], finished=False)
-    study = study_of(tmp_path, hand_made=FAST, target=SLOW)
-    (row,) = (row for row in group_table(study).rows if row["method"] == "hand_made")
+    write_run(tmp_path / "short_fast", "hand_designed", [98], [0.0, 0.9], finished=False)
+    write_run(tmp_path / "short_slow", "hand_designed", [99], [0.0, 0.0], finished=False)
+    study = study_of(tmp_path, hand_designed=FAST, target=SLOW)
+    (row,) = (row for row in group_table(study).rows if row["method"] == "hand_designed")
     assert row["seeds"] == f"{SEEDS} of {SEEDS + 2}"
     assert row["frames (M)"] == pytest.approx(100 * 50 / 1e6)  # of whole runs
     assert row["updates to 80% ID success (at most 50)"].estimate == 30
@@ -197,7 +200,7 @@ def test_what_no_method_does_soon_is_not_held_against_one(tmp_path: Path) -> Non
     (told,) = (finding.evidence for finding in findings(study) if finding.claim == SOON)
     assert "perf_gain gets to 10% within 10 updates in 0 of 6 runs" in told
     assert "in 6 after 20;" in told and told.endswith("nor does any run of any method here")
-    curves["hand_made"] = FAST
+    curves["hand_designed"] = FAST
     found = verdicts(study_of(tmp_path / "somebody", **curves))
     assert found[STALL] == "supported" and found[SOON] == "contradicted"
 

@@ -61,7 +61,7 @@ def write_methods(
                 [value * (1 - 0.01 * seed) for value in base],
                 cycles=harder if proposes else (),
                 copies=1100 if proposes else 0,
-                asked=3 if EXACT in NEEDS.get(method, ()) or ablation == "chosen" else 0,
+                asked=3 if EXACT in NEEDS.get(method, ()) or ablation == "filtered" else 0,
                 ablation=ablation or "none",
                 facts={"about": facts} if facts else None,
             )
@@ -81,7 +81,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     curves = {
         "perf_gain": FASTEST,
         "ncc": FAST,
-        "hand_made": FASTEST,
+        "hand_designed": FASTEST,
         "domain_randomization": SLOW,
         "target": FLAT,
     }
@@ -191,10 +191,10 @@ def test_what_a_method_needs_is_what_its_runs_say(tmp_path: Path) -> None:
 
 def test_a_variant_needs_what_its_runs_asked_for(tmp_path: Path) -> None:
     """With a choice by exact success even domain randomization needs that."""
-    curves = {"domain_randomization": SLOW, "domain_randomization, chosen": FASTEST}
+    curves = {"domain_randomization": SLOW, "domain_randomization, filtered": FASTEST}
     found = choices(study_of(write_methods(tmp_path, curves)), NEEDS)
     best = {there: row["updates"].best.label for there, row in found.items() if row["updates"]}
-    assert best["no target, exact evaluation"] == "domain_randomization, chosen"
+    assert best["no target, exact evaluation"] == "domain_randomization, filtered"
     assert best["no target, episodes alone"] == "domain_randomization"
 
 
@@ -206,7 +206,7 @@ def test_our_claims_hold_where_they_are_true(tmp_path: Path) -> None:
     true = {
         "first_order_gain": FASTEST,
         "first_order_proposer": FAST,
-        "hand_made": FAST,
+        "hand_designed": FAST,
         "domain_randomization": SLOW,
         "perf_gain, paper_literal": [value * 0.9 for value in SLOW],
         "target": FLAT,

@@ -55,7 +55,7 @@ def study_of(folder: Path, exact: bool | None = True, **options: Any) -> Study:
         for seed in range(5):
             told = {"levels": [value + 0.01 * seed for value in levels], "task": task}
             write_run(folder / f"{method}{seed}", method, [seed], **told, **options)
-    write_run(folder / "older", "hand_made", task=task)
+    write_run(folder / "older", "hand_designed", task=task)
     return read_studies(sorted(folder.iterdir()), None)[0][0]
 
 
@@ -73,7 +73,7 @@ def test_tables_have_every_share_and_every_level(tmp_path: Path) -> None:
     assert (whole["mean"], whole["mean, low"], whole["mean, high"]) == pytest.approx(known)
     assert min(row["share"] for row in found) == pytest.approx(0.01)
     header, rows = level_table(study)
-    assert header[2:] == ["domain_randomization", "hand_made", "target"]
+    assert header[2:] == ["domain_randomization", "hand_designed", "target"]
     assert len(rows) == 2 * 3 and rows[1][:2] == ["id_success", 1]
     assert rows[1][2:] == pytest.approx([0.92, np.nan, 0.42], nan_ok=True)
 
@@ -84,7 +84,7 @@ def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
     assert gap.estimate == pytest.approx(1 - 0.42) and gap.high > gap.low
     pooled = sorted(value + 0.01 * seed for value in LEVELS["target"] for seed in range(5))
     assert rows["target"]["IQM of ID success"].estimate == pytest.approx(np.mean(pooled[3:-3]))
-    assert rows["hand_made"]["IQM of ID success"] is None
+    assert rows["hand_designed"]["IQM of ID success"] is None
     assert rows["target"]["P(better than domain_randomization)"].estimate == 0.5
     assert rows["domain_randomization"]["P(better than domain_randomization)"] is None
 
@@ -115,7 +115,7 @@ def test_the_page_has_what_every_method_reaches_on_each_level(tmp_path: Path) ->
         "OOD success rate",
     ]
     means = dict(zip(labels, drawn["levels"][0]["methods"], strict=True))
-    assert means["hand_made"] is None  # the older folder tells of none
+    assert means["hand_designed"] is None  # the older folder tells of none
     for method, levels in LEVELS.items():
         assert means[method] == pytest.approx([value + 0.02 for value in levels])
 

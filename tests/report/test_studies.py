@@ -31,9 +31,9 @@ def labels(study: Study) -> dict[str, list[int]]:
 def test_seeds_of_one_method_make_a_group(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target", [1])
     write_run(tmp_path / "b", "target", [0])
-    write_run(tmp_path / "c", "hand_made", [0, 1])
+    write_run(tmp_path / "c", "hand_designed", [0, 1])
     (study,), notes = read(tmp_path)
-    assert labels(study) == {"target": [0, 1], "hand_made": [0, 1]}
+    assert labels(study) == {"target": [0, 1], "hand_designed": [0, 1]}
     assert not notes and study.title == "Tiny scale, 2×4 mazes"
 
 
@@ -149,7 +149,7 @@ def test_runs_are_compared_at_the_length_of_most(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target", [0], [0.0, 0.9, 0.9])
     write_run(tmp_path / "b", "target", [1], [0.0, 0.1, 0.9])
     write_run(tmp_path / "c", "target", [2], [0.0, 0.1, 0.1, 0.1])
-    write_run(tmp_path / "d", "hand_made", [0], [0.0, 0.1], finished=False)
+    write_run(tmp_path / "d", "hand_designed", [0], [0.0, 0.1], finished=False)
     (study,), _ = read(tmp_path)
     assert study.horizon == 20
     assert [group.label for group in study.compared] == ["target"]

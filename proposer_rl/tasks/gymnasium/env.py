@@ -1,0 +1,172 @@
+"""Environments of Gymnasium as one TorchRL environment, each on a level of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from proposer_rl.tasks.gymnasium.levels import SEED
+from proposer_rl.tasks.gymnasium.networks import checked_spaces
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.gymnasium.success import Rule, Steps
+
+Vectorization = Literal["sync", "async"]
+# A forked process need not import torch again, of which it has no use: TorchRL's choice is spawn.
+CONTEXT = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
+
+
+class GymnasiumEnv(EnvBase):
+    """A batch of environments of Gymnasium, stepped by its vector environments.
+
+    An environment whose episode is over begins its level again, from the same seed. Observations
+    are ``observation`` and ``success``, bool [*B, 1]: whether the step ended an episode that counts
+    as one. ``reward`` is scaled.
+
+    Args:
+        levels: as :class:`~proposer_rl.tasks.gymnasium.levels.ParameterSpace` makes them, [*B].
+        make: makes one environment.
+        parameters: what differs between levels, by name.
+        success: when an episode is one.
+        reward_scale: rewards are multiplied with it.
+        vectorization: one after another, or each in a process of its own.
+        once: play one episode of each level, and then stand still, without reward.
+    """
+
+    def __init__(
+        self,
+        levels: TensorDictBase,
+        make: MakeEnvironment,
+        parameters: Mapping[str, ParameterSettings],
+        *,
+        success: Rule,
+        reward_scale: float = 1.0,
+        vectorization: Vectorization = "sync",
+        once: bool = False,
+    ) -> None:
+        super().__init__(batch_size=levels.batch_size)
+        self._succeeded = success
+        self._reward_scale = reward_scale
+        self._once = once
+        players = [partial(LevelPlayer, make, parameters, play) for play in plays(levels, once)]
+        self._vector = _vectorized(players, vectorization)
+        self._returns = np.zeros(len(players))
+        self._make_specs()
+
+    def set_levels(self, levels: TensorDictBase) -> None:
+        """Play these levels [*B] from the next reset on."""
+        self._vector.set_attr("play", plays(levels, self._once))
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close all environments, and end their processes."""
+        self._vector.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            self._returns[:] = 0
+            seen, _ = self._vector.reset()
+        else:
+            chosen = mask.reshape(-1).numpy()
+            self._returns[chosen] = 0
+            seen, _ = self._vector.reset(options={"reset_mask": chosen})
+        # Of these TorchRL takes over only the entries of the environments that are reset.
+        return self._batched(observation=seen, success=np.zeros(len(self._returns), np.bool_))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        space = self._vector.single_action_space
+        actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
+        seen, rewards, terminated, truncated, info = self._vector.step(actions)
+        self._returns += rewards
+        return self._batched(
+            observation=seen,
+            success=self._succeeded(Steps(terminated, truncated, self._returns, info)),
+            reward=(rewards * self._reward_scale).astype(np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated | truncated,
+        )
+
+    def _batched(self, **entries: NDArray[Any]) -> TensorDict:
+        """Entries [n, ...] of all environments, [*B, ...]; single numbers as [*B, 1]."""
+        tensors = {
+            key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
+            for key, entry in entries.items()
+        }
+        seen = tensors["observation"]
+        if seen.dtype != torch.uint8:
+            tensors["observation"] = seen.float()
+        return TensorDict(tensors, self.batch_size)
+
+    def _make_specs(self) -> None:
+        batch = self.batch_size
+        seen, acts = checked_spaces(
+            self._vector.single_observation_space, self._vector.single_action_space
+        )
+        kind = torch.uint8 if seen.dtype == np.uint8 else torch.float32
+        flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, *seen.shape), dtype=kind), success=flag, shape=batch
+        )
+        if isinstance(acts, spaces.Discrete):
+            self.action_spec = Categorical(int(acts.n), shape=batch)
+        else:
+            self.action_spec = Unbounded((*batch, *acts.shape))
+        self.reward_spec = Unbounded((*batch, 1))
+        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(ends, shape=batch)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Do nothing: what is random belongs to the levels."""
+
+
+def _vectorized(
+    players: Sequence[Callable[[], LevelPlayer]], vectorization: Vectorization
+) -> SyncVectorEnv | AsyncVectorEnv:
+    mode = AutoresetMode.DISABLED
+    if vectorization == "sync":
+        return SyncVectorEnv(players, autoreset_mode=mode)
+    alone = [partial(_in_own_process, player, os.getpid()) for player in players]
+    return AsyncVectorEnv(alone, autoreset_mode=mode, context=CONTEXT)
+
+
+def _in_own_process(make: Callable[[], LevelPlayer], parent: int) -> LevelPlayer:
+    """Make a player; in a process of its own, one that ends at once when its parent does.
+
+    A forked process would otherwise answer signals as its parent, which saves its work first.
+    """
+    if os.getpid() != parent:  # Gymnasium makes one in the parent, too
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return make()
+
+
+def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:
+    """What players are to play for levels [*B], in one row."""
+    columns = {str(name): entry.flatten().tolist() for name, entry in levels.items()}
+    seeds = columns.pop(SEED)
+    return [
+        Play(dict(zip(columns, row, strict=True)), seed, once)
+        for seed, *row in zip(seeds, *columns.values(), strict=True)
+    ]
+
+
+def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
+    """Actions [n, ...] of a policy as environments of a space take them."""
+    chosen = actions.numpy()
+    return chosen + space.start if isinstance(space, spaces.Discrete) else chosen

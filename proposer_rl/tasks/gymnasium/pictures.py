@@ -1,0 +1,100 @@
+"""Pictures of levels: the environment's own frames along a Solver's first episode."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.tasks.gymnasium.env import as_actions, plays
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+
+# Of pygame, with which most environments draw: no greeting, and no window or sound is needed.
+for name, value in {
+    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "SDL_VIDEODRIVER": "dummy",
+    "SDL_AUDIODRIVER": "dummy",
+}.items():
+    os.environ.setdefault(name, value)
+
+MODE = "rgb_array"
+LONGER_SIDE = 150  # pixels
+LATER = 3  # moments of an episode that are drawn over its start
+KEY = "The environment's frames: the start, and more faintly three later moments of the episode."
+NO_FRAMES = "The environment draws no frames here; the numbers are those of the level."
+
+
+class Camera:
+    """Plays levels again, with the actions that a Solver took, and takes pictures.
+
+    Args:
+        make: makes the environment.
+        parameters: what differs between levels, by name.
+        play: any level.
+
+    Attributes:
+        works: whether there are frames: the environment can draw, and has what it needs for it.
+    """
+
+    def __init__(
+        self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+    ) -> None:
+        self._player = LevelPlayer(make, parameters, play)
+        self.works = MODE in self._player.metadata.get("render_modes", ())
+        if self.works:
+            self._player = LevelPlayer(replace(make, render_mode=MODE), parameters, play)
+            self._player.reset()
+            try:
+                self.works = self._player.render() is not None
+            except Exception:  # a package, a display, a driver: there are the numbers instead
+                self.works = False
+
+    def pictures(
+        self, levels: TensorDictBase, rollout: TensorDictBase | None
+    ) -> list[NDArray[np.uint8]]:
+        """Pictures uint8 [H, W, 3] of levels [n], and of first episodes there [n, T]."""
+        return [
+            self._picture(play, None if rollout is None else _first_actions(rollout[index]))
+            for index, play in enumerate(plays(levels))
+        ]
+
+    def _picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+        if not self.works:
+            return written([f"{name} {value:.4g}" for name, value in play.values.items()])
+        self._player.play = play
+        self._player.reset()
+        frames = [self._frame()]
+        steps = [] if actions is None else list(as_actions(actions, self._player.action_space))
+        moments = {round(part * len(steps) / LATER) for part in range(1, LATER + 1)}
+        for number, action in enumerate(steps, 1):
+            self._player.step(action)
+            if number in moments:
+                frames.append(self._frame())
+        shares = np.ones(len(frames))
+        shares[0] = 2
+        return np.average(frames, 0, shares).astype(np.uint8)
+
+    def _frame(self) -> NDArray[np.uint8]:
+        image = Image.fromarray(np.asarray(self._player.render(), np.uint8))
+        image.thumbnail((LONGER_SIDE, LONGER_SIDE))
+        return np.asarray(image)
+
+
+def written(lines: Sequence[str]) -> NDArray[np.uint8]:
+    """Lines of text as a picture, uint8 [H, W, 3]."""
+    image = Image.new("RGB", (LONGER_SIDE, 8 + 14 * len(lines)), (250, 250, 250))
+    ImageDraw.Draw(image).multiline_text((4, 4), "\n".join(lines), (45, 45, 45))
+    return np.asarray(image)
+
+
+def _first_actions(rollout: TensorDictBase) -> Tensor:
+    """Of a rollout [T], the actions of its first episode."""
+    ended = rollout["next", "done"].squeeze(-1).long()
+    return rollout["action"][ended.cumsum(0) - ended == 0]

@@ -1,0 +1,35 @@
+"""Mazes: levels, their exact generation, distributions over them, the environment, pictures."""
+
+from __future__ import annotations
+
+from gymnasium import register
+
+from proposer_rl.tasks.mazes.distance import shortest_path_length
+from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.tasks.mazes.dynamics import successors
+from proposer_rl.tasks.mazes.env import MazeEnv
+from proposer_rl.tasks.mazes.generation import MECHANISMS, generate_levels
+from proposer_rl.tasks.mazes.levels import Level, LevelSpec, planes, validate_levels
+from proposer_rl.tasks.mazes.rendering import draw_level
+
+__all__ = [
+    "MECHANISMS",
+    "Level",
+    "LevelDistribution",
+    "LevelSpec",
+    "MazeEnv",
+    "SpecificationSpace",
+    "draw_level",
+    "generate_levels",
+    "planes",
+    "shortest_path_length",
+    "successors",
+    "validate_levels",
+]
+
+# By name, so that Gymnasium's environments are imported when one is made.
+register(
+    "proposer_rl/Maze-v0",
+    entry_point="proposer_rl.tasks.mazes.as_gymnasium.env:MazeGymnasiumEnv",
+    vector_entry_point="proposer_rl.tasks.mazes.as_gymnasium.vector:MazeVectorEnv",
+)

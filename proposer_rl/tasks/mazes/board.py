@@ -1,0 +1,192 @@
+"""Mazes drawn by hand, and all that a Solver does there: what ``bin/play`` shows of mazes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from proposer_rl.models import ActorCritic, cell_maps
+from proposer_rl.task import CellKind
+from proposer_rl.tasks.mazes.dynamics import shortest_way, successors
+from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, policy_path
+from proposer_rl.tasks.mazes.level_files import (
+    levels_from_text,
+    levels_to_text,
+    shipped_levels,
+    shipped_sets,
+)
+from proposer_rl.tasks.mazes.levels import (
+    FREE,
+    GOAL,
+    START,
+    WALL,
+    Level,
+    cell_index,
+    cell_plane,
+    planes,
+)
+from proposer_rl.tasks.mazes.occupancy import expected_visits, success_from_cells
+from proposer_rl.tasks.mazes.records import recorded_drawing
+from proposer_rl.tasks.mazes.settings import MazeSettings
+
+DIGITS = 4  # of the numbers of a map: what can be seen
+
+
+class Drawings:
+    """Mazes as drawings: of a :class:`~proposer_rl.task.Board` all but what a Solver does.
+
+    Args:
+        size: rows and columns of the run's mazes.
+    """
+
+    level: type[Level] = Level
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.sets = shipped_sets()
+
+    def read(self, rows: Sequence[str]) -> Level:
+        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        # The message of a drawing shows it; here it was seen already.
+        try:
+            return self.level.from_text("\n".join(rows))
+        except ValueError as error:
+            raise ValueError(str(error).partition(", got")[0]) from error
+
+    def draw(self, level: Level) -> list[str]:
+        """The rows of a level's drawing."""
+        return str(level.to_text()).splitlines()
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """The drawing in a record, whose text has spaces, and dots where an episode went."""
+        return recorded_drawing(record)
+
+    def level_set(self, name: str) -> Mapping[str, Level]:
+        """The levels of a set that comes along."""
+        return shipped_levels(name)
+
+    def read_file(self, text: str) -> Mapping[str, Level]:
+        """The levels of a file's text; docs/levels.md has the format."""
+        return levels_from_text(text, kind=self.level)
+
+    def write_file(self, name: str, level: Level) -> str:
+        """A file's text; docs/levels.md has the format."""
+        return levels_to_text({name: level})
+
+
+class MazeBoard(Drawings):
+    """Mazes that are seen whole; a :class:`~proposer_rl.task.Board`.
+
+    Args:
+        maze: the inner environment.
+        check: refuses a level that the Solver's network cannot see, given its name.
+        max_steps: the step limit of a level, given the length of its shortest path.
+        device: that of the Solvers.
+    """
+
+    kinds = (
+        CellKind(FREE, "free"),
+        CellKind(WALL, "wall"),
+        CellKind(START, "start", once=True),
+        CellKind(GOAL, "goal", once=True),
+    )
+    actions = ("up", "down", "left", "right")
+
+    def __init__(
+        self,
+        maze: MazeSettings,
+        check: Callable[[str, Level], None],
+        max_steps: Callable[[int], int],
+        device: torch.device,
+    ) -> None:
+        super().__init__((maze.height, maze.width))
+        self._step_penalty = maze.step_penalty
+        self._check = check
+        self._max_steps = max_steps
+        self._device = device
+
+    def read(self, rows: Sequence[str]) -> Level:
+        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        level = super().read(rows)
+        self._check("drawn", level)
+        return level
+
+    @torch.no_grad()
+    def examine(
+        self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
+    ) -> dict[str, Any]:
+        """What a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
+
+        ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
+        ``maps``: the critic's values; the probability of success from every cell with the whole
+        step limit; how often a step of an episode begins there.
+        """
+        shortest = shortest_path(level)
+        limit = max_steps or self._max_steps(0 if shortest is None else len(shortest) - 1)
+        level = level.to(self._device)
+        copies = planes(level.expand(agent.copies, 1))
+        logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
+        logits, values = logits.float(), values[0].float()
+        if not (logits.isfinite().all() and values.isfinite().all()):
+            raise ValueError("the Solver of this checkpoint answers with numbers without an end")
+        policy = logits.softmax(0)
+        visits = expected_visits(level, policy, limit)
+        results = ExactEvaluator(limit, self._step_penalty)(level, logits)
+        goal = cell_plane(level.goal, level.walls.shape).bool()
+        maps = {
+            "critic's value": (values, level.walls | goal),
+            "success from here": (success_from_cells(level, policy, limit), level.walls),
+            "expected visits": (visits, level.walls),
+        }
+        path = policy_path(level, logits, limit).tolist()
+        return {
+            "results": {
+                "success": float(results["success"]),
+                "return": float(results["return"]),
+                "steps": float(visits.sum()),
+            },
+            "policy": _numbers(policy, level.walls | goal),
+            "maps": {name: _numbers(*values) for name, values in maps.items()},
+            "paths": {"solver": _until_it_ends(path, level.goal.tolist()), "shortest": shortest},
+            "next": successors(level).tolist(),
+            "goal": level.goal.tolist(),
+            "max_steps": limit,
+            "step_penalty": self._step_penalty,
+            "missed": -self._step_penalty * limit,
+        }
+
+
+def shortest_path(level: Level) -> list[list[int]] | None:
+    """A shortest path of a level ``[]``: its cells (row, column), start and goal included.
+
+    Returns:
+        Of several the one whose moves come first in
+        :data:`~proposer_rl.tasks.mazes.dynamics.MOVES`; None
+        where there is no path.
+    """
+    width = level.walls.shape[1]
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    path = shortest_way(successors(level).tolist(), start, lambda cell: cell == goal)
+    return None if path is None else [list(divmod(cell, width)) for cell in path]
+
+
+def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
+    """A path up to the goal, or to the first cell that is entered again: it circles from there."""
+    seen: set[tuple[int, ...]] = set()
+    for length, cell in enumerate(path, 1):
+        if cell == goal or tuple(cell) in seen:
+            return path[:length]
+        seen.add(tuple(cell))
+    return path
+
+
+def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:
+    """Values ``[*A, H, W]`` as lists [H][W][*A]; None where ``without``, bool ``[H, W]``, is."""
+    rows = values.movedim((-2, -1), (0, 1)).double().round(decimals=DIGITS).tolist()
+    return [
+        [None if left_out else value for value, left_out in zip(row, line, strict=True)]
+        for row, line in zip(rows, without.tolist(), strict=True)
+    ]

@@ -1,0 +1,193 @@
+"""What levels are drawn from: a set of specifications, or a grid of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from proposer_rl.tasks.mazes.generation import generate_levels
+from proposer_rl.tasks.mazes.levels import Level, LevelSpec
+from proposer_rl.tasks.mazes.randomness import Generators
+
+
+class LevelDistribution:
+    """Levels of specifications that are equally likely, numbered in their order.
+
+    Making one proves that every specification can be met: it draws a level of each, from a
+    generator of its own, so that it does not disturb any other random state.
+
+    Args:
+        specifications: Pairs (obstacle fraction, path length), at least one; see
+            :class:`~proposer_rl.tasks.mazes.levels.LevelSpec`.
+        mechanism: ``"uniform"`` or ``"path_first"``; see
+            :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
+        height: H, cells.
+        width: W, cells.
+        device: Where the levels are returned.
+
+    Raises:
+        ValueError: If a specification cannot be met, or there is none.
+
+    Example:
+        >>> easy_and_hard = LevelDistribution([(0.0, 2), (0.4, 12)])
+        >>> fractions, lengths = easy_and_hard.decode(torch.tensor([0, 1]))
+        >>> lengths
+        tensor([ 2, 12])
+        >>> easy_and_hard.sample((4, 8)).batch_size
+        torch.Size([4, 8])
+    """
+
+    def __init__(
+        self,
+        specifications: Sequence[tuple[float, int]],
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.device = torch.device(device)
+        self.specifications = tuple(LevelSpec(*pair) for pair in specifications)
+        self.mechanism = mechanism
+        self.height = height
+        self.width = width
+        if not self.specifications:
+            raise ValueError("at least one specification is needed")
+        self.generate(torch.arange(self.size), torch.Generator().manual_seed(0))
+
+    @property
+    def size(self) -> int:
+        """Number of specifications."""
+        return len(self.specifications)
+
+    def on_grid(self, height: int, width: int) -> LevelDistribution:
+        """The same specifications on another grid.
+
+        Raises:
+            ValueError: If one cannot be met there.
+        """
+        return LevelDistribution(self.specifications, self.mechanism, height, width, self.device)
+
+    def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Obstacle fractions float64 ``[*B]`` and path lengths int64 ``[*B]`` of numbers ``[*B]``.
+
+        Raises:
+            ValueError: If a number is not in 0 ... size - 1.
+        """
+        if index.numel() and not bool(((index >= 0) & (index < self.size)).all()):
+            raise ValueError(
+                f"specifications are numbered 0 to {self.size - 1}, "
+                f"got {int(index.min())} to {int(index.max())}"
+            )
+        fractions, lengths = zip(*self.specifications, strict=True)
+        return (
+            torch.tensor(fractions, dtype=torch.float64, device=index.device)[index],
+            torch.tensor(lengths, device=index.device)[index],
+        )
+
+    def generate(self, index: Tensor, generator: Generators = None) -> Level:
+        """Draws one level for each number.
+
+        Args:
+            index: int64 ``[*B]``, in 0 ... size - 1.
+            generator: As in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
+
+        Returns:
+            Levels ``[*B]``, in the order of the numbers.
+
+        Raises:
+            ValueError: If a number is out of range.
+        """
+        fraction, length = self.decode(index.cpu())
+        grid = (self.height, self.width)
+        return generate_levels(fraction, length, *grid, self.mechanism, generator, self.device)
+
+    def sample(
+        self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Level:
+        """Draws levels ``[*B]`` of uniformly random specifications.
+
+        Args:
+            batch_shape: ``[*B]``; a number for ``[B]``.
+            generator: Source of randomness; None for the default one.
+        """
+        shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
+        place = "cpu" if generator is None else generator.device
+        index = torch.randint(self.size, shape, generator=generator, device=place)
+        return self.generate(index, generator)
+
+
+class SpecificationSpace(LevelDistribution):
+    """The M x N pairs of M obstacle fractions and N path lengths, numbered row by row.
+
+    Number ``i * N + j`` stands for ``(obstacle_fractions[i], path_lengths[j])``.
+
+    Args:
+        obstacle_fractions: M distinct fractions in [0, 1).
+        path_lengths: N distinct numbers of moves.
+        mechanism, height, width, device: As in :class:`LevelDistribution`.
+
+    Attributes:
+        axes: The M fractions and N lengths, by name.
+
+    Raises:
+        ValueError: If an entry is repeated or a specification cannot be met.
+
+    Example:
+        >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
+        >>> space.size
+        6
+        >>> space.specifications[4]
+        LevelSpec(obstacle_fraction=0.2, path_length=4)
+    """
+
+    def __init__(
+        self,
+        obstacle_fractions: Sequence[float] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5),
+        path_lengths: Sequence[int] = (2, 4, 6, 8, 10, 12, 14, 16),
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        axes = {"obstacle_fractions": obstacle_fractions, "path_lengths": path_lengths}
+        for name, values in axes.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} must be distinct, got {list(values)}")
+        self.axes: dict[str, Sequence[float]] = {
+            "obstacle fraction": tuple(obstacle_fractions),
+            "path length": tuple(path_lengths),
+        }
+        pairs = list(product(obstacle_fractions, path_lengths))
+        super().__init__(pairs, mechanism, height, width, device)
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Obstacle fraction and path length of each pair, each scaled to [-1, 1]: float [M * N, 2].
+
+        Of an axis with a single value the coordinate is 0.
+        """
+        return torch.cartesian_prod(
+            *(self._scaled(torch.tensor(values), axis) for axis, values in self.axes.items())
+        )
+
+    def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
+        """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
+
+        Between equally near ones rounding decides. Pairs that the space does not have get the
+        nearest that it has, also where they lie outside of it.
+        """
+        wanted = zip(*specifications, strict=True)
+        scaled = [
+            self._scaled(torch.tensor(values), axis)
+            for axis, values in zip(self.axes, wanted, strict=True)
+        ]
+        return torch.cdist(torch.stack(scaled, -1), self.coordinates).argmin(-1)
+
+    def _scaled(self, values: Tensor, axis: str) -> Tensor:
+        """Values along an axis, which goes from -1 to 1; 0 where it has a single value."""
+        known = torch.tensor(self.axes[axis], dtype=torch.float32)
+        middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
+        return (values - middle) / reach if reach > 0 else torch.zeros(len(values))

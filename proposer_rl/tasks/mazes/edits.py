@@ -1,0 +1,91 @@
+"""Small random edits of levels, from which a curriculum makes new levels of old ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_position
+from proposer_rl.tasks.mazes.randomness import Draws
+
+FLIP_WALL, MOVE_GOAL, MOVE_START = range(3)
+
+
+def edit_levels(levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
+    """Levels after a number of random edits, one after another.
+
+    An edit is one of three operators, each with probability 1/3:
+
+    - flip: a uniform cell that is neither start nor goal becomes an obstacle, or ceases to be one;
+    - the goal moves to a uniform free cell other than start and goal;
+    - the start does.
+
+    Where there is no such cell, the level stays as it is. Nothing else is asked of an edit: the
+    goal may become unreachable.
+
+    It is the mutation of ACCEL (Parker-Holder et al. 2022, arXiv 2203.01302), with two deviations
+    from how libraries draw it, among nothing, a flip and a move of the goal: no edit is wasted, and
+    the start moves, too.
+
+    Args:
+        levels: valid levels ``[K, n]`` on any device; they are left as they are.
+        count: edits of each level, at least 0. With the same generators the first ``count`` edits
+            of more are those of fewer.
+        generators: K generators of the CPU, one for each index of the first dimension: levels
+            ``[k]`` depend on generator k alone.
+
+    Returns:
+        Valid levels ``[K, n]`` on the levels' device.
+
+    Raises:
+        ValueError: If ``count`` is negative, or the generators are not as many as the levels' first
+            dimension.
+
+    Example:
+        >>> levels = Level.from_text(["S..G"] * 4).reshape(1, 4)
+        >>> edit_levels(levels, 1, [torch.Generator().manual_seed(0)])[0].to_text()
+        ['.S.G', 'S.#G', '.S.G', 'S.#G']
+    """
+    copies, number = levels.batch_size
+    if count < 0:
+        raise ValueError(f"count must be at least 0, got {count}")
+    if len(generators) != copies:
+        raise ValueError(
+            f"{copies} generators are needed for levels of {copies} copies, got {len(generators)}"
+        )
+    group = torch.arange(copies).repeat_interleave(number)
+    draws = Draws(generators, group, torch.device("cpu"))
+    flat = levels.reshape(-1)  # [C]
+    for _ in range(count):
+        operator, place = draws.randint(3), draws.rand(1)  # [1, C]
+        device = levels.walls.device
+        flat = _edit(flat, operator.squeeze(0).to(device), place.squeeze(0).to(device))
+    return flat.reshape(copies, number).clone()
+
+
+def _edit(levels: Level, operator: Tensor, place: Tensor) -> Level:
+    """One edit of each of levels [C]: int64 [C] says which, float [C] in [0, 1) where."""
+    width = levels.walls.shape[-1]
+    walls = levels.walls.flatten(1)  # [C, H*W]
+    start, goal = (cell_index(end, width).unsqueeze(1) for end in (levels.start, levels.goal))
+    allowed = ~walls | (operator == FLIP_WALL).unsqueeze(1)
+    allowed = allowed.scatter(1, start, False).scatter(1, goal, False)
+    marked = allowed.cumsum(1, dtype=torch.int32)  # up to and with each cell
+    choices = marked[:, -1]
+    # Equal parts of [0, 1) lead to each cell; rounding may make the product their whole number.
+    rank = (place * choices).int().minimum(choices - 1)
+    cell = (marked <= rank.unsqueeze(1)).sum(1)  # [C]
+
+    def chosen(which: int) -> Tensor:
+        return (operator == which) & (choices > 0)
+
+    flipped = torch.zeros_like(walls).scatter(1, cell.unsqueeze(1), chosen(FLIP_WALL).unsqueeze(1))
+    position = cell_position(cell, width)  # [C, 2]
+    return Level(
+        walls=(walls ^ flipped).view_as(levels.walls),
+        start=position.where(chosen(MOVE_START).unsqueeze(1), levels.start),
+        goal=position.where(chosen(MOVE_GOAL).unsqueeze(1), levels.goal),
+        batch_size=levels.batch_size,
+    )

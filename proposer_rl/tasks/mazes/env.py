@@ -1,0 +1,137 @@
+"""The maze as a TorchRL environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+
+from proposer_rl.tasks.mazes.dynamics import MOVES, successors
+from proposer_rl.tasks.mazes.level_env import LevelEnv
+from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
+from proposer_rl.tasks.mazes.rendering import draw_level
+
+
+class MazeEnv(LevelEnv):
+    """A batch of mazes, one agent in each.
+
+    - Action: int64 ``[*B]``, 0 up, 1 down, 2 left, 3 right. A move into an obstacle or out of the
+      grid leaves the agent where it is.
+    - Observation: ``"planes"``, float32 ``[*B, 3, H, W]``: obstacles, start, goal (with
+      ``observe_agent`` a fourth plane, the agent); ``"agent"``, int64 ``[*B, 2]``: row and column
+      of the agent; ``"step_count"``, int64 ``[*B, 1]``: steps taken in this episode.
+    - Reward: float32 ``[*B, 1]``, 1 on entering the goal, minus ``step_penalty`` at every step, the
+      last one included.
+    - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
+      elsewhere. A step that reaches the goal at the limit is terminated and not truncated, since
+      nothing was cut off. ``done`` is either.
+    - Reset: the agent goes back to the start of the *same* level, also when TorchRL resets finished
+      mazes by itself. Levels change only by
+      :meth:`~proposer_rl.tasks.mazes.level_env.LevelEnv.set_levels`.
+
+    The dynamics are deterministic and depend on the tensordict that is stepped and on the levels
+    alone; nothing is drawn at random.
+
+    Args:
+        levels: Levels of any batch shape ``[*B]``, which with their device become the
+            environment's. They must be valid; see
+            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-made ones.
+        max_steps: Step limit of an episode.
+        step_penalty: Cost of a step.
+        observe_agent: Whether the planes show the agent.
+
+    Raises:
+        ValueError: If ``max_steps`` is less than 1.
+
+    Example:
+        >>> from proposer_rl import Level
+        >>> env = MazeEnv(Level.from_text("S.G"))
+        >>> state = env.reset()
+        >>> for _ in range(2):
+        ...     state = env.step(state.set("action", torch.tensor(3)))["next"]
+        >>> state["reward"], state["terminated"]
+        (tensor([0.9900]), tensor([True]))
+    """
+
+    def __init__(
+        self,
+        levels: Level,
+        *,
+        max_steps: int = 25,
+        step_penalty: float = 0.01,
+        observe_agent: bool = False,
+    ) -> None:
+        self.step_penalty = step_penalty
+        self.observe_agent = observe_agent
+        self._constant = () if observe_agent else ("planes",)
+        super().__init__(levels, max_steps)
+        self._make_specs()
+
+    def render(self, mode: str = "rgb_array", cell: int = 16) -> Any:
+        """Draws the mazes as they are now.
+
+        Args:
+            mode: ``"rgb_array"`` or ``"ansi"``.
+            cell: Side of a cell in pixels.
+
+        Returns:
+            uint8 ``[*B, H', W', 3]``; or text (a list of texts for a batch) in which ``A`` is the
+            agent.
+
+        Raises:
+            ValueError: If the mode is another.
+        """
+        if mode not in ("rgb_array", "ansi"):
+            raise ValueError(f"mode must be 'rgb_array' or 'ansi', got {mode!r}")
+        levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
+        if mode == "ansi":
+            places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character
+            texts = zip(levels.to_text(), places, strict=True)
+            marked = [f"{text[:place]}A{text[place + 1 :]}" for text, place in texts]
+            return marked if self.batch_dims else marked[0]
+        pictures = [
+            draw_level(level, agent=agent.tolist(), cell=cell)
+            for level, agent in zip(levels, agents, strict=True)
+        ]
+        return torch.stack(pictures).reshape(*self.batch_size, *pictures[0].shape)
+
+    def _make_specs(self) -> None:
+        batch, (height, width) = self.batch_size, self._grid
+        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
+        self.observation_spec = Composite(
+            planes=Bounded(0.0, 1.0, (*batch, 3 + self.observe_agent, height, width)),
+            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
+            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
+            shape=batch,
+        ).to(self.device)
+        self.action_spec = Categorical(len(MOVES), shape=batch, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        self.done_spec = self._ends()
+
+    def _tabulate(self, levels: Level) -> None:
+        self._planes = planes(levels)
+        self._successors = successors(levels).flatten(-2)  # [*B, 4 * H*W]
+        self._goal = cell_index(levels.goal, self._grid[1]).unsqueeze(-1)  # [*B, 1]
+
+    def _first(self) -> dict[str, Tensor]:
+        return self._observe(self._levels.start.clone())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        (height, width), action = self._grid, tensordict.get("action")
+        cell = cell_index(tensordict.get("agent"), width)
+        move = (action * (height * width) + cell).unsqueeze(-1)
+        cell = self._successors.gather(-1, move)  # [*B, 1]
+        terminated = cell == self._goal
+        self._agent = cell_position(cell.squeeze(-1), width)
+        reward = terminated.float() - self.step_penalty
+        after = {**self._observe(self._agent), **self._after(terminated, tensordict)}
+        return TensorDict({**after, "reward": reward}, self.batch_size, device=self.device)
+
+    def _observe(self, agent: Tensor) -> dict[str, Tensor]:
+        drawn = self._planes
+        if self.observe_agent:
+            drawn = torch.cat([drawn, cell_plane(agent, self._grid).unsqueeze(-3)], dim=-3)
+        return {"planes": drawn, "agent": agent}

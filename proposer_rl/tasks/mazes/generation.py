@@ -1,0 +1,247 @@
+"""Batched generation of mazes that meet their specification exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, NoReturn
+
+import torch
+from torch import Tensor
+
+from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.tasks.mazes.path_first import draw_path_first
+from proposer_rl.tasks.mazes.randomness import Draws, Generators
+from proposer_rl.tasks.mazes.uniform import draw_uniform
+
+
+class _Mechanism(NamedTuple):
+    draw: Callable[[Tensor, Tensor, int, int, Draws], tuple[Tensor, Level]]
+    limit: int  # candidates per level after which a specification counts as impossible
+    chunk: int  # candidates drawn at once on a CPU, so that the working set stays in its cache
+    device_chunk: int  # the same on an accelerator, where few large launches are faster
+    pools: bool  # whether a candidate's random numbers are as many whatever the others are
+
+
+_MECHANISMS = {
+    "uniform": _Mechanism(draw_uniform, 200_000, 8_192, 131_072, True),
+    "path_first": _Mechanism(draw_path_first, 100_000, 2_048, 32_768, False),
+}
+MECHANISMS = tuple(_MECHANISMS)
+
+
+def generate_levels(
+    obstacle_fraction: float | Sequence[float] | Tensor,
+    path_length: int | Sequence[int] | Tensor,
+    height: int = 10,
+    width: int = 10,
+    mechanism: str = "uniform",
+    generator: Generators = None,
+    device: torch.device | str | None = None,
+) -> Level:
+    """Draws one level for each specification, exactly as specified.
+
+    Every level has ``round(obstacle_fraction * H * W)`` obstacles, a free start, a free goal, and a
+    shortest path of ``path_length`` moves. The product is rounded in float64, halves to the even
+    number, from the fraction as it is passed: where a half matters, pass float64.
+
+    - ``uniform``: obstacles uniform over the cells, start uniform over the free cells, goal uniform
+      over the cells at distance ``path_length`` from it; obstacles and start are drawn again
+      until there is such a cell.
+    - ``path_first``: among obstacles only, a random path without shortcuts is carved from a uniform
+      start; then cells are opened in random order, except those that would make the path from
+      start to goal shorter, until the number of obstacles is met; drawn again if it cannot be.
+
+    Args:
+        obstacle_fraction: Fractions in [0, 1), broadcast with ``path_length`` to ``[*B]``.
+        path_length: Whole numbers of moves, at least 1.
+        height: H, cells.
+        width: W, cells.
+        mechanism: ``"uniform"`` or ``"path_first"``.
+        generator: Source of randomness; None for the default one. The levels are drawn on its
+            device, so that they depend on it alone. With a sequence of generators, one for each
+            index of the first dimension, levels ``[k]`` are those that generator k alone would
+            give, drawn together.
+        device: Where the levels are returned; None for that of ``obstacle_fraction`` or
+            ``path_length`` if either is a tensor, else that of the generator, else the CPU.
+
+    Returns:
+        Levels of batch shape ``[*B]``.
+
+    Raises:
+        ValueError: If an argument is invalid, or if a specification is impossible or so rare that
+            the mechanism did not meet it within a bounded number of candidates; the message names
+            the specification.
+
+    Example:
+        >>> levels = generate_levels(0.25, [3, 5], height=6, width=6)
+        >>> levels.walls.sum((-2, -1))
+        tensor([9, 9])
+        >>> from proposer_rl import shortest_path_length
+        >>> shortest_path_length(levels)
+        tensor([3, 5])
+    """
+    if mechanism not in _MECHANISMS:
+        raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
+    if height < 1 or width < 1:
+        raise ValueError(f"a grid has at least one row and one column, got {height}x{width}")
+    source = generator[0] if isinstance(generator, Sequence) else generator
+    if device is None:
+        tensors = [x for x in (obstacle_fraction, path_length) if isinstance(x, Tensor)]
+        device = tensors[0].device if tensors else "cpu" if source is None else source.device
+    device = torch.device(device)
+    fraction, length = _specifications(obstacle_fraction, path_length)
+    shape, groups, group = fraction.shape, 1, torch.zeros_like(length)
+    if isinstance(generator, Sequence):
+        groups = len(generator)
+        if shape[:1] != (groups,):
+            raise ValueError(
+                f"{groups} generators need as many indices in the first dimension, "
+                f"got {list(shape)}"
+            )
+        group += torch.arange(groups).view(-1, *[1] * (len(shape) - 1))
+    levels: Any
+    if isinstance(generator, Sequence) and not _MECHANISMS[mechanism].pools:
+        each = zip(fraction, length, generator, strict=True)
+        levels = torch.stack(
+            [generate_levels(f, n, height, width, mechanism, g, g.device) for f, n, g in each]
+        )
+    else:
+        problems = (fraction.flatten(), length.flatten(), group.flatten(), groups)
+        task = _Task(*problems, height, width, mechanism)
+        levels = task.solve(generator, device if source is None else source.device).reshape(shape)
+    if device.type == "cuda" and levels.walls.device.type == "cpu":
+        return levels.pin_memory().to(device, non_blocking=True)  # without waiting for the GPU
+    return levels.to(device)
+
+
+def _specifications(
+    obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Both arguments as float64 and int64 tensors of one shape on the CPU, if they are in range."""
+    if isinstance(obstacle_fraction, Tensor):
+        obstacle_fraction = obstacle_fraction.detach().cpu()
+    fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
+    length = torch.as_tensor(path_length).cpu()
+    if length.is_floating_point() or length.dtype == torch.bool:
+        raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
+    try:
+        fraction, length = torch.broadcast_tensors(fraction, length.long())
+    except RuntimeError as error:
+        raise ValueError(
+            f"obstacle_fraction {list(fraction.shape)} and path_length {list(length.shape)} "
+            "must have shapes that broadcast"
+        ) from error
+    bad = ~((fraction >= 0) & (fraction < 1))
+    if bad.any():
+        value = fraction[bad][0].item()
+        raise ValueError(f"obstacle_fraction must be at least 0 and below 1, got {value:g}")
+    if (length < 1).any():
+        raise ValueError(f"path_length must be at least 1, got {int(length.min())}")
+    return fraction, length
+
+
+class _Task:
+    """The problems of one call, pooled by distinct specification and group.
+
+    Specifications are in ascending order of path length, as the mechanisms require. All counts are
+    kept on the CPU; only candidates live on the device.
+    """
+
+    def __init__(
+        self,
+        fraction: Tensor,
+        length: Tensor,
+        group: Tensor,
+        groups: int,
+        height: int,
+        width: int,
+        name: str,
+    ) -> None:
+        self.grid = (height, width)
+        self.name = name
+        self.mechanism = _MECHANISMS[name]
+        obstacles = (fraction * (height * width)).round().long()
+        base = height * width + 1
+        number = (length * base + obstacles) * groups + group
+        specs, spec_of = number.unique(return_inverse=True)
+        specs, self.group = specs // groups, specs % groups  # [S]
+        self.length, self.obstacles = specs // base, specs % base  # ascending in length
+        self.by_group = self.group.argsort(stable=True)
+        self.order = spec_of.argsort(stable=True)  # problems, grouped by specification
+        self.wanted = spec_of.bincount(minlength=len(specs))  # [S]
+        self.first = self.wanted.cumsum(0) - self.wanted  # of each specification in ``order``
+        self.example = fraction[self.order[self.first]]
+        self._check_necessary()
+
+    def solve(self, generator: Generators, device: torch.device) -> Level:
+        """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
+        count, (height, width) = self.order.shape[0], self.grid
+        cells = torch.zeros(2, count, 2, dtype=torch.int64, device=device)
+        walls = torch.zeros(count, height, width, dtype=torch.bool, device=device)
+        result = Level(walls=walls, start=cells[0], goal=cells[1], batch_size=[count])
+        drawn, accepted = torch.zeros_like(self.wanted), torch.zeros_like(self.wanted)
+        filled = torch.zeros_like(self.wanted)
+        while (filled < self.wanted).any():
+            share = self._share(self.wanted - filled, drawn, accepted, device.type == "cpu")
+            spec_of = torch.arange(len(share)).repeat_interleave(share)  # [C]
+            draws = Draws(generator, self.group[spec_of], device)
+            kept, level = self.mechanism.draw(
+                self.obstacles[spec_of], self.length[spec_of], height, width, draws
+            )
+            spec_of = spec_of[kept.cpu()]  # [A]
+            found = spec_of.bincount(minlength=len(share))
+            rank = torch.arange(len(spec_of)) - (found.cumsum(0) - found)[spec_of]
+            slot = filled[spec_of] + rank
+            used = slot < self.wanted[spec_of]
+            problem = self.order[(self.first[spec_of] + slot)[used]].to(device)
+            result[problem] = level[used.to(device)]
+            drawn += share
+            accepted += found
+            filled = torch.minimum(filled + found, self.wanted)
+            self._check_rarity(filled, drawn, accepted)
+        return result
+
+    def _share(self, pending: Tensor, drawn: Tensor, accepted: Tensor, on_cpu: bool) -> Tensor:
+        """Candidates of each specification to draw next, as many as should fill what is pending.
+
+        The estimated rate is that of a uniform prior (one success and one failure seen in
+        advance), so a specification never met asks for twice as many each time.
+        """
+        rate = (accepted + 1) / (drawn + 2)
+        share = (1.1 * pending / rate).ceil().long() + 2 * (pending > 0)
+        chunk = self.mechanism.chunk if on_cpu else self.mechanism.device_chunk
+        ordered, group = share[self.by_group], self.group[self.by_group]
+        before = ordered.cumsum(0) - ordered
+        before -= before[torch.searchsorted(group, group)]  # only those of the same group
+        room = torch.empty_like(share).scatter_(0, self.by_group, chunk - before)
+        return share.minimum(room.clamp(min=0))
+
+    def _check_necessary(self) -> None:
+        """Refuses at once what no level can meet."""
+        height, width = self.grid
+        free, farthest = height * width - self.obstacles, height + width - 2
+        for spec in (free <= self.length).nonzero().flatten():
+            moves = self.length[spec]
+            self._refuse(
+                spec, f"a path of {moves} moves needs {moves + 1} free cells of {free[spec]}"
+            )
+        for spec in ((self.obstacles == 0) & (self.length > farthest)).nonzero().flatten():
+            self._refuse(spec, f"without obstacles no two cells are over {farthest} moves apart")
+
+    def _check_rarity(self, filled: Tensor, drawn: Tensor, accepted: Tensor) -> None:
+        """Gives up on what is met less often than once in ``limit`` candidates."""
+        hopeless = (filled < self.wanted) & (drawn > self.mechanism.limit * (accepted + 1))
+        for spec in hopeless.nonzero().flatten():
+            self._refuse(
+                spec,
+                f"it is impossible or rarer than 1 in {self.mechanism.limit:,} candidates "
+                f"({accepted[spec]} met in {drawn[spec]:,})",
+            )
+
+    def _refuse(self, spec: Tensor, reason: str) -> NoReturn:
+        height, width = self.grid
+        raise ValueError(
+            f"cannot make levels with obstacle_fraction={self.example[spec].item():g}, "
+            f"path_length={self.length[spec]} on a {height}x{width} grid "
+            f"({self.obstacles[spec]} obstacles, mechanism {self.name!r}): {reason}"
+        )

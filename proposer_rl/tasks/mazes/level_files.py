@@ -1,0 +1,300 @@
+"""Named levels as text and as JSON, and those of a run's record. docs/levels.md has the formats."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from proposer_rl.runs.folder import read_bounded, write_atomically
+from proposer_rl.tasks.mazes import Level, shortest_path_length
+from proposer_rl.tasks.mazes.records import recorded_drawing
+
+SUFFIXES = (".txt", ".json")
+RECORD = ".jsonl"  # of levels that a run trained on; read, not written
+LARGEST_FILE = 10**7  # bytes; files may come from anybody
+LONGEST_NAME = 80
+
+L = TypeVar("L", bound=Level)
+
+_HERE = Path(__file__).parent
+_HEADER = re.compile(r"\[(.*)\]")
+_RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
+
+
+def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
+    """Reads a file of levels.
+
+    Args:
+        path: A file whose name ends in ``.txt`` or ``.json``, or a run's ``curriculum.jsonl``.
+        kind: Class of the levels, whose ``from_text`` reads their drawings.
+
+    Returns:
+        Levels of batch shape ``[]`` by their names, in the file's order.
+
+    Raises:
+        ValueError: If the file holds something else; the message names the file and the level.
+        StorageError: If it cannot be read.
+    """
+    path = Path(path)
+    _check_suffix(path, (*SUFFIXES, RECORD))
+    content = read_bounded(path, LARGEST_FILE)
+    try:
+        text = content.decode("utf-8-sig")  # some editors begin a file with a mark
+        if path.suffix == ".json":
+            return levels_from_json(text, kind)
+        if path.suffix == RECORD:
+            return levels_from_record(text, kind)
+        return levels_from_text(text, path.stem, kind)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> None:
+    """Writes a file of levels; one that exists is replaced.
+
+    Args:
+        path: As in :func:`read_levels`.
+        levels: Levels of batch shape ``[]`` by their names.
+
+    Raises:
+        ValueError: If the name of the file or of a level cannot be used, or a goal is out of reach.
+        StorageError: If the disk cannot take it.
+    """
+    path = Path(path)
+    _check_suffix(path, SUFFIXES)
+    text = levels_to_json(levels) if path.suffix == ".json" else levels_to_text(levels)
+    write_atomically(path, text.encode())
+
+
+def shipped_sets() -> list[str]:
+    """Names of the sets that come with the package."""
+    return sorted(file.stem for file in _HERE.glob("*.txt"))
+
+
+def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
+    """The levels of a set that comes with the package; an agent that turns looks to the right.
+
+    Args:
+        name: Of the set.
+        kind: Class of the levels.
+
+    Raises:
+        ValueError: If there is no such set.
+    """
+    if name not in shipped_sets():
+        raise ValueError(f"{name}: there is no such set of levels; there are {shipped_sets()}")
+    return read_levels(_HERE / f"{name}.txt", kind)
+
+
+def chosen_levels(
+    name: str,
+    distributions: Mapping[str, Callable[[], L]],
+    suffixes: Sequence[str],
+    read: Callable[[str], dict[str, L]],
+    shipped: Callable[[str], dict[str, L]],
+    known: str,
+) -> tuple[dict[str, L], bool]:
+    """The levels that a user names, and whether they are those of a distribution.
+
+    Args:
+        name: Of a file, a distribution or a set that comes along.
+        distributions: What gives the levels of each, by its name.
+        suffixes: Of files.
+        read: Reads a file.
+        shipped: Reads a set that comes along.
+        known: What there is, in words.
+
+    Raises:
+        ValueError: If there is no such thing.
+        StorageError: If a file cannot be read.
+    """
+    if Path(name).suffix in suffixes:
+        if not Path(name).exists():
+            raise ValueError(f"--levels {name}: there is no such file")
+        return read(name), False
+    for distribution, sample in distributions.items():
+        if name.casefold() == distribution.casefold():
+            levels: Any = sample()
+            return {f"{distribution}_{i:03}": levels[i].cpu() for i in range(len(levels))}, True
+    if name in shipped_sets():
+        return shipped(name), False
+    raise ValueError(f"--levels {name}: must be one of: {known}")
+
+
+def levels_from_text(
+    text: str, unnamed: str = "level", kind: type[Level] = Level
+) -> dict[str, Level]:
+    """Reads levels drawn with one character per cell.
+
+    Args:
+        text: For each level a line ``[name]``, perhaps a line ``path_length: 12``, and the rows of
+            its drawing as :meth:`Level.from_text` reads them. Blank lines, and lines that begin
+            with a semicolon, are ignored.
+        unnamed: Name of a level drawn before the first name.
+        kind: As in :func:`read_levels`.
+
+    Raises:
+        ValueError: If a line or level is not like that, a name occurs twice, there is no level, or
+            a path length is not that of the level.
+    """
+    drawn: list[tuple[str, list[str], int | None]] = []
+    for line in map(str.strip, text.splitlines()):
+        header, record = _HEADER.fullmatch(line), _RECORD.fullmatch(line)
+        if not line or line.startswith(";"):
+            continue
+        if header or not drawn:
+            drawn.append((header[1].strip() if header else unnamed, [], None))
+        name, rows, _ = drawn[-1]
+        if record:
+            drawn[-1] = (name, rows, int(record[1]))
+        elif not header:
+            rows.append(line)
+    return named_levels(drawn, kind)
+
+
+def levels_from_json(text: str, kind: type[Level] = Level) -> dict[str, Level]:
+    """Reads levels from JSON.
+
+    Args:
+        text: ``{"levels": [{"name": "hall", "level": ["S..", "..G"], "path_length": 3}]}``; the
+            path length may be missing.
+        kind: As in :func:`read_levels`.
+
+    Raises:
+        ValueError: As :func:`levels_from_text`.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError("is no JSON") from None
+    items = content.get("levels") if isinstance(content, dict) else None
+    if not isinstance(items, list):
+        raise ValueError('must be an object with a list "levels"')
+    return named_levels([_from_item(number, item) for number, item in enumerate(items, 1)], kind)
+
+
+def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]:
+    """Reads the levels of a run's ``curriculum.jsonl``, those too whose goal is out of reach.
+
+    Args:
+        text: One JSON object per line: ``updates``, ``seed`` and ``levels``, each of which has its
+            drawing as ``text``, with the Solver's episode in it. A last line without its newline
+            was interrupted, and is left out.
+        kind: As in :func:`read_levels`.
+
+    Returns:
+        Levels by updates and place in the batch, as ``update_00010_1``, of several seeds by these,
+        too, as ``seed_0_update_00010_1``.
+
+    Raises:
+        ValueError: If a line is not like that, or there is no level.
+    """
+    found: dict[tuple[int, str], Level] = {}
+    for number, line in enumerate(text.split("\n")[:-1], 1):
+        try:
+            row = json.loads(line)
+            seed, updates = int(row["seed"]), int(row["updates"])
+            for nth, level in enumerate(row["levels"], 1):
+                drawn = "\n".join(recorded_drawing(level))
+                found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
+        except (
+            KeyError,
+            TypeError,
+            AttributeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+        ) as error:
+            raise ValueError(f"line {number} is no record of mazes") from error
+    if not found:
+        raise ValueError("holds no levels")
+    several = len({seed for seed, _ in found}) > 1
+    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in found.items()}
+
+
+def levels_to_text(levels: Mapping[str, Level]) -> str:
+    """Draws levels; the inverse of :func:`levels_from_text`, with their path lengths."""
+    return "\n".join(
+        f"[{name}]\npath_length: {length}\n{level.to_text()}\n"
+        for name, level, length in _checked(levels)
+    )
+
+
+def levels_to_json(levels: Mapping[str, Level]) -> str:
+    """Writes levels as JSON; the inverse of :func:`levels_from_json`, with their path lengths."""
+    items = [
+        {"name": name, "path_length": length, "level": level.to_text().splitlines()}
+        for name, level, length in _checked(levels)
+    ]
+    return json.dumps({"levels": items}, indent=1) + "\n"
+
+
+def _from_item(number: int, item: Any) -> tuple[str, list[str], int | None]:
+    if not isinstance(item, dict) or not {"name", "level"} <= item.keys():
+        raise ValueError(f'level {number}: must be an object with a "name" and a "level"')
+    unknown = sorted(item.keys() - {"name", "level", "path_length"})
+    if unknown:
+        raise ValueError(f"level {number}: there is no such key as {unknown[0]!r}")
+    name, rows, length = item["name"], item["level"], item.get("path_length")
+    if not isinstance(name, str):
+        raise ValueError(f"level {number}: its name must be text, got {name!r:.80}")
+    if not isinstance(rows, list) or not all(isinstance(row, str) for row in rows):
+        raise ValueError(f"level {name!r:.80}: must be a list of rows, each of them text")
+    if length is not None and type(length) is not int:
+        raise ValueError(f"level {name!r:.80}: path_length must be whole, got {length!r:.80}")
+    return name, rows, length
+
+
+def named_levels(
+    drawn: Sequence[tuple[str, Sequence[str], int | None]], kind: type[Level] = Level
+) -> dict[str, Level]:
+    """Levels of names, rows of a drawing and, where it is known, the length of the shortest path.
+
+    Raises:
+        ValueError: As :func:`levels_from_text`.
+    """
+    levels: dict[str, Level] = {}
+    for name, rows, recorded in drawn:
+        if name in levels:
+            raise ValueError(f"level {name!r:.80}: the name occurs twice")
+        try:
+            levels[name] = kind.from_text("\n".join(rows))
+        except ValueError as error:
+            reason = str(error).partition(", got")[0]
+            raise ValueError(f"level {name!r:.80}: {reason}") from error
+        _check_length(name, levels[name], recorded)
+    if not levels:
+        raise ValueError("holds no levels")
+    return levels
+
+
+def _checked(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
+    if not levels:
+        raise ValueError("there must be at least one level to write")
+    return [(name, level, _check_length(name, level)) for name, level in levels.items()]
+
+
+def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
+    """The length of the level's shortest path, if it is the one recorded."""
+    usable = name.strip() == name and name.isprintable() and not set(name) & set("[]")
+    if not usable or not 0 < len(name) <= LONGEST_NAME:
+        raise ValueError(
+            f"level {name!r:.80}: a name has 1 to {LONGEST_NAME} printable characters, no brackets"
+        )
+    length = int(shortest_path_length(level))
+    if length < 0:
+        raise ValueError(f"level {name!r}: the goal cannot be reached")
+    if recorded not in (None, length):
+        raise ValueError(
+            f"level {name!r}: path_length is {recorded}, but the shortest path has {length} moves"
+        )
+    return length
+
+
+def _check_suffix(path: Path, known: Sequence[str]) -> None:
+    if path.suffix not in known:
+        raise ValueError(f"{path}: must end in one of {', '.join(known)}")

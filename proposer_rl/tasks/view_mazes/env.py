@@ -1,0 +1,162 @@
+"""The field's maze as a TorchRL environment: an agent that turns, moves and sees 5x5 cells."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import pad
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+
+from proposer_rl.tasks.mazes.level_env import LevelEnv
+from proposer_rl.tasks.mazes.levels import cell_index
+from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
+
+LEFT, RIGHT, FORWARD = range(3)
+EMPTY, WALL, GOAL = 1, 2, 8
+"""Objects by MiniGrid's numbers."""
+
+VIEW = 5  # cells on a side of what is seen
+RIM = VIEW - 1  # of walls around the grid, so that all that is seen is in memory
+AGENT = (VIEW // 2, VIEW - 1)  # where the agent is in its view
+PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
+
+
+class ViewMazeEnv(LevelEnv):
+    """The maze of PAIRED, PLR, ACCEL, SFL and their libraries; a batch of them.
+
+    - Action: int64 ``[*B]``, 0 turn left, 1 turn right, 2 move forward. A move into an obstacle or
+      out of the grid leaves the agent where it is.
+    - Observation, what a Solver sees: ``"view"``, uint8 ``[*B, 5, 5]``, and ``"direction"``, int64
+      ``[*B]``, 0 right, 1 down, 2 left, 3 up. The view shows the cells before the agent: 1 empty, 2
+      wall, 8 goal, as MiniGrid's ``image[:, :, 0]`` with ``agent_view_size=5`` and
+      ``see_through_walls=True``, which are the field's. The first index runs from the agent's left
+      to its right, the second from afar to near; the agent is at ``[2, 4]`` and not shown. Walls
+      hide nothing; outside of the grid there are walls.
+    - State besides: ``"agent"``, ``"step_count"``
+    (:class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`),
+      and ``"is_init"``, bool ``[*B, 1]``, whether an episode begins, as TorchRL calls it.
+    - Reward: float32 ``[*B, 1]``, 1 - 0.9 t / ``max_steps`` on entering the goal with step t, else
+      0.
+    - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
+      elsewhere.
+
+    Args:
+        levels: Levels of any batch shape ``[*B]``, valid
+            (:func:`~proposer_rl.tasks.view_mazes.levels.validate_view_levels`).
+        max_steps: Step limit of an episode.
+
+    Raises:
+        ValueError: If ``max_steps`` is less than 1.
+
+    Example:
+        >>> env = ViewMazeEnv(ViewLevel.from_text("^.G"))
+        >>> state = env.reset()
+        >>> for action in (1, 2, 2):  # right, forward, forward
+        ...     state = env.step(state.set("action", torch.tensor(action)))["next"]
+        >>> state["reward"], state["terminated"]
+        (tensor([0.9892]), tensor([True]))
+    """
+
+    def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
+        super().__init__(levels, max_steps)
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        batch, (height, width) = self.batch_size, self._grid
+        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
+        self.observation_spec = Composite(
+            view=Bounded(EMPTY, GOAL, (*batch, VIEW, VIEW), dtype=torch.uint8),
+            direction=Categorical(len(AHEAD), shape=batch),
+            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
+            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
+            is_init=Binary(1, (*batch, 1), dtype=torch.bool),
+            shape=batch,
+        ).to(self.device)
+        self.action_spec = Categorical(3, shape=batch, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        self.done_spec = self._ends()
+
+    def _tabulate(self, levels: ViewLevel) -> None:
+        """Takes levels up as one line of objects, of all grids with their rims one after another.
+
+        A place is a number of a cell in that line.
+        """
+        device, count = self.device, self.batch_size.numel()
+        rows, width = (side + 2 * RIM for side in self._grid)
+        self._width = width
+        walls = pad(levels.walls, (RIM,) * 4, value=True).reshape(count, rows * width)
+        objects = torch.where(walls, WALL, EMPTY).to(torch.uint8)
+        goal = cell_index(levels.goal + RIM, width).reshape(count, 1)
+        self._objects = objects.scatter_(1, goal, GOAL).flatten()
+        self._origin = torch.arange(count, device=device).view(self.batch_size) * (rows * width)
+        self._moves, self._ahead, self._seen = _directions(width, device)
+        self._first_view = self._view(self._place(levels.start), levels.direction)
+
+    def _first(self) -> dict[str, Tensor]:
+        return {
+            "view": self._first_view.clone(),
+            "direction": self._levels.direction.clone(),
+            "agent": self._levels.start.clone(),
+            "is_init": torch.ones(*self.batch_size, 1, dtype=torch.bool, device=self.device),
+        }
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action, direction = tensordict.get("action"), tensordict.get("direction")
+        forward = action == FORWARD
+        turned = (direction + torch.where(action == LEFT, -1, 1)) & 3
+        direction = torch.where(forward, direction, turned)
+        place = self._place(tensordict.get("agent"))
+        ahead = place + self._ahead.take(direction)
+        there = self._objects.take(ahead)
+        moved = forward & (there != WALL)
+        place = torch.where(moved, ahead, place)
+        terminated = (forward & (there == GOAL)).unsqueeze(-1)
+        self._agent = tensordict.get("agent") + self._moves[direction] * moved.unsqueeze(-1)
+        ends = self._after(terminated, tensordict)
+        reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
+        return TensorDict(
+            {
+                "view": self._view(place, direction),
+                "direction": direction,
+                "agent": self._agent,
+                "is_init": torch.zeros_like(terminated),
+                **ends,
+                "reward": reward,
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+    def _place(self, agent: Tensor) -> Tensor:
+        return cell_index(agent + RIM, self._width) + self._origin
+
+    def _view(self, place: Tensor, direction: Tensor) -> Tensor:
+        seen = self._seen.index_select(0, direction.flatten())  # [N, 25]
+        cells = (seen + place.reshape(-1, 1).int()).flatten()
+        view = self._objects.index_select(0, cells).view(*place.shape, VIEW, VIEW)
+        view[..., AGENT[0], AGENT[1]].fill_(EMPTY)
+        return view
+
+
+@cache
+def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """What a direction means in a line of grids of some width, of each of the four.
+
+    Made once: from numbers of the host, which a recorded reset must not ask for.
+
+    Returns:
+        The move forward [4, 2], the change of place that it makes [4], and the changes of place
+        from the agent to the cells that it sees, int32 [4, 25].
+    """
+    ahead = torch.tensor(AHEAD)
+    right = ahead.roll(-1, 0)
+    across, along = torch.meshgrid(
+        torch.arange(VIEW) - AGENT[0], AGENT[1] - torch.arange(VIEW), indexing="ij"
+    )
+    seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
+    # int32: half the memory to go through.
+    tables = ahead, cell_index(ahead, width), cell_index(seen, width).flatten(1).int()
+    return tuple(table.to(device) for table in tables)  # type: ignore[return-value]

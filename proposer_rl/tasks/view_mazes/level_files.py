@@ -1,0 +1,137 @@
+"""The user's files of the field's levels: drawings, jaxued's module, MiniGrid's encodings."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from proposer_rl.runs.folder import read_bounded
+from proposer_rl.tasks.mazes.level_files import (
+    LARGEST_FILE,
+    RECORD,
+    named_levels,
+    read_levels,
+)
+from proposer_rl.tasks.mazes.levels import FREE, WALL, drawn_rows
+from proposer_rl.tasks.mazes.levels import GOAL as GOAL_MARK
+from proposer_rl.tasks.view_mazes.env import EMPTY, GOAL
+from proposer_rl.tasks.view_mazes.env import WALL as WALL_NUMBER
+from proposer_rl.tasks.view_mazes.levels import AGENTS, ViewLevel
+
+SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
+FLOOR, AGENT = 3, 10  # MiniGrid's numbers of further objects
+MARKS = {EMPTY: FREE, FLOOR: FREE, WALL_NUMBER: WALL, GOAL: GOAL_MARK}
+
+
+def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
+    """Reads a file of levels; nothing in it is executed.
+
+    - ``.txt``, ``.json`` and a run's ``curriculum.jsonl``: as
+      :func:`~proposer_rl.tasks.mazes.level_files.read_levels`; the start is one of ``>``, ``v``,
+      ``<``
+      and ``^``, or an ``S`` that looks to the right. A single drawing of jaxued's is such a file.
+    - ``.py``: a module such as jaxued's ``environments/maze/level.py``: every text in it that is
+      assigned to a name and drawn like that is a level of this name.
+    - ``.npy``, or a list in ``.json``: MiniGrid's encoding of one grid, [W, H, 3], or of several of
+      one size, [n, W, H, 3], with the agent in it, as ``FullyObsWrapper`` has it. A border of walls
+      is left out.
+
+    Returns:
+        Levels of batch shape ``[]`` by their names, in the file's order.
+
+    Raises:
+        ValueError: If the file holds something else; the message names the file.
+        StorageError: If it cannot be read.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{path}: must end in one of {', '.join(SUFFIXES)}")
+    content = read_bounded(path, LARGEST_FILE)
+    encoded = path.suffix == ".npy"
+    if path.suffix == ".json":
+        encoded = content.lstrip().startswith(b"[")
+    if not encoded and path.suffix != ".py":
+        return cast(dict[str, ViewLevel], read_levels(path, ViewLevel))
+    try:
+        drawn = _encoded(content, path) if encoded else _assigned(content)
+        named = [(name, rows, None) for name, rows in drawn.items()]
+        return cast(dict[str, ViewLevel], named_levels(named, ViewLevel))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _assigned(content: bytes) -> dict[str, list[str]]:
+    """Rows of the drawings that a module assigns to names."""
+    try:
+        body = ast.parse(content).body
+    except (SyntaxError, RecursionError, MemoryError):
+        raise ValueError("is no Python module") from None
+    return {
+        target.id: drawn_rows(statement.value.value)
+        for statement in body
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
+        and isinstance(statement.value, ast.Constant)
+        and isinstance(statement.value.value, str)
+        and _is_drawing(statement.value.value)
+        for target in getattr(statement, "targets", [getattr(statement, "target", None)])
+        if isinstance(target, ast.Name)
+    }
+
+
+def _is_drawing(text: str) -> bool:
+    marks = set("".join(text.split()))
+    return GOAL_MARK in marks and bool(marks & set(AGENTS)) and marks <= {*AGENTS, *MARKS.values()}
+
+
+def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
+    """Rows of MiniGrid's encodings."""
+    try:
+        if path.suffix == ".npy":
+            array: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
+        else:
+            array = np.array(json.loads(content))
+    except (ValueError, EOFError, RecursionError, MemoryError):
+        raise ValueError("is no array of numbers") from None
+    if not isinstance(array, np.ndarray) or not array.size:
+        raise ValueError("is no array of numbers")
+    if array.ndim not in (3, 4) or array.shape[-1] != 3 or array.dtype.kind not in "iu":
+        raise ValueError(
+            "must be MiniGrid's encoding of grids, whole numbers [W, H, 3] or [n, W, H, 3], got "
+            f"{array.dtype} {list(array.shape)}"
+        )
+    if array.ndim == 3:
+        return {path.stem: list(_drawn(array, path.stem))}
+    names = [f"{path.stem}_{number}" for number in range(len(array))]
+    return {name: list(_drawn(grid, name)) for name, grid in zip(names, array, strict=True)}
+
+
+def _drawn(grid: NDArray[Any], name: str) -> Iterator[str]:
+    """Rows of one grid [W, H, 3] of objects, colours and states."""
+    objects, states = grid[..., 0].T, grid[..., 2].T  # [H, W]
+    border = [objects[0], objects[-1], objects[:, 0], objects[:, -1]]
+    if min(objects.shape) > 2 and all((side == WALL_NUMBER).all() for side in border):
+        objects, states = objects[1:-1, 1:-1], states[1:-1, 1:-1]
+    if (objects == AGENT).sum() != 1:
+        raise ValueError(
+            f"level {name!r}: must have one agent (object {AGENT}), as FullyObsWrapper shows it"
+        )
+    for row, state in zip(objects.tolist(), states.tolist(), strict=True):
+        marks = []
+        for number, direction in zip(row, state, strict=True):
+            if number == AGENT and 0 <= direction < len(AGENTS):
+                marks.append(AGENTS[direction])
+            elif number in MARKS:
+                marks.append(MARKS[number])
+            else:
+                raise ValueError(
+                    f"level {name!r}: object {number} with state {direction} is none of this maze's"
+                )
+        yield "".join(marks)

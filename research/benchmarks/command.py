@@ -1,0 +1,162 @@
+"""Measure what ``bin/bench`` was asked, print tables, write a JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+
+from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import SIGNALLED
+from proposer_rl.runs.folder import write_atomically
+from research.benchmarks.curricula import read_methods
+from research.benchmarks.peer import require_jaxued
+from research.benchmarks.registry import BENCHMARKS, selected
+from research.benchmarks.report import describe, machine, summary, versions
+from research.benchmarks.results import Options, Result, Size
+from research.benchmarks.worker import BenchmarkFailed, run_apart
+
+FAILED = 1
+TERMINATED = SIGNALLED + signal.SIGTERM
+
+
+def answer(arguments: argparse.Namespace) -> None:
+    """Ends with 0 if all was measured, 1 if a benchmark failed.
+
+    Raises:
+        ConfigError: for bad input.
+        StorageError: if the results cannot be written.
+    """
+    if arguments.list:
+        _list()
+        return
+    unknown = [name for name in arguments.names if name not in BENCHMARKS]
+    if unknown:
+        raise ConfigError(
+            f"unknown benchmark {unknown[0]!r}; choose among: {', '.join(BENCHMARKS)}"
+        )
+    if not arguments.output.parent.is_dir():
+        raise ConfigError(f"--output: there is no folder {arguments.output.parent}")
+    # Told to end, it ends the benchmark's process too.
+    before = signal.signal(signal.SIGTERM, _terminated)
+    try:
+        sys.exit(run(arguments.names, _options(arguments), arguments.threads, arguments.output))
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def run(names: list[str], options: Options, threads: int | None, output: Path) -> int:
+    """Run benchmarks one after another, each in a process of its own.
+
+    Args:
+        names: of the benchmarks; empty for the default ones.
+        options: for each of them.
+        threads: of torch; None leaves torch's choice.
+        output: the JSON file to write.
+
+    Returns:
+        The exit code.
+    """
+    chosen = selected(names, options.size == "full", options.device.startswith("cuda"))
+    content: dict[str, Any] = {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(options.device),
+        "versions": versions(),
+        "options": asdict(options),
+        "benchmarks": {},
+    }
+    results, start = [], time.perf_counter()
+    for number, name in enumerate(chosen, 1):
+        place = f"[{number}/{len(chosen)}] {name}"
+        _say(f"{place}: {BENCHMARKS[name].about} ...")
+        try:
+            measured = run_apart(name, options, threads)
+        except BenchmarkFailed as failure:
+            measured = {"error": str(failure)}
+            _say(f"{place}: failed\n{failure}")
+        else:
+            results.append(Result.from_json(measured["result"]))
+            memory = f"{measured['peak_memory'] / 2**20:,.0f} MiB at most"
+            _say(f"{place}: {measured['seconds']:.1f} s, {memory}")
+        content["benchmarks"][name] = measured
+        content["seconds"] = time.perf_counter() - start
+        write_atomically(output, json.dumps(content, indent=1).encode())
+    details = [text for result in results if (text := describe(result))]
+    rows = [summary(results)] if any(result.rows for result in results) else []
+    print("\n\n".join([*details, *rows]))
+    if options.tiny:
+        _say("At this size nothing is a measurement: it is to see that everything runs.")
+    _say(f"{content['seconds']:.0f} s. File: {output}")
+    return FAILED if len(results) < len(chosen) else 0
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    device = arguments.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from error
+    size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
+    if arguments.jaxued is not None:
+        _check_jaxued(arguments.jaxued, arguments.names, device)
+    if arguments.runs:
+        _check_runs(arguments.runs, arguments.names)
+    peers = (arguments.jaxued, arguments.runs)
+    return Options(arguments.repeats, arguments.precision, device, size, *peers)
+
+
+def _check_jaxued(python: str, names: list[str], device: str) -> None:
+    if names and "view" not in names:
+        raise ConfigError(
+            f"--jaxued {python}: is for the benchmark view, not for {', '.join(names)}"
+        )
+    if torch.device(device).type != "cpu":
+        raise ConfigError(
+            f"--jaxued {python}: JAX is measured on the CPU; give --device cpu, not {device}"
+        )
+    try:
+        require_jaxued(python)
+    except ValueError as error:
+        raise ConfigError(
+            f"--jaxued {python}: {error}; must be an interpreter that can import jaxued"
+        ) from error
+
+
+def _check_runs(folders: list[str], names: list[str]) -> None:
+    if names != ["curricula"]:
+        raise ConfigError(
+            f"--runs: is for the benchmark curricula, not for {', '.join(names) or 'all'}"
+        )
+    try:
+        read_methods(folders)
+    except ValueError as error:
+        raise ConfigError(f"--runs: {error}") from error
+
+
+def _list() -> None:
+    remarks = {
+        "default": "",
+        "full": " [with --full or by name]",
+        "cuda": " [on a GPU]",
+        "request": " [by name]",
+    }
+    for name, benchmark in BENCHMARKS.items():
+        print(f"{name:<15} {benchmark.about}{remarks[benchmark.on]}")
+
+
+def _terminated(*_: object) -> NoReturn:
+    sys.exit(TERMINATED)
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)

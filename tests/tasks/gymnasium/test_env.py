@@ -1,0 +1,154 @@
+"""The batch is many environments of Gymnasium, each by itself; successes are counted as asked."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from proposer_rl.runs.signals import StopSignals
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
+from proposer_rl.tasks.gymnasium.levels import ParameterSpace, space_bins
+from proposer_rl.tasks.gymnasium.player import MakeEnvironment
+from proposer_rl.tasks.gymnasium.settings import SuccessSettings
+from proposer_rl.tasks.gymnasium.success import Steps, success_rule
+from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
+
+K, P, T = 2, 3, 20
+SPACE = ParameterSpace({name: space_bins(settings) for name, settings in PARAMETERS.items()})
+LEVELS = SPACE.sample(K * P, Streams(0).generator()).reshape(K, P)
+
+
+def make(**more: Any) -> GymnasiumEnv:
+    rule = success_rule(SuccessSettings(kind="terminated"))
+    return GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, **more)
+
+
+def by_hand(level: Any, actions: list[int]) -> list[tuple[Any, float, bool, bool]]:
+    """What a plain loop over Gymnasium's own environment sees: state before, reward, ends."""
+    env: Any = gymnasium.make(WALK, width=level["width"].item())
+    env.unwrapped.engine.speed = level["speed"].item()
+    set_wind(env.unwrapped, level["wind"].item())
+    start = {"seed": level["seed"].item(), "options": {"start": level["begin"].item()}}
+    seen, _ = env.reset(**start)
+    rows = []
+    for action in actions:
+        after, reward, terminated, truncated, _ = env.step(action + 1)
+        rows.append((seen, reward, terminated, truncated))
+        seen = env.reset(**start)[0] if terminated or truncated else after
+    return rows
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_it_is_gymnasium_s_environments_side_by_side(vectorization: Any) -> None:
+    env = make(vectorization=vectorization, reward_scale=0.5)
+    rollout = env.rollout(T, break_when_any_done=False)
+    env.close()
+    assert rollout.batch_size == (K, P, T)
+    ends = 0
+    for k in range(K):
+        for p in range(P):
+            ours = rollout[k, p]
+            rows = by_hand(LEVELS[k, p], ours["action"].tolist())
+            states, rewards, terminated, truncated = zip(*rows, strict=True)
+            np.testing.assert_allclose(ours["observation"], np.stack(states), rtol=1e-6)
+            np.testing.assert_allclose(
+                ours["next", "reward"].squeeze(-1), 0.5 * np.array(rewards), rtol=1e-6
+            )
+            assert ours["next", "terminated"].squeeze(-1).tolist() == list(terminated)
+            assert ours["next", "truncated"].squeeze(-1).tolist() == list(truncated)
+            assert ours["next", "success"].squeeze(-1).tolist() == list(terminated)
+            ends += sum(terminated) + sum(truncated)
+    assert ends > K * P  # episodes began again
+
+
+def test_its_processes_end_when_a_run_does_and_leave_its_signals_alone() -> None:
+    with StopSignals():
+        before = signal.getsignal(signal.SIGTERM)
+        env: Any = make(vectorization="async")
+        env.reset()
+        assert signal.getsignal(signal.SIGTERM) is before is not signal.SIG_DFL
+        for process in env._vector.processes:
+            process.terminate()
+            process.join(60)
+            assert process.exitcode == -signal.SIGTERM
+
+
+def test_its_specs_hold() -> None:
+    check_env_specs(make())
+
+
+def test_levels_are_taken_up_at_the_next_reset() -> None:
+    env = make()
+    env.reset()
+    env.set_levels(SPACE.sample(K * P, Streams(1).generator()).reshape(K, P))
+    after = env.rollout(3, auto_reset=True)["observation"]
+    env.set_levels(LEVELS)
+    torch.testing.assert_close(env.reset()["observation"], make().reset()["observation"])
+    assert not torch.equal(after[:, :, 0], env.reset()["observation"])
+
+
+def test_a_level_becomes_what_a_player_plays() -> None:
+    (play,) = plays(LEVELS[1, 2:], once=True)
+    assert play.seed == LEVELS[1, 2]["seed"] and play.once
+    assert play.values == {name: LEVELS[1, 2][name].item() for name in PARAMETERS}
+    assert isinstance(play.values["begin"], int)
+
+
+STEPS = Steps(
+    terminated=np.array([True, False, True, False]),
+    truncated=np.array([False, True, True, False]),
+    returns=np.array([3.0, 5.0, 1.0, 9.0]),
+    info={"won": np.array([1, 0, 1, 1])},
+)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"kind": "terminated"}, [True, False, True, False]),
+        ({"kind": "survived"}, [False, True, False, False]),
+        ({"kind": "return", "least": 3.0}, [True, True, False, False]),
+        ({"kind": "info", "key": "won"}, [True, False, True, False]),
+        ({"kind": "info", "key": "unheard of"}, [False, False, False, False]),
+    ],
+)
+def test_successes(settings: Any, expected: list[bool]) -> None:
+    assert success_rule(SuccessSettings(**settings))(STEPS).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"kind": "return"}, "success.least: missing"),
+        ({"kind": "info"}, "success.key: missing"),
+        ({"kind": "survived", "least": 1.0}, "success.least: is of no use"),
+        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: is of no use"),
+    ],
+)
+def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        success_rule(SuccessSettings(**settings))
+
+
+def test_returns_count_from_the_start_of_each_episode() -> None:
+    least = 3.0
+    rule = success_rule(SuccessSettings(kind="return", least=least))
+    env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, reward_scale=0.1)
+    rollout = env.rollout(5 * LIMIT, break_when_any_done=False)
+    found = set()
+    for row in rollout.reshape(K * P, -1):
+        total = 0.0
+        for step in row:
+            total += 10 * step["next", "reward"].item()
+            over = step["next", "done"].item()
+            assert step["next", "success"].item() == (over and total >= least)
+            found.add((over, total >= least))
+            total = 0.0 if over else total
+    assert {(True, True), (True, False)} <= found

@@ -1,0 +1,115 @@
+"""Bins, targets and where in the bins targets lie."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium.levels import Bins, ParameterSpace, space_bins, target_bins
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from tests.tasks.gymnasium.toys import PARAMETERS
+
+BINS = {name: space_bins(settings) for name, settings in PARAMETERS.items()}
+TARGET = {name: target_bins(settings) for name, settings in PARAMETERS.items()}
+SPACE = ParameterSpace(BINS)
+
+
+def test_bins_stand_for_their_middles_and_the_last_parameter_runs_fastest() -> None:
+    assert SPACE.axes == {
+        "speed": [0.75, 1.25], "width": [1.0, 2.0], "begin": [0, 1], "wind": [-1, 1],
+    }  # fmt: skip
+    assert SPACE.size == 16
+    for choice in range(16):
+        (level,) = SPACE.generate(torch.tensor([[choice]]), [Streams(choice).generator()])[0]
+        speed, width, begin, wind = (int(digit) for digit in f"{choice:04b}")
+        assert 0.5 + 0.5 * speed <= level["speed"] <= 1.0 + 0.5 * speed
+        assert (level["width"], level["begin"], level["wind"]) == (1 + width, begin, 2 * wind - 1)
+
+
+def test_of_a_bin_all_of_its_range_is_drawn_evenly() -> None:
+    speed = SPACE.generate(torch.full((1, 4000), 15), [Streams(0).generator()])[0]["speed"]
+    counts = torch.histc(speed, 4, min=1.0, max=1.5)
+    assert counts.sum() == 4000 and ((counts - 1000).abs() < 4 * 1000**0.5).all()
+
+
+def test_whole_numbers_stay_whole_and_seeds_differ() -> None:
+    levels = SPACE.sample(100, Streams(0).generator())
+    assert levels["begin"].dtype == levels["wind"].dtype == levels["seed"].dtype == torch.int64
+    assert levels["width"].dtype == torch.float64
+    assert len(set(levels["seed"].tolist())) == 100
+    target = ParameterSpace(TARGET).sample(100, Streams(0).generator())
+    assert {name: entry.dtype for name, entry in target.items()} == {
+        name: entry.dtype for name, entry in levels.items()
+    }
+    assert set(target["begin"].tolist()) == {0, 1} and set(target["wind"].tolist()) == {1}
+    assert 1.0 <= target["speed"].min() < target["speed"].max() <= 1.25
+
+
+NUMBERS = st.floats(-5, 5).map(lambda x: round(x, 2))
+
+
+def intervals(pair: tuple[float, float]) -> Bins:
+    low, high = (torch.tensor([end], dtype=torch.float64) for end in sorted(pair))
+    return Bins(low, high)
+
+
+@given(st.lists(NUMBERS, min_size=1, max_size=5, unique=True), NUMBERS)
+def test_a_value_counts_for_the_nearest_one(values: list[float], target: float) -> None:
+    values = sorted(values)
+    settings = ParameterSettings(values=values, target=target)
+    shares = space_bins(settings).shares(target_bins(settings))
+    nearest = min(abs(value - target) for value in values)
+    (chosen,) = shares.nonzero().flatten().tolist()
+    assert shares[chosen] == 1 and abs(values[chosen] - target) == pytest.approx(nearest)
+
+
+@given(st.integers(1, 5), st.tuples(NUMBERS, NUMBERS).filter(lambda pair: pair[0] != pair[1]))
+def test_a_range_is_divided_among_the_bins_that_it_covers(
+    bins: int, pair: tuple[float, float]
+) -> None:
+    space = space_bins(ParameterSettings(low=-3.0, high=2.0, bins=bins, target=0.0))
+    shares = space.shares(intervals(pair))
+    # An even grid within the target, each point counted for its bin.
+    low, high = sorted(pair)
+    points = low + (high - low) * (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
+    place = ((points + 3.0) / 5.0 * bins).floor().clamp(0, bins - 1).long()
+    counted = place.bincount(minlength=bins) / 20000
+    torch.testing.assert_close(shares, counted.double(), atol=1e-3, rtol=0)
+
+
+def test_shares_of_several_parameters_multiply() -> None:
+    shares = SPACE.shares(ParameterSpace(TARGET))
+    drawn = ParameterSpace(TARGET).sample(200, Streams(0).generator())
+    assert shares.dtype == torch.float32 and float(shares.sum()) == 1
+    fast, wide, windy = drawn["speed"] >= 1, drawn["width"] == 2, drawn["wind"] == 1
+    assert (fast & wide & windy).all()
+    assert shares.nonzero().flatten().tolist() == [0b1101, 0b1111]
+
+
+def test_a_single_bin_lies_in_the_middle() -> None:
+    only = space_bins(ParameterSettings(values=[3], target=3))
+    assert ParameterSpace({"a": only}).coordinates.tolist() == [[0.0]]
+    both = ParameterSpace({"a": only, "b": BINS["width"]})
+    assert both.coordinates.tolist() == [[0.0, -1.0], [0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("given_", "message"),
+    [
+        ({"target": 1.0}, "needs values, or low, high and bins"),
+        ({"target": 1.0, "low": 1.0, "high": 2.0}, "needs values, or low, high and bins"),
+        ({"target": 1.0, "values": [1.0], "bins": 2}, "either values, or low, high and bins"),
+        ({"target": 1.0, "values": [2.0, 1.0]}, r"values=\[2.0, 1.0\] must rise"),
+        ({"target": 1.0, "low": 2.0, "high": 2.0, "bins": 1}, "low=2.0 must be below high=2.0"),
+        ({"target": 1.5, "values": [1, 2]}, r"target=\[1.5\] must be whole"),
+        ({"target": [2.0, 1.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
+        ({"target": [0.0, 1.0, 2.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
+    ],
+)
+def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
+    settings = ParameterSettings(**given_)
+    with pytest.raises(ValueError, match=message):
+        space_bins(settings), target_bins(settings)

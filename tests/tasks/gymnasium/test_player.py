@@ -1,0 +1,178 @@
+"""Levels arrive in the environment, and are the same whatever was played before."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
+    MakeEnvironment,
+    Play,
+    RefusedLevelError,
+    imported,
+)
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK
+
+LEVEL = {"speed": 1.25, "width": 2.0, "begin": 1, "wind": -1}
+CARTPOLE = {
+    "length": ParameterSettings(
+        set="call", name="proposer_rl.tasks.gymnasium.cartpole.set_length", values=[1], target=1
+    ),
+    "mass": ParameterSettings(
+        set="call", name="proposer_rl.tasks.gymnasium.cartpole.set_pole_mass", values=[1], target=1
+    ),
+    "force": ParameterSettings(name="force_mag", values=[1], target=1),
+    "gravity": ParameterSettings(values=[1], target=1),
+}
+
+
+def argument(**more: Any) -> ParameterSettings:
+    return ParameterSettings(set="argument", values=[0], target=0, **more)
+
+
+def test_each_number_gets_where_it_belongs() -> None:
+    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7))
+    inner: Any = player.unwrapped
+    player.reset(seed=99)
+    assert (inner.engine.speed, inner.width, inner.wind) == (1.25, 2.0, -0.1)
+    assert inner.kept == [(7, {"start": 1})]
+    player.play = Play({**LEVEL, "wind": 1}, 8)
+    player.reset()
+    assert player.unwrapped is inner and inner.wind == 0.1  # nothing had to be built
+    player.play = Play({**LEVEL, "width": 1.0}, 8)
+    player.reset()
+    again: Any = player.unwrapped
+    assert again is not inner and (again.width, again.engine.speed) == (1.0, 1.25)
+
+
+def test_once_it_stands_still_after_an_episode() -> None:
+    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7, once=True))
+    for _ in range(2):
+        player.play = Play({**LEVEL, "speed": 0.5}, 7, once=True)
+        player.reset()
+        ends = [player.step(1)[3] for _ in range(LIMIT)]
+        assert ends == [False] * (LIMIT - 1) + [True]
+        last = player.reset()[0]
+        for _ in range(2 * LIMIT):
+            seen, reward, terminated, truncated, _ = player.step(2)
+            assert np.array_equal(seen, last) and (reward, terminated, truncated) == (
+                0,
+                False,
+                False,
+            )
+
+
+def steps(player: LevelPlayer, play: Play, count: int = 40) -> list[np.ndarray]:
+    player.play = play
+    numbers = np.random.default_rng(0)
+    seen = [np.asarray(player.reset()[0]).ravel()]
+    for _ in range(count):
+        space: Any = player.action_space
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
+        action = numbers.integers(space.n) if discrete else numbers.uniform(-1, 1, space.shape)
+        now, reward, terminated, truncated, _ = player.step(action)
+        seen.append(np.append(np.asarray(now).ravel(), reward))
+        if terminated or truncated:
+            break
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("env_id", "more", "parameters", "values"),
+    [
+        ("CartPole-v1", {}, CARTPOLE, [(0.5, 0.1, 9.0, 5.0), (1.0, 0.3, 4.0, 20.0)]),
+        (
+            "LunarLander-v3",
+            {"arguments": {"enable_wind": True}},
+            {n: ParameterSettings(values=[1], target=1) for n in ("gravity", "wind_power")},
+            [(-5.0, 10.0), (-10.0, 2.0)],
+        ),
+        (
+            "minigrid:MiniGrid-SimpleCrossingS9N1-v0",
+            {"wrappers": ["minigrid.wrappers.ImgObsWrapper"]},
+            {"size": argument(), "crossings": argument(name="num_crossings")},
+            [(9, 2), (7, 1)],
+        ),
+    ],
+)
+def test_a_level_is_the_same_in_new_and_in_used_environments(
+    env_id: str, more: dict, parameters: dict, values: list
+) -> None:
+    make = MakeEnvironment(env_id, **more)
+    one, other = (dict(zip(parameters, row, strict=True)) for row in values)
+    used = LevelPlayer(make, parameters, Play(one, 0))
+    played = [
+        steps(used, play)
+        for play in (Play(one, 5), Play(other, 9), Play(one, 5), Play(one, 5), Play(other, 5))
+    ]
+    fresh = steps(LevelPlayer(make, parameters, Play(other, 1)), Play(one, 5))
+    for again in (played[2], played[3], fresh):
+        assert len(again) == len(played[0])
+        assert all(np.array_equal(a, b) for a, b in zip(again, played[0], strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(played[4], played[0], strict=False))
+
+
+def test_a_longer_pole_obeys_the_equations_of_motion() -> None:
+    """Barto, Sutton and Anderson 1983, without friction, with the pole's half length and masses."""
+    length, mass, force, gravity = 0.8, 0.3, 7.0, 15.0
+    values = {"length": length, "mass": mass, "force": force, "gravity": gravity}
+    player = LevelPlayer(MakeEnvironment("CartPole-v1"), CARTPOLE, Play(values, 3))
+    _, speed, angle, turn = map(float, player.reset()[0])
+    seen = player.step(1)[0]
+    total = 1.0 + mass
+    push = (force + mass * length * turn**2 * math.sin(angle)) / total
+    turning = (gravity * math.sin(angle) - math.cos(angle) * push) / (
+        length * (4 / 3 - mass * math.cos(angle) ** 2 / total)
+    )
+    moving = push - mass * length * turning * math.cos(angle) / total
+    assert seen[1] == pytest.approx(speed + 0.02 * moving, abs=1e-5)
+    assert seen[3] == pytest.approx(turn + 0.02 * turning, abs=1e-5)
+
+
+def test_continuous_actions_go_from_minus_one_to_one() -> None:
+    parameters = {"g": ParameterSettings(values=[10.0], target=10.0)}
+    make, play = MakeEnvironment("Pendulum-v1"), Play({"g": 10.0}, 4)
+    player = LevelPlayer(make, parameters, play)
+    for action, torque in ((0.5, 1.0), (-1.0, -2.0), (3.0, 2.0)):
+        plain = gymnasium.make("Pendulum-v1", g=10.0)
+        plain.reset(seed=4)
+        player.reset()
+        ours = player.step(np.array([action], np.float32))
+        theirs = plain.step(np.array([torque], np.float32))
+        assert ours[0] == pytest.approx(theirs[0]) and ours[1] == pytest.approx(theirs[1])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "values", "message"),
+    [
+        (
+            {"lenght": ParameterSettings(values=[1], target=1)},
+            {"lenght": 1},
+            "Walk has no attribute 'lenght'; numbers that it has: width, wind",
+        ),
+        ({"width": argument()}, {"width": -1}, "refuses width=-1: ValueError: width must be"),
+        ({"wdth": argument()}, {"wdth": 1}, "refuses wdth=1: TypeError: .* argument 'wdth'"),
+        (
+            {"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)},
+            {"a": 1},
+            "refuses a=1: TypeError",
+        ),
+    ],
+)
+def test_what_the_environment_refuses_is_told(parameters: dict, values: dict, message: str) -> None:
+    with pytest.raises(RefusedLevelError, match=message):
+        player = LevelPlayer(MakeEnvironment(WALK), parameters, Play(values, 0))
+        player.reset()
+        player.reset()
+
+
+@pytest.mark.parametrize("name", ["nothing", "math.nothing", "nowhere.at_all", "math.pi"])
+def test_what_cannot_be_imported_is_told(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        imported(name)

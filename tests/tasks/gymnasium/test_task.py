@@ -1,0 +1,328 @@
+"""Environments of Gymnasium as tasks: wrong input, pictures, and the commands."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from proposer_rl.cli.build import make_task
+from proposer_rl.extras import install_command
+from proposer_rl.runs.folder import read_csv
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium import pictures
+from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
+from tests.same_run import assert_same_run
+from tests.tasks.gymnasium.toys import PARAMETERS, TINY, Walk, walk_task
+from tests.test_docs import TRAIN, write_files
+from tests.tiny import composed
+
+NO_BOX2D = pytest.mark.skipif(
+    sys.version_info >= (3, 14) and find_spec("Box2D") is None,
+    reason="Box2D would have to be compiled for this Python",
+)
+
+
+def picture(record: dict[str, Any]) -> np.ndarray:
+    file = io.BytesIO(base64.b64decode(record["picture"]))
+    return np.asarray(Image.open(file).convert("RGB")).astype(int)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"env_id": "Nowhere-v0"}, "env_id=Nowhere-v0: Environment `Nowhere` doesn't exist"),
+        ({"env_id": "nowhere:Walk-v0"}, "env_id=nowhere:Walk-v0: a package is missing; install it"),
+        ({"parameters": {}}, "parameters: at least one"),
+        (
+            {"parameters": {"seed": PARAMETERS["width"]}},
+            "parameters.seed: is a column of what is told of training",
+        ),
+        (
+            {"parameters": {"width": ParameterSettings(values=[2.0, 1.0], target=1.0)}},
+            r"parameters.width: values=\[2.0, 1.0\] must rise",
+        ),
+        (
+            {"parameters": {"weight": ParameterSettings(values=[1.0], target=1.0)}},
+            "parameters: Walk has no attribute 'weight'; numbers that it has: width, wind",
+        ),
+        (
+            {
+                "parameters": {
+                    "width": ParameterSettings(
+                        set="argument", low=-1.0, high=2.0, bins=2, target=1.0
+                    )
+                }
+            },
+            "parameters: .*Walk-v0 refuses width=-1: ValueError: width must be positive",
+        ),
+        (
+            {
+                "parameters": {
+                    "a": ParameterSettings(set="call", name="nowhere.f", values=[1], target=1)
+                }
+            },
+            "parameters.a.name: 'nowhere.f': cannot be imported",
+        ),
+        (
+            {"parameters": {"a": ParameterSettings(set="call", values=[1], target=1)}},
+            "parameters.a.name: missing",
+        ),
+        (
+            {"parameters": {"updates": PARAMETERS["width"]}},
+            "parameters.updates: is a column of what is told of training",
+        ),
+        (
+            {"parameters": {"entropy": PARAMETERS["width"]}},
+            "parameters.entropy: is a column of what is told of training",
+        ),
+        (
+            {"wrappers": ["tests.tasks.gymnasium.test_task.with_whole_actions"]},
+            r"action space Box.*int64\): there is a policy for .* a Box \[D\] of floats",
+        ),
+        ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
+        ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
+        ({"arguments": {"foo": 1}}, "arguments and parameters: .*unexpected keyword"),
+        (
+            {
+                "env_id": "tests.tasks.gymnasium.test_task:Grown-v0",
+                "parameters": {"size": ParameterSettings(set="argument", values=[3, 5], target=3)},
+            },
+            "parameters.size: all levels must show and take the same, but 5 changes",
+        ),
+        (
+            {"wrappers": ["tests.tasks.gymnasium.test_task.as_dictionary"]},
+            "observation space Dict.*FlattenObservation",
+        ),
+        ({"env_id": "tests.tasks.gymnasium.test_task:Endless-v0"}, "max_steps: missing"),
+    ],
+)
+def test_wrong_input_is_told_in_a_line(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        walk_task(**changed)
+    assert "\n" not in str(caught.value)
+
+
+def with_whole_actions(env: Any) -> Any:
+    whole = gymnasium.spaces.Box(0, 1, (1,), np.int64)
+    return gymnasium.wrappers.TransformAction(env, lambda action: int(action[0]), whole)
+
+
+def as_dictionary(env: Any) -> Any:
+    return gymnasium.wrappers.TransformObservation(
+        env, lambda seen: {"a": seen}, gymnasium.spaces.Dict({"a": env.observation_space})
+    )
+
+
+gymnasium.register("Endless-v0", Walk)
+
+
+class Grown(gymnasium.Env[Any, Any]):
+    """Shows as many numbers as it is asked for."""
+
+    def __init__(self, size: int, render_mode: str | None = None) -> None:
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (size,))
+        self.action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, **_: object) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(self.observation_space.shape, np.float32), {}
+
+
+gymnasium.register("Grown-v0", Grown, max_episode_steps=5)
+
+
+def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(*_: object, **__: object) -> None:
+        raise gymnasium.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr(gymnasium, "make", make)
+    line = install_command("box2d")
+    with pytest.raises(ValueError) as caught:
+        walk_task(extra="box2d")
+    assert line in str(caught.value) and "Box2D is not installed" in str(caught.value)
+
+
+def test_evaluations_take_no_process_for_each_level() -> None:
+    task = walk_task(vectorization="async")
+    levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
+    kinds = [type(task._env(levels, once=once)._vector) for once in (True, False)]
+    assert kinds == [gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv]
+
+
+def test_what_the_environment_needs_can_be_put_around_it() -> None:
+    task = walk_task(
+        wrappers=[
+            "tests.tasks.gymnasium.test_task.as_dictionary",
+            "gymnasium.wrappers.FlattenObservation",
+        ]
+    )
+    assert task.learner([Streams(0)]).env.observation_spec["observation"].shape == (1, 4, 2)
+
+
+def test_the_target_lies_where_the_settings_say() -> None:
+    shares = walk_task().target_shares.reshape(2, 2, 2, 2)
+    assert shares[1, 1, :, 1].tolist() == [0.5, 0.5]
+
+
+def test_statistics_and_returns_are_those_of_the_environment() -> None:
+    task = walk_task()
+    learner = task.learner([Streams(0)])
+    levels = task.space.sample(4, Streams(1).generator()).unsqueeze(0)
+    learner.env.set_levels(levels)
+    rollout = learner.collect([Streams(2).generator()])
+    told = task.statistics(levels, rollout)
+    first = [row.tolist().index(True) + 1 for row in rollout["next", "done"][0].squeeze(-1)]
+    rewards = rollout["next", "reward"][0].squeeze(-1) / 0.5
+    returns = [float(row[:end].sum()) for row, end in zip(rewards, first, strict=True)]
+    assert float(told["train_return"][0]) == pytest.approx(np.mean(returns), rel=1e-5)
+    assert float(told["speed"][0]) == pytest.approx(float(levels["speed"].mean()))
+
+
+@pytest.mark.parametrize(
+    "failure", [None, gymnasium.error.DependencyNotInstalled("pygame"), RuntimeError("no OpenGL")]
+)
+def test_pictures_show_the_level_and_the_episode(
+    failure: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = failure is None
+    if failure is not None:
+
+        def render(self: object) -> None:
+            raise failure
+
+        monkeypatch.setattr(pictures.LevelPlayer, "render", render)
+    task: Any = make_task(composed("task=cartpole", "+method=target", *TINY))
+    learner = task.learner([Streams(0)])
+    choices = torch.tensor([[0, task.space.size - 1, 0, 0]])
+    levels = task.space.generate(choices, [Streams(0).generator()])
+    learner.env.set_levels(levels)
+    rollout = learner.collect([Streams(2).generator()])
+    still, moved = task.record(levels[0], None), task.record(levels[0], rollout[0])
+    assert max(picture(still[0]).shape[:2]) == pictures.LONGER_SIDE
+    assert not np.array_equal(picture(still[0]), picture(still[1]))
+    assert (task.facts["key"] == pictures.KEY) is drawn
+    assert np.array_equal(picture(still[0]), picture(moved[0])) is not drawn
+    assert still[0]["text"][0] == "half length 0.1"
+    assert still[0]["level"]["seed"] == int(levels["seed"][0, 0])
+
+
+@pytest.mark.parametrize("image", [False, True])
+def test_of_images_and_continuous_actions_it_learns(image: bool) -> None:
+    walls = ["minigrid.wrappers.ImgObsWrapper"]
+    size = ParameterSettings(set="argument", name="goal_velocity", values=[0.0], target=0.0)
+    changed: dict[str, Any] = {"env_id": "MountainCarContinuous-v0", "parameters": {"goal": size}}
+    if image:
+        size = ParameterSettings(set="argument", values=[5, 6], target=6)
+        changed = {
+            "env_id": "minigrid:MiniGrid-Empty-5x5-v0", "wrappers": walls,
+            "parameters": {"size": size}, "max_steps": 8,
+        }  # fmt: skip
+    task = walk_task(network=NetworkSettings(hidden=[8], channels=[4]), **changed)
+    learner = task.learner([Streams(0), Streams(1)])
+    before = learner.snapshot()
+    levels = task.target.sample(8, Streams(0).generator()).reshape(2, 4)
+    learner.env.set_levels(levels)
+    draws = [Streams(copy).generator() for copy in range(2)]
+    rollout, _ = learner.update(draws)
+    learner.check()
+    assert not (learner.snapshot() == before).all()
+    if not image:
+        assert rollout["action"].shape == (2, 4, 8, 1) and rollout["action"].std() > 0.3
+        assert task.probe(learner.agent, levels[0]).shape == (2, 4, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "answers"),
+    [
+        ("cartpole", (4,), 2),
+        pytest.param("lunar_lander", (8,), 4, marks=NO_BOX2D),
+        ("minigrid", (7, 7, 3), 7),
+    ],
+)
+def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: int) -> None:
+    task: Any = make_task(composed(f"task={name}", "+method=target", *TINY))
+    learner = task.learner([Streams(0)])
+    levels = task.target.sample(4, Streams(1).generator())
+    learner.env.set_levels(levels.unsqueeze(0))
+    rollout = learner.collect([Streams(2).generator()])
+    assert rollout["observation"].shape == (1, 4, 12, *shape)
+    assert task.probe(learner.agent, levels).shape == (1, 4, answers)
+    start, later = task.record(levels[:1], None), task.record(levels[:1], rollout[0, :1])
+    assert picture(start[0]).std() > 1 and not np.array_equal(picture(start[0]), picture(later[0]))
+    assert task.target_shares.count_nonzero() == 1  # all three targets are a bin's
+
+
+METHODS = [
+    "perf_gain", "target", "domain_randomization", "hand_designed", "plr", "robust_plr", "alp_gmm",
+    "learning_progress curriculum.source=episodes", "first_order_sampled", "currot", "paired",
+    "sfl +score=sampled", "ncc +score=sampled", "regret +score=sampled", "pace +score=sampled",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize("method", METHODS)
+def test_curricula_run_from_the_command_line(method: str, train: Any) -> None:
+    assert train("task=cartpole", *f"+method={method}".split(), *TINY, "hydra.run.dir=run") == 0
+    rows = read_csv(Path("run/metrics.csv"))
+    assert [row["updates"] for row in rows] == [0, 2, 4]
+    assert {"target_success", "target_return", "all_success", "all_return"} <= rows[0].keys()
+    told = json.loads(Path("run/run.json").read_text())["task"]
+    assert told["title"] == "CartPole-v1" and told["exact"] is False
+
+
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("regret", "does not know the largest return"),
+        ("pace", "gradient_norm needs gradients"),
+        ("first_order_gain", "gradients"),
+        ("first_order_proposer", "gradients"),
+        ("accel", "GymnasiumTask has no edit("),
+    ],
+)
+def test_what_the_task_cannot_tell_is_refused(
+    method: str, message: str, train: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train("task=cartpole", f"+method={method}", *TINY, "hydra.run.dir=run") == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+    assert not Path("run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_folder")
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(train: Any) -> None:
+    run = ("task=cartpole", "+method=perf_gain", "schedule.checkpoint_every=2", *TINY)
+    assert train(*run, "hydra.run.dir=whole") == 0
+    shutil.copytree("whole", "run")
+    Path("run/summary.json").unlink()
+    newest = max(Path("run/checkpoints").glob("*.pt"), key=lambda path: path.stat().st_mtime)
+    newest.unlink()  # as if the run had been killed after the one before
+    assert train(*run, "hydra.run.dir=run") == 0
+    assert_same_run(Path("whole"), Path("run"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_folder")
+def test_the_file_that_the_page_shows_is_all_that_is_needed(train: Any) -> None:
+    (command,) = [call for call in TRAIN if "task=hill" in call]
+    write_files(Path())
+    assert train(*command, *TINY, "hydra.run.dir=run") == 0
+    told = json.loads(Path("run/run.json").read_text())["task"]
+    assert told["title"] == "MountainCar-v0"
+    assert told["space"] == {
+        "force": pytest.approx([0.001, 0.002, 0.003, 0.004]), "gravity": [0.001, 0.0025]
+    }  # fmt: skip

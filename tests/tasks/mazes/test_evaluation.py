@@ -1,0 +1,346 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binom, norm
+from torch import Tensor
+
+from proposer_rl.tasks.mazes import Level, generate_levels
+from proposer_rl.tasks.mazes.evaluation import (
+    ExactEvaluator,
+    RolloutEvaluator,
+    optimal_return,
+    policy_path,
+    worst_mean,
+)
+from tests.tasks.mazes.oracles import distances, moved, play, random_levels
+
+UP, DOWN, LEFT, RIGHT = range(4)
+
+
+def random_logits(*shape: int, seed: int = 0, scale: float = 1.0) -> Tensor:
+    return scale * torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def constant_logits(probabilities: list[float], height: int, width: int) -> Tensor:
+    return torch.tensor(probabilities).log().view(4, 1, 1).expand(4, height, width)
+
+
+def by_dense_matrix(
+    level: Level, policy: Tensor, max_steps: int, step_penalty: float
+) -> tuple[float, float]:
+    """Return and success by repeated multiplication with the chain's whole matrix, in float64."""
+    height, width = level.walls.shape
+    goal = level.goal[0] * width + level.goal[1]
+    matrix = torch.zeros(height * width, height * width, dtype=torch.float64)
+    for cell in range(height * width):
+        for action in range(4):
+            row, column = moved(level, divmod(cell, width), action)
+            matrix[cell, row * width + column] += policy[action].flatten()[cell].double()
+    matrix[goal] = 0
+    matrix[goal, goal] = 1
+    state = torch.zeros(height * width, dtype=torch.float64)
+    state[level.start[0] * width + level.start[1]] = 1
+    total = 0.0
+    for _ in range(max_steps):
+        before, state = state, state @ matrix
+        total += (state[goal] - before[goal] - step_penalty * (1 - before[goal])).item()
+    return total, state[goal].item()
+
+
+@settings(max_examples=30)
+@given(
+    size=st.tuples(st.integers(1, 6), st.integers(2, 6)),
+    seed=st.integers(0, 10_000),
+    max_steps=st.integers(0, 40),
+    greedy=st.booleans(),
+    scale=st.sampled_from([0.0, 1.0, 30.0]),
+)
+def test_exact_values_agree_with_the_dense_chain(
+    size: tuple[int, int], seed: int, max_steps: int, greedy: bool, scale: float
+) -> None:
+    levels = random_levels(4, *size, 0.3, seed)
+    logits = random_logits(4, 4, *size, seed=seed, scale=scale)
+    result = ExactEvaluator(max_steps, 0.05, greedy)(
+        levels.reshape(2, 2), logits.unflatten(0, (2, 2))
+    )
+    assert result.batch_size == (2, 2)
+    policy = logits.softmax(1)
+    if greedy:
+        policy = torch.zeros_like(logits).scatter(1, logits.argmax(1, keepdim=True), 1.0)
+    for i, level in enumerate(levels):
+        expected = by_dense_matrix(level, policy[i], max_steps, 0.05)
+        found = result["return"].flatten()[i].item(), result["success"].flatten()[i].item()
+        assert found == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize("length", [1, 4, 9])
+def test_corridor_has_a_closed_form(length: int) -> None:
+    """Right with probability p, else up, which does not move: a negative binomial waiting time."""
+    p, limit, penalty = 0.6, 12, 0.03
+    level = Level.from_text("." * 2 + "S" + "." * (length - 1) + "G" + "...")
+    logits = constant_logits([1 - p, 1e-30, 1e-30, p], 1, level.walls.shape[1])
+    result = ExactEvaluator(limit, penalty)(level, logits)
+    arrived = [1 - binom.cdf(length - 1, steps, p) for steps in range(limit + 1)]
+    assert result["success"].item() == pytest.approx(arrived[limit], abs=1e-6)
+    steps = sum(1 - arrived[step] for step in range(limit))
+    assert result["return"].item() == pytest.approx(arrived[limit] - penalty * steps, abs=1e-6)
+
+
+def test_exact_agrees_with_episodes_of_the_environment() -> None:
+    levels = generate_levels([0.2] * 12, 3, 5, 5, generator=torch.Generator().manual_seed(0))
+    logits = random_logits(12, 4, 5, 5, scale=0.5)
+    episodes = 4000
+    exact = ExactEvaluator()(levels, logits)
+    played = RolloutEvaluator(episodes=episodes, generator=torch.Generator().manual_seed(1))(
+        levels, logits
+    )
+    bound = norm.isf(1e-4)  # two-sided, so 1 in 200 for the 24 comparisons together
+    success = exact["success"]
+    assert success.min() > 0.02 and success.max() < 0.98
+    error = (success * (1 - success) / episodes).sqrt()
+    assert ((played["success"] - success).abs() < bound * error).all()
+    # A return is a success minus at most 25 steps of 0.01, so its deviation is at most this much.
+    error = error + 0.125 / episodes**0.5
+    assert ((played["return"] - exact["return"]).abs() < bound * error).all()
+
+
+def test_rollout_means_are_over_first_episodes_only() -> None:
+    """A policy that walks straight to the goal earns one success, though the horizon goes on."""
+    levels = Level.from_text(["S.G", "SG."])
+    logits = constant_logits([1e-30, 1e-30, 1e-30, 1.0], 1, 3).expand(2, 4, 1, 3)
+    for greedy in (False, True):
+        result = RolloutEvaluator(10, 0.125, episodes=3, greedy=greedy)(levels, logits)
+        assert result["success"].tolist() == [1.0, 1.0]
+        assert result["return"].tolist() == [0.75, 0.875]
+
+
+@pytest.mark.parametrize("source", ["call", "evaluator"])
+def test_generator_determines_the_rollouts(source: str) -> None:
+    levels, logits = random_levels(20, 4, 4, 0.2, 0), random_logits(20, 4, 4, 4)
+
+    def success(seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        torch.rand(seed)  # the global state does not matter
+        if source == "call":
+            return RolloutEvaluator(episodes=3)(levels, logits, generator)["success"]
+        return RolloutEvaluator(episodes=3, generator=generator)(levels, logits)["success"]
+
+    assert torch.equal(success(1), success(1))
+    assert not torch.equal(success(1), success(2))
+
+
+def test_copies_play_with_the_same_numbers_in_any_company() -> None:
+    levels, logits = random_levels(12, 4, 4, 0.2, 0), random_logits(3, 12, 4, 4, 4)
+
+    def returns(copies: slice) -> Tensor:
+        generator, own = torch.Generator().manual_seed(0), logits[copies]
+        return RolloutEvaluator(episodes=3)(levels.expand(len(own), 12), own, generator)["return"]
+
+    together = returns(slice(3))
+    assert torch.equal(returns(slice(1, 3)), together[1:])
+    assert not torch.equal(together[0], together[1])
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10_000), greedy=st.booleans())
+def test_success_is_a_probability_that_grows_with_the_step_limit(seed: int, greedy: bool) -> None:
+    levels = random_levels(8, 5, 5, 0.3, seed)
+    logits = random_logits(8, 4, 5, 5, seed=seed)
+    limits = [0, 1, 2, 5, 10, 25, 60]
+    success = torch.stack(
+        [ExactEvaluator(limit, greedy=greedy)(levels, logits)["success"] for limit in limits]
+    )
+    assert (success[0] == 0).all() and (success <= 1 + 1e-6).all()
+    assert (success.diff(dim=0) >= -1e-6).all()
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000))
+def test_greedy_policies_agree_with_a_simulator(seed: int) -> None:
+    """Both evaluators and the path; equal logits, of which the first counts, are common here."""
+    levels = random_levels(6, 3, 4, 0.2, seed)
+    logits = random_logits(6, 4, 3, 4, seed=seed).round()
+    exact = ExactEvaluator(9, 0.25, greedy=True)(levels, logits)
+    played = RolloutEvaluator(9, 0.25, greedy=True)(levels, logits)
+    paths = policy_path(levels, logits, max_steps=9)
+    assert (paths.shape, paths.dtype) == ((6, 10, 2), torch.int64)
+    for i, level in enumerate(levels):
+        cell, path, rewards = tuple(level.start.tolist()), [level.start.tolist()], []
+        for _ in range(9):
+            scores = logits[i, :, cell[0], cell[1]].tolist()
+            one_step = Level(level.walls, torch.tensor(cell), level.goal, batch_size=[])
+            cell, reward, terminated, _ = next(play(one_step, [scores.index(max(scores))], 9, 0.25))
+            path.append(list(cell))
+            rewards.append(reward)
+            if terminated:
+                break
+        success = float(path[-1] == level.goal.tolist())
+        for result in (exact[i], played[i]):
+            assert result["success"].item() == pytest.approx(success)
+            assert result["return"].item() == pytest.approx(sum(rewards))
+        assert paths[i].tolist() == path + path[-1:] * (10 - len(path))
+
+
+def test_single_levels_are_evaluated_as_they_are_in_a_batch() -> None:
+    levels, logits = random_levels(3, 4, 4, 0.2, 0), random_logits(3, 4, 4, 4)
+    together = ExactEvaluator()(levels, logits)
+    for i in range(3):
+        alone = ExactEvaluator()(levels[i], logits[i])
+        assert alone.batch_size == ()
+        assert alone["return"].item() == pytest.approx(together["return"][i].item())
+        assert torch.equal(policy_path(levels[i], logits[i]), policy_path(levels, logits)[i])
+
+
+def test_logits_of_an_expanded_batch_are_left_as_they_were() -> None:
+    levels = random_levels(3, 4, 4, 0.2, 0).expand(5, 3)
+    logits = random_logits(5, 3, 4, 4, 4).requires_grad_()
+    before = logits.detach().clone()
+    assert not ExactEvaluator()(levels, logits)["return"].requires_grad
+    assert torch.equal(logits, before)
+
+
+def test_no_episodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        RolloutEvaluator(episodes=0)
+
+
+def best_play(level: Level, max_steps: int, step_penalty: float) -> float:
+    """The largest return by trying all sequences of actions, without those that repeat a state."""
+    goal, best = tuple(level.goal.tolist()), -step_penalty * max_steps
+    here = {tuple(level.start.tolist())}
+    for step in range(1, max_steps + 1):
+        here = {moved(level, cell, action) for cell in here for action in range(4)}
+        if goal in here:
+            best = max(best, 1 - step_penalty * step)
+            here.remove(goal)  # the episode ends there
+    return best
+
+
+@settings(max_examples=60)
+@given(
+    size=st.tuples(st.integers(1, 4), st.integers(2, 4)),
+    fraction=st.sampled_from([0.0, 0.3, 0.6]),
+    max_steps=st.integers(1, 12),
+    step_penalty=st.sampled_from([0.0, 0.01, 0.5, 3.0]),
+    seed=st.integers(0, 10_000),
+)
+def test_the_optimum_is_what_the_best_sequence_of_actions_gets(
+    size: tuple[int, int], fraction: float, max_steps: int, step_penalty: float, seed: int
+) -> None:
+    levels = random_levels(4, *size, fraction, seed)
+    expected = [best_play(level, max_steps, step_penalty) for level in levels]
+    found = optimal_return(levels.reshape(2, 2), max_steps, step_penalty)
+    assert (found.shape, found.dtype) == ((2, 2), torch.float32)
+    assert found.flatten().tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def shortest_path_logits(level: Level) -> Tensor:
+    """A policy that goes to a neighbour which is nearer to the goal: float [4, H, W]."""
+    logits = torch.zeros(4, *level.walls.shape)
+    away = distances(Level(level.walls, level.goal, level.start, batch_size=[]))
+    for cell, distance in away.items():
+        for action in range(4):
+            if away[moved(level, cell, action)] < distance:
+                logits[(action, *cell)] = 1.0
+    return logits
+
+
+@pytest.mark.parametrize(("moves", "expected"), [(25, 1 - 25 * 0.01), (26, -25 * 0.01)])
+def test_by_default_an_episode_has_the_papers_25_moves(moves: int, expected: float) -> None:
+    corridor = Level.from_text(f"S{'.' * (moves - 1)}G")
+    reached = ExactEvaluator(greedy=True)(corridor, shortest_path_logits(corridor))["return"]
+    assert reached.item() == pytest.approx(expected, abs=1e-5)
+    assert optimal_return(corridor).item() == pytest.approx(expected, abs=1e-5)
+
+
+@settings(max_examples=30)
+@given(max_steps=st.integers(1, 15), seed=st.integers(0, 10_000))
+def test_the_optimum_is_reached_on_a_shortest_path_and_passed_by_no_policy(
+    max_steps: int, seed: int
+) -> None:
+    levels = random_levels(6, 4, 5, 0.3, seed)
+    optimum = optimal_return(levels, max_steps, 0.02)
+    shortest = torch.stack([shortest_path_logits(level) for level in levels])
+    reached = ExactEvaluator(max_steps, 0.02, greedy=True)(levels, shortest)["return"]
+    torch.testing.assert_close(reached, optimum, rtol=0, atol=1e-5)
+    some = ExactEvaluator(max_steps, 0.02)(levels, random_logits(6, 4, 4, 5, seed=seed, scale=3.0))
+    assert (some["return"] <= optimum + 1e-5).all()
+
+
+def test_the_numbers_of_a_corridor_under_the_uniform_policy() -> None:
+    level = Level.from_text("SG")
+    reached = ExactEvaluator(max_steps=2)(level, torch.zeros(4, 1, 2))
+    success, optimum = reached["success"].item(), optimal_return(level, max_steps=2).item()
+    assert success == 0.4375 and success * (1 - success) == 0.24609375
+    assert reached["return"].item() == pytest.approx(0.42)
+    assert optimum == pytest.approx(0.99)
+    assert optimum - reached["return"].item() == pytest.approx(0.57)
+
+
+@given(
+    values=st.lists(st.floats(0, 1, width=32), min_size=1, max_size=12),
+    tenths=st.integers(1, 10),
+)
+def test_the_worst_mean_counts_the_last_value_in_part(values: list[float], tenths: int) -> None:
+    # Ten of every value make the part a whole number.
+    tenfold = sorted(values * 10)[: len(values) * tenths]
+    expected = sum(tenfold) / len(tenfold)
+    found = worst_mean(torch.tensor([values, values[::-1]]), tenths / 10)
+    assert found.tolist() == pytest.approx([expected] * 2, abs=1e-5)
+
+
+def test_the_worst_mean_of_one_row_is_that_of_the_row_in_a_batch() -> None:
+    values = torch.tensor([[0.5, 0.1, 0.9], [0.3, 0.2, 0.0]])
+    alone = torch.stack([worst_mean(row, 0.5) for row in values])
+    torch.testing.assert_close(alone, worst_mean(values, 0.5))
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    levels = random_levels(3, 3, 4, 0.2, 1)
+    logits = random_logits(3, 4, 3, 4, seed=1).double().requires_grad_()
+    evaluator = ExactEvaluator(max_steps=7, step_penalty=0.1)
+
+    def evaluate(logits: Tensor) -> tuple[Tensor, Tensor]:
+        result = evaluator.differentiable(levels, logits)
+        return result["return"], result["success"]
+
+    assert torch.autograd.gradcheck(evaluate, logits, eps=1e-6, atol=1e-8, rtol=1e-6)
+
+
+def test_what_is_differentiated_is_what_is_evaluated() -> None:
+    levels, logits = random_levels(5, 4, 4, 0.2, 2), random_logits(5, 4, 4, 4).requires_grad_()
+    evaluator = ExactEvaluator(max_steps=9)
+    found, expected = evaluator.differentiable(levels, logits), evaluator(levels, logits)
+    assert found["return"].requires_grad
+    for key in ("return", "success"):
+        assert torch.equal(found[key].detach(), expected[key])
+    with torch.no_grad():
+        assert torch.equal(evaluator.differentiable(levels, logits)["return"], expected["return"])
+
+
+def test_logits_of_half_precision_are_evaluated_in_single() -> None:
+    levels, logits = random_levels(6, 4, 5, 0.3, 0), random_logits(6, 4, 4, 5, scale=3.0)
+    rounded = logits.to(torch.bfloat16)
+    found = ExactEvaluator()(levels, rounded)["return"]
+    expected = ExactEvaluator()(levels, rounded.float())["return"]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+def test_double_precision_is_kept() -> None:
+    levels, logits = random_levels(2, 3, 3, 0.2, 3), random_logits(2, 4, 3, 3).double()
+    result = ExactEvaluator(max_steps=8, step_penalty=0.05)(levels, logits)
+    for i, level in enumerate(levels):
+        expected = by_dense_matrix(level, logits[i].softmax(0), 8, 0.05)
+        assert (result["return"][i].item(), result["success"][i].item()) == pytest.approx(
+            expected, abs=1e-14
+        )
+
+
+def test_a_greedy_policy_is_not_differentiated() -> None:
+    with pytest.raises(ValueError, match="a greedy policy has no gradient"):
+        ExactEvaluator(greedy=True).differentiable(
+            random_levels(1, 3, 3, 0.0, 0), random_logits(1, 4, 3, 3)
+        )

@@ -1,0 +1,153 @@
+"""The field's maze as a task: beyond the contract's own tests, and from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from proposer_rl.cli.instruments import evaluate
+from proposer_rl.cli.train import main as train
+from proposer_rl.runs.folder import read_csv
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.levels import ViewLevel, validate_view_levels
+from tests.commands import call
+from tests.tiny import composed, tiny_view_task
+
+SMOKE = ["task=view_maze_smoke", "compute.progress=false"]
+
+
+def run(folder: Path, *words: str) -> int:
+    """Calls bin/train at the smallest size; returns its exit code."""
+    return call(train, *SMOKE, *words, f"hydra.run.dir={folder}")
+
+
+def test_the_fields_numbers_are_the_default() -> None:
+    config = composed("+method=plr", "task=view_maze", "+as=jaxued")
+    ppo, maze = config.solver.ppo, config.task["maze"]
+    assert (maze["height"], maze["width"], maze["max_steps"]) == (13, 13, 250)
+    assert (config.solver.batch_size, ppo.horizon, ppo.epochs) == (32, 256, 5)
+    assert (ppo.gamma, ppo.lmbda, ppo.learning_rate) == (0.995, 0.95, 1e-4)
+    assert config.task["network"]["memory"] == 256
+    assert config.curriculum["score"] == "max_mc" and config.curriculum["capacity"] == 4000
+
+
+def test_measurements_repeat_and_are_said_to_be_played() -> None:
+    task = tiny_view_task()
+    agent = task.learner([Streams(0)]).agent
+    assert bool((task.measure(agent) == task.measure(agent)).all())
+    assert not task.exact_performance and task.facts["exact"] is False
+
+
+def test_edits_keep_levels_valid_and_their_directions() -> None:
+    task = tiny_view_task()
+    levels = task.space.sample(12, Streams(0).generator()).reshape(2, 6)
+    draws = [Streams(k).generator() for k in range(2)]
+    children = task.edit(levels, 4, draws)  # type: ignore[arg-type]
+    validate_view_levels(children)
+    assert torch.equal(children.direction, levels.direction)
+    assert not (children.walls == levels.walls).all()
+
+
+def test_probes_show_levels_and_where_solvers_go() -> None:
+    task = tiny_view_task()
+    agent = task.learner([Streams(k) for k in range(2)]).agent
+    levels = task.target.sample(3, Streams(0).generator())
+    probes = task.probe(agent, levels)
+    assert probes.shape == (2, 3, 4, 5, 5)
+    assert torch.equal(probes[0, :, 0], levels.walls.float())
+    torch.testing.assert_close(probes[:, :, 3].sum((-2, -1)), torch.ones(2, 3))
+    assert not (probes[:, :, 3] * probes[:, :, 0]).any()  # nobody stands in a wall
+
+
+def test_records_draw_the_direction_and_the_episode() -> None:
+    task = tiny_view_task()
+    level = ViewLevel.from_text([">..\n..G"])
+    forward = ViewMazeEnv(level).rollout(2, lambda td: td.set("action", torch.tensor([2])))
+    (record,) = task.record(level, forward)
+    assert record["text"] == ["> • •", ". . G"] and record["path"] == [[0, 0], [0, 1], [0, 2]]
+    (record,) = task.record(level, None)
+    assert record["text"] == ["> . .", ". . G"]
+
+
+def test_statistics_count_what_can_be_solved_in_time() -> None:
+    task = tiny_view_task()  # 8 steps
+    levels = ViewLevel.from_text([">...G", "<.#.G", "<...G", ">#..G"])
+    env = ViewMazeEnv(levels.unsqueeze(0), max_steps=8)
+    told = task.statistics(levels.unsqueeze(0), env.rollout(8, break_when_any_done=False))
+    assert float(told["solvable"]) == 0.5
+    assert float(told["obstacle_fraction"]) == pytest.approx(0.1)
+
+
+def test_a_run_is_trained_resumed_and_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["+method=accel", "seed=2", "schedule.updates=4"]
+    assert run(tmp_path / "once", *words) == 0
+    rows = read_csv(tmp_path / "once" / "metrics.csv")
+    assert float(rows[-1]["curriculum_frames"]) > 0
+    newest = max((tmp_path / "once" / "checkpoints").iterdir())
+    newest.unlink()
+    assert run(tmp_path / "once", *words) == 0
+    for before, after in zip(rows, read_csv(tmp_path / "once" / "metrics.csv"), strict=True):
+        assert {**before, "seconds": 0} == {**after, "seconds": 0}
+    Path("mine.txt").write_text("[hall]\n>..G\n[turn]\n<.G\n")
+    evaluate(["once", "--levels", "mine.txt", "-o", "scores.json"])
+    scores = {row["level"]: row for row in json.loads(Path("scores.json").read_text())}
+    assert list(scores) == ["hall", "turn"]
+    for row in scores.values():
+        assert row["success_low"] <= row["success"] <= row["success_high"]
+        assert row["success"] * 5 == round(row["success"] * 5)  # of 5 episodes
+        assert row["max_steps"] == 12
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["+method=first_order_gain"], "needs gradients"),
+        (["+method=regret"], "source=exact: ViewMazeTask tells performance by playing"),
+        (["+method=sfl"], "+score=sampled"),
+        (["+method=target", "task.maze.height=4"], "distributions.ood: perfect mazes have odd"),
+        (["+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23 walls"),
+        (
+            ["+method=target", "task.distributions.id.kind=spiral"],
+            "task.distributions.id.kind='spiral': input should be one of 'four_rooms', 'perfect', "
+            "'scattered'",
+        ),
+    ],
+)
+def test_what_does_not_go_is_refused_before_anything_is_written(
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(tmp_path / "none", *words) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and said in lines[0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("file", ["bad.txt", "bad.npy", "missing.py"])
+def test_a_file_that_holds_no_levels_is_refused(
+    file: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(tmp_path / "run", "+method=target", "schedule.updates=2") == 0
+    capsys.readouterr()
+    if not file.startswith("missing"):
+        Path(file).write_text(">#G\n")
+    with pytest.raises(SystemExit) as end:
+        evaluate(["run", "--levels", file, "-o", "scores.json"])
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert end.value.code == 2 and len(lines) == 1 and file in lines[0]
+    assert not Path("scores.json").exists()
