@@ -115,7 +115,7 @@ def test_a_learner_trains_on_the_levels_that_are_set(task: Task) -> None:
         came.append((levels, update.rollout, learner.snapshot()))
     assert same(came[0][2], came[1][2]) and not same(came[0][2], came[2][2])
     levels, rollout, _ = came[0]
-    statistics = task.statistics(levels, rollout)
+    statistics = task.training_metrics(levels, rollout)
     assert statistics.batch_size == (K,) and len(list(statistics.keys())) > 0
     for records in (task.record(levels[0], rollout[0]), task.record(levels[0], None)):
         assert len(json.loads(json.dumps(records))) == P
@@ -147,8 +147,8 @@ def test_solvers_are_measured_and_seen(task: Task) -> None:
     encoder = task.probe_encoder(6)
     assert encoder(probes).shape == (K, C, 6)
     measured = task.measure(agent)
-    assert measured.batch_size == (K,) and set(measured.keys()) == set(task.measurements)
-    for name, performance in task.performances(agent).items():
+    assert measured.batch_size == (K,) and set(measured.keys()) == set(task.metrics)
+    for name, performance in task.evaluate(agent).items():
         assert performance.batch_size[0] == K
         torch.testing.assert_close(performance["success"].mean(1), measured[f"{name}_success"])
 
@@ -160,7 +160,7 @@ def test_what_a_reader_is_told(task: Task) -> None:
         "exact",
     }  # fmt: skip
     for name in facts["distributions"]:
-        assert f"{name}_success" in task.measurements
+        assert f"{name}_success" in task.metrics
         assert all("picture" in record for record in facts["samples"][name])
     assert list(facts["space"]) == list(task.space.axes)
     assert facts == json.loads(json.dumps(task.facts))

@@ -19,11 +19,11 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.tasks.gymnasium.levels import SEED
 from proposer_rl.tasks.gymnasium.networks import checked_spaces
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from proposer_rl.tasks.gymnasium.success import Rule, Steps
+from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
 # A forked process need not import torch again, of which it has no use: TorchRL's choice is spawn.
@@ -38,7 +38,7 @@ class GymnasiumEnv(EnvBase):
     as one. ``reward`` is scaled.
 
     Args:
-        levels: as :class:`~proposer_rl.tasks.gymnasium.levels.ParameterSpace` makes them, [*B].
+        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B].
         make: makes one environment.
         parameters: what differs between levels, by name.
         success: when an episode is one.

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Len
 
 from proposer_rl.settings import settings
+from proposer_rl.tasks.parameters import Number
 
-Number = int | float
 Widths = list[Annotated[int, Ge(1)]]
 
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 
-from proposer_rl.cli.build import make_in_place, make_task
+from proposer_rl.cli.build import make_in_context, make_task
 from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Parts, Workers, proposer
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 from tests.tiny import composed
 
 COPIES = 3
@@ -63,7 +63,7 @@ def make(
     maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
-        return make_in_place(maker, solver, Place(torch.device(device)))
+        return make_in_context(maker, solver, ComputeContext(torch.device(device)))
 
     task = make_task(settings)
     found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)

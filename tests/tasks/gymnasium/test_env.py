@@ -14,10 +14,11 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
-from proposer_rl.tasks.gymnasium.levels import ParameterSpace, space_bins
+from proposer_rl.tasks.gymnasium.levels import space_bins
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.gymnasium.settings import SuccessSettings
 from proposer_rl.tasks.gymnasium.success import Steps, success_rule
+from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 
 K, P, T = 2, 3, 20

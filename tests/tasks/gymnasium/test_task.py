@@ -181,7 +181,7 @@ def test_statistics_and_returns_are_those_of_the_environment() -> None:
     levels = task.space.sample(4, Streams(1).generator()).unsqueeze(0)
     learner.env.set_levels(levels)
     rollout = learner.collect([Streams(2).generator()])
-    told = task.statistics(levels, rollout)
+    told = task.training_metrics(levels, rollout)
     first = [row.tolist().index(True) + 1 for row in rollout["next", "done"][0].squeeze(-1)]
     rewards = rollout["next", "reward"][0].squeeze(-1) / 0.5
     returns = [float(row[:end].sum()) for row, end in zip(rewards, first, strict=True)]

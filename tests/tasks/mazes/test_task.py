@@ -14,7 +14,7 @@ from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import EditableTask, OptimalTask, Place
+from proposer_rl.task import ComputeContext, EditableTask, OptimalTask
 from proposer_rl.tasks.mazes import Level, LevelSpec, shortest_path_length
 from proposer_rl.tasks.mazes.settings import (
     DistributionSettings,
@@ -42,7 +42,7 @@ def test_performance_and_measurements_are_those_of_the_exact_evaluator() -> None
         torch.testing.assert_close(measured[f"id_{kind}"], expected[kind].mean(1))
     # A tenth of eight levels is less than one: the worst.
     torch.testing.assert_close(measured["id_success_worst10"], expected["success"].amin(1))
-    assert set(measured.keys()) == set(TASK.measurements)
+    assert set(measured.keys()) == set(TASK.metrics)
 
 
 def test_evaluation_levels_are_the_same_in_every_run_and_follow_their_seed() -> None:
@@ -67,7 +67,9 @@ def test_another_network_takes_the_unets_place() -> None:
             return maps.split([4, 1], -3)
 
     unused = NetworkSettings(channels=[64, 128, 256, 512])
-    own = tiny_task(make_network=Convolution, network=unused, place=Place(precision="auto"))
+    own = tiny_task(
+        make_network=Convolution, network=unused, context=ComputeContext(precision="auto")
+    )
     assert own.precision == "fp32" and named(own, "shapes")
     solvers = own.learner([Streams(0), Streams(1)])
     assert sum(p.numel() for p in solvers.agent.parameters()) == 2 * (3 * 9 + 1) * 5
@@ -120,7 +122,7 @@ def test_statistics_and_records_of_what_was_trained_on() -> None:
     )
     ppo.env.set_levels(levels)
     rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
-    statistics = TASK.statistics(levels, rollout)
+    statistics = TASK.training_metrics(levels, rollout)
     torch.testing.assert_close(statistics["obstacle_fraction"], torch.full((2,), 0.1))
     torch.testing.assert_close(statistics["path_length"], torch.full((2,), 3.0))
     torch.testing.assert_close(statistics["path_length_sd"], torch.ones(2))
@@ -146,7 +148,7 @@ def test_statistics_of_levels_that_have_no_path_or_too_long_a_one() -> None:
     levels = torch.stack([torch.stack([near, far, walled, near]), torch.stack([walled] * 4)])
     ppo = learners(2)
     ppo.env.set_levels(levels)
-    statistics = TASK.statistics(levels, ppo.collect())
+    statistics = TASK.training_metrics(levels, ppo.collect())
     assert statistics["path_length"].tolist() == pytest.approx([14 / 3, 0])
     variance = (2 * (1 - 14 / 3) ** 2 + (12 - 14 / 3) ** 2) / 3
     assert statistics["path_length_sd"].tolist() == pytest.approx([variance**0.5, 0])
@@ -161,7 +163,7 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
     assert not (edited == levels).all()
     ppo.env.set_levels(edited)
     rollout = ppo.update([Streams(k).generator("actions") for k in (0, 1)]).rollout
-    statistics = TASK.statistics(edited, rollout)
+    statistics = TASK.training_metrics(edited, rollout)
     assert all(bool(value.isfinite().all()) for value in statistics.values())
     assert (statistics["train_success"] <= statistics["solvable"]).all()
     assert statistics["solvable"].min() < 1
@@ -224,7 +226,7 @@ def test_settings_that_do_not_go_together_are_refused_naming_the_key(parts, mess
 
 def named(task: MazeTask, name: str, max_steps: int | None = None) -> dict[str, float]:
     """The step limits of a set's levels."""
-    scores = task.scores(learners(1).agent, name, max_steps)
+    scores = task.level_results(learners(1).agent, name, max_steps)
     return {score.level: score.about["max_steps"] for score in scores}
 
 
@@ -235,7 +237,7 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
     assert set(named(TASK, "ID").values()) == {8}
     agent = learners(1).agent
     usual, *others = (
-        [(score.level, score.results) for score in TASK.scores(agent, name, None)]
+        [(score.level, score.results) for score in TASK.level_results(agent, name, None)]
         for name in ("id@6x6", "ID@6x6", "id@06x6")
     )
     assert usual[0][0] == "id@6x6_000" and others == [usual, usual]

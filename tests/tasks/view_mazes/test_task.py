@@ -77,7 +77,7 @@ def test_statistics_count_what_can_be_solved_in_time() -> None:
     task = tiny_view_task()  # 8 steps
     levels = ViewLevel.from_text([">...G", "<.#.G", "<...G", ">#..G"])
     env = ViewMazeEnv(levels.unsqueeze(0), max_steps=8)
-    told = task.statistics(levels.unsqueeze(0), env.rollout(8, break_when_any_done=False))
+    told = task.training_metrics(levels.unsqueeze(0), env.rollout(8, break_when_any_done=False))
     assert float(told["solvable"]) == 0.5
     assert float(told["obstacle_fraction"]) == pytest.approx(0.1)
 

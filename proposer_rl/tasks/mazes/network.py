@@ -1,40 +1,40 @@
-"""What is wrong with a task's settings: one line that names the key."""
+"""The Solver's U-Net: its settings' network, and which mazes it can see."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from proposer_rl.tasks.mazes.settings import DistributionSettings, MazeSettings, NetworkSettings
+import torch
 
+from proposer_rl.models import UNet
+from proposer_rl.tasks.mazes.settings import MazeSettings, NetworkSettings
 
-def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Make something, naming the key in whatever is wrong with its value."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error
+ACTIONS = 4
+PLANES = 3
 
 
-def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuse names of distributions that there are not."""
-    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
+def unet(settings: NetworkSettings, planes: int) -> UNet:
+    """The network of one Solver, which sees so many planes."""
+    return UNet(
+        in_channels=planes,
+        head_channels=(ACTIONS, 1),
+        channels=settings.channels,
+        groups=settings.groups,
+        head_gains=(settings.policy_gain, settings.value_gain),
+    )
 
 
-def check_paths(
-    maze: MazeSettings, distributions: Mapping[str, DistributionSettings], measured: Iterable[str]
-) -> None:
-    """Refuse a step limit within which some distribution's goals are out of reach."""
-    for name in sorted(measured):
-        longest = max(length for _, length in distributions[name].specifications)
-        if longest > maze.max_steps:
-            raise ValueError(
-                f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length of "
-                f"distributions.{name}, which is measured on: nobody could reach the goal"
-            )
+def faster_precision(channels: Sequence[int], device: torch.device) -> str:
+    """``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
+
+    That is a wide network on a CPU with instructions for it; see docs/benchmark.md.
+
+    Args:
+        channels: of the Solver's network.
+        device: that it runs on.
+    """
+    in_hardware = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 
 def check_network(maze: MazeSettings, network: NetworkSettings) -> None:
@@ -57,7 +57,7 @@ def check_network(maze: MazeSettings, network: NetworkSettings) -> None:
         )
 
 
-def check_size(name: str, size: Sequence[int], network: NetworkSettings) -> None:
+def check_level_size(name: str, size: Sequence[int], network: NetworkSettings) -> None:
     """Refuse a level of a size that the U-Net of the settings cannot see."""
     least = 2 ** (len(network.channels) - 1)
     height, width = size

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import pytest
 import torch
 from torch import Tensor, nn
 
-from proposer_rl.models import Population, UNet, cell_logits, map_actor_critic
-from proposer_rl.tasks.mazes import planes
+from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.task import LevelResult
+from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import RolloutEvaluator
 from proposer_rl.tasks.mazes.level_files import levels_from_text, shipped_levels
-from proposer_rl.tasks.mazes.level_scores import score_levels
 from proposer_rl.tasks.mazes.rendering import draw_level
+from proposer_rl.tasks.mazes.settings import MazeSettings
 from tests.tasks.mazes.oracles import random_levels
+from tests.tiny import tiny_task
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -30,6 +34,16 @@ G
 S#.
 ..G
 """
+
+
+def results(
+    agent: ActorCritic,
+    levels: Mapping[str, Level],
+    limit_of: Callable[[int], int],
+    step_penalty: float = 0.01,
+) -> list[LevelResult]:
+    rules = MazeSettings(height=5, width=5, max_steps=8, step_penalty=step_penalty)
+    return tiny_task(maze=rules).results_of(agent, levels, limit_of)
 
 
 class Always(nn.Module):
@@ -51,7 +65,7 @@ class Always(nn.Module):
 def test_policies_whose_scores_are_known() -> None:
     actions = iter([RIGHT, DOWN])
     solver = map_actor_critic(Population(lambda: Always(next(actions)), 2))
-    scores = score_levels(solver, levels_from_text(HALLS), lambda length: 2 * length, 0.125)
+    scores = results(solver, levels_from_text(HALLS), lambda length: 2 * length, 0.125)
     assert [(s.level, s.solver) for s in scores] == [
         (name, k) for name in ("right", "down", "right too", "blocked") for k in (0, 1)
     ]
@@ -80,7 +94,7 @@ def test_policies_whose_scores_are_known() -> None:
         assert (scores[number].picture() == expected).all()
 
 
-def solvers(per_step: bool = False) -> object:
+def solvers(per_step: bool = False) -> ActorCritic:
     torch.manual_seed(0)
     network = Population(
         lambda: UNet(3 + per_step, channels=(8, 8, 8), groups=4, head_gains=(3.0, 1.0)), 2
@@ -93,8 +107,8 @@ def test_a_level_has_the_same_score_in_any_company() -> None:
     solver = solvers()
     sizes = [(5, 4), (7, 7), (5, 4), (9, 6), (7, 7), (4, 5)]
     levels = {str(i): random_levels(1, *size, 0.1, i)[0] for i, size in enumerate(sizes)}
-    together = score_levels(solver, levels, lambda length: 12)
-    alone = [s for n, v in levels.items() for s in score_levels(solver, {n: v}, lambda length: 12)]
+    together = results(solver, levels, lambda length: 12)
+    alone = [s for n, v in levels.items() for s in results(solver, {n: v}, lambda length: 12)]
     for one, other in zip(together, alone, strict=True):
         assert one[:3] == other[:3] and one.note == other.note
         assert one.results == pytest.approx(other.results, abs=1e-5)
@@ -104,9 +118,9 @@ def test_a_level_has_the_same_score_in_any_company() -> None:
 
 def test_many_levels_go_through_the_network_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = {str(i): level for i, level in enumerate(random_levels(7, 4, 4, 0.1, 0))}
-    whole = score_levels(solvers(), levels, lambda length: 9)
-    monkeypatch.setattr("proposer_rl.tasks.mazes.level_scores.AT_ONCE", 2 * 16)
-    parts = score_levels(solvers(), levels, lambda length: 9)
+    whole = results(solvers(), levels, lambda length: 9)
+    monkeypatch.setattr("proposer_rl.tasks.mazes.task.CELLS_AT_ONCE", 2 * 16)
+    parts = results(solvers(), levels, lambda length: 9)
     for one, other in zip(parts, whole, strict=True):
         assert one[:3] == other[:3] and (one.picture() == other.picture()).all()
         assert one.results == pytest.approx(other.results, abs=1e-5)
@@ -116,7 +130,7 @@ def test_many_levels_go_through_the_network_in_parts(monkeypatch: pytest.MonkeyP
 def test_scores_are_what_playing_gives(per_step: bool) -> None:
     solver = solvers(per_step)
     level = random_levels(1, 5, 7, 0.1, 4)[0]
-    scores = score_levels(solver, {"level": level}, lambda length: 20, 0.05)
+    scores = results(solver, {"level": level}, lambda length: 20, 0.05)
     copies = level.expand(2, 1)
     player = RolloutEvaluator(20, 0.05, episodes=4000, generator=torch.Generator().manual_seed(0))
     played = player(copies, cell_logits(solver, planes(copies)))
@@ -127,7 +141,7 @@ def test_scores_are_what_playing_gives(per_step: bool) -> None:
 
 def test_every_shape_goes_through_the_network() -> None:
     levels = shipped_levels("shapes")
-    scores = score_levels(solvers(), levels, lambda length: 2 * length)
+    scores = results(solvers(), levels, lambda length: 2 * length)
     assert len(scores) == 2 * len(levels)
     assert all(0 <= s.results["success"] <= 1 for s in scores)
     assert {s.results["greedy_success"] for s in scores} <= {0, 1}
