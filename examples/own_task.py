@@ -1,6 +1,6 @@
 """A whole task in forty lines: stop a sledge at a place, on ice, against the wind.
 
-    PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=plr
+    PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=domain_randomization
 
 trains, and what it wrote is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) as
 any other run. `proposer_rl/task.py` has all that can be replaced; a picture, say.

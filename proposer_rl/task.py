@@ -2,7 +2,7 @@
 
 A task is an environment in which Solvers are trained, and how they are measured there. What it
 takes as a level is its own business: a tensordict or tensorclass of any content, whose batch shape
-alone is looked at. K are Solvers, P the levels of one update, T its steps, E validation levels, C
+alone matters. K are Solvers, P the levels of one update, T its steps, E validation levels, C
 probes, N bins.
 
 :class:`Task` asks for three things: levels to draw from, an environment that plays them, and a
@@ -117,7 +117,7 @@ class Task(ABC):
     One word has one meaning. A **performance** is what Solvers reach on levels: return and success.
     To **evaluate** is to find it on the fixed evaluation levels, one by one. **Metrics** are the
     numbers that sum this up (:meth:`measure`), or the training (:meth:`training_metrics`).
-    **Records** are levels to be looked at. **Facts** are what a reader is told of the task.
+    **Records** are levels as pictures and text. **Facts** describe the task for readers.
 
     A task must give :meth:`environment`, :meth:`network`, a ``title``, and call this constructor.
 
@@ -324,7 +324,7 @@ class Task(ABC):
         return TensorDict(means, levels.batch_size[:1])
 
     def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
-        """Levels [n], and what one Solver did there [n, T], for JSON and to be looked at.
+        """Levels [n], and what one Solver did there [n, T], as pictures and text, for JSON.
 
         Each record has a ``picture``, a PNG in base64, and may have ``text``, its lines as they
         are shown in a terminal, and anything else.
@@ -355,7 +355,7 @@ class Task(ABC):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What a reader of a run is told of the task, for JSON.
+        """What readers of a run need to know of the task, for JSON.
 
         - ``title``: of its runs, and ``levels``: what levels are called;
         - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
@@ -515,7 +515,7 @@ def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
 
 
 def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuse names of distributions that there are not.
+    """Refuse unknown names of distributions.
 
     Raises:
         ValueError: naming the key.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +63,19 @@ def tiny_task(**changed: Any) -> MazeTask:
 TASK = tiny_task()
 
 
-def mountain_cars() -> Task:
+def example_task(module: str, name: str) -> Task:
+    """A task of an example, which is imported as a script in its folder would import it."""
     sys.path.insert(0, EXAMPLES)
     try:
-        from mountain_car import MountainCarTask
+        make = getattr(import_module(module), name)
     finally:
         sys.path.remove(EXAMPLES)
     solver = SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2))
-    return MountainCarTask(levels=8, solver=solver, context=ComputeContext())
+    return make(levels=8, solver=solver, context=ComputeContext())
+
+
+mountain_cars = partial(example_task, "mountain_car", "MountainCarTask")
+sledges = partial(example_task, "own_task", "SledgeTask")
 
 
 def tiny_view_task(**changed: Any) -> ViewMazeTask:

@@ -183,35 +183,35 @@ def _check_comparison(options: argparse.Namespace) -> None:
     if output is not None and output.suffix != ".csv":
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
     if options.max_steps is not None and output is not None:
-        raise ConfigError(f"--max-steps: --output {output} would not tell it; leave one out")
+        raise ConfigError(f"--max-steps: --output {output} does not record it; leave one out")
 
 
 def _stored(output: Path | None) -> list[RunScore]:
     return read_scores(output) if output is not None and output.exists() else []
 
 
-def _added(found: list[RunScore], scores: list[RunScore], output: Path | None) -> list[RunScore]:
-    """Scores with those found in place of older ones, as they then stand in the output.
+def _added(new: list[RunScore], scores: list[RunScore], output: Path | None) -> list[RunScore]:
+    """Scores with new ones in place of older ones, as they then stand in the output.
 
     Where there is one it counts as it is by now: other processes may have added to it.
     """
-    if output is None or not found:
-        return _replaced(scores, found)
+    if output is None or not new:
+        return _replaced(scores, new)
     with taking_turns(output):
-        scores = _replaced(_stored(output), found)
+        scores = _replaced(_stored(output), new)
         write_atomically(output, write_scores(scores))
     return scores
 
 
-def _replaced(scores: list[RunScore], found: list[RunScore]) -> list[RunScore]:
-    place = {score[:4] for score in found}
-    return [score for score in scores if score[:4] not in place] + found
+def _replaced(scores: list[RunScore], new: list[RunScore]) -> list[RunScore]:
+    place = {score[:4] for score in new}
+    return [score for score in scores if score[:4] not in place] + new
 
 
 def _missing(
     run: Run, names: Sequence[str], scores: list[RunScore], max_steps: int | None
 ) -> list[RunScore]:
-    """Scores of a run that there are none of yet, or that were of something else."""
+    """Scores of a run that are missing, or were of something else."""
     digests = {name: _digest(run.folder, name) for name in names}
     known = {name: scored(run, scores, name) for name in names}
     todo = [
@@ -233,7 +233,7 @@ def _digest(folder: Path, levels: str) -> str:
     """Of a run's settings and newest checkpoint, and of the levels where they are a file.
 
     Returns:
-        16 hexadecimal digits; nothing for a run without checkpoints, of which nothing can be told.
+        16 hexadecimal digits; nothing for a run without checkpoints.
     """
     checkpoints = checkpoint_files(folder / "checkpoints")
     if not checkpoints:

@@ -92,7 +92,7 @@ def mean_performance(
     """Mean return and share of successes of K Solvers over episodes on levels.
 
     The random numbers are those of the levels, the same for every Solver: they differ by what they
-    do alone, and what one gets does not depend on the company that it is evaluated in.
+    do alone, and what one gets does not depend on which others are evaluated with it.
 
     Args:
         agent: K Solvers.

@@ -40,7 +40,7 @@ class Board(Protocol):
 
     @property
     def sets(self) -> Sequence[str]:
-        """Names of the sets of levels that come along."""
+        """Names of the shipped sets of levels."""
 
     def read(self, rows: Sequence[str]) -> Levels:
         """The level [] that is drawn.

@@ -1,4 +1,4 @@
-"""What there is to see of one run: its levels, and its Solvers on levels."""
+"""One run as the page shows it: its levels, and its Solvers on levels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Load = Callable[[Path], tuple[int, PPO]]
 
 
 class Session:
-    """A run that is looked at; nothing in its folder is changed.
+    """A run that is shown; nothing in its folder is changed.
 
     One thread at a time computes; the others wait.
 

@@ -139,7 +139,7 @@ class LevelVectorEnv(VectorEnv[Any, Any, Any]):
             ValueError: if an action is none.
             gymnasium.error.ResetNeeded: if environments whose episode is over were not reset.
         """
-        actions, count = np.asarray(actions), int(self.single_action_space.n)
+        actions, count = np.asarray(actions), int(self._env.action_spec.n)
         whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == (self.num_envs,)
         if not whole or not ((actions >= 0) & (actions < count)).all():
             raise ValueError(

@@ -82,9 +82,9 @@ class GymnasiumEnv(EnvBase):
             self._returns[:] = 0
             seen, _ = self._vector.reset()
         else:
-            chosen = mask.reshape(-1).numpy()
-            self._returns[chosen] = 0
-            seen, _ = self._vector.reset(options={"reset_mask": chosen})
+            which = mask.reshape(-1).numpy()
+            self._returns[which] = 0
+            seen, _ = self._vector.reset(options={"reset_mask": which})
         # Of these TorchRL takes over only the entries of the environments that are reset.
         return self._batched(observation=seen, success=np.zeros(len(self._returns), np.bool_))
 
@@ -168,5 +168,5 @@ def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:
 
 def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
     """Actions [n, ...] of a policy as environments of a space take them."""
-    chosen = actions.numpy()
-    return chosen + space.start if isinstance(space, spaces.Discrete) else chosen
+    taken = actions.numpy()
+    return taken + space.start if isinstance(space, spaces.Discrete) else taken

@@ -54,7 +54,7 @@ class Camera:
             self._player.reset()
             try:
                 self.works = self._player.render() is not None
-            except Exception:  # a package, a display, a driver: there are the numbers instead
+            except Exception:  # a package, a display, a driver: the numbers are shown instead
                 self.works = False
 
     def pictures(

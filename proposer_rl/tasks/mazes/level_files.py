@@ -74,7 +74,7 @@ def shipped_sets() -> list[str]:
 
 
 def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """The levels of a set that comes with the package; an agent that turns looks to the right.
+    """The levels of a shipped set; an agent that turns looks to the right.
 
     Args:
         name: Of the set.
@@ -156,14 +156,14 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
     Raises:
         ValueError: If a line is not like that, or there is no level.
     """
-    found: dict[tuple[int, str], Level] = {}
+    levels: dict[tuple[int, str], Level] = {}
     for number, line in enumerate(text.split("\n")[:-1], 1):
         try:
             row = json.loads(line)
             seed, updates = int(row["seed"]), int(row["updates"])
             for nth, level in enumerate(row["levels"], 1):
                 drawn = "\n".join(recorded_drawing(level))
-                found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
+                levels[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
         except (
             KeyError,
             TypeError,
@@ -173,10 +173,10 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
             RecursionError,
         ) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
-    if not found:
+    if not levels:
         raise ValueError("holds no levels")
-    several = len({seed for seed, _ in found}) > 1
-    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in found.items()}
+    several = len({seed for seed, _ in levels}) > 1
+    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in levels.items()}
 
 
 def levels_to_text(levels: Mapping[str, Level]) -> str:

@@ -1,4 +1,4 @@
-"""Mazes to be looked at: pictures as arrays of colours, and records of what a Solver did."""
+"""Mazes for readers: pictures as arrays of colours, and records of what a Solver did."""
 
 from __future__ import annotations
 

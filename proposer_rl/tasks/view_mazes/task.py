@@ -1,4 +1,4 @@
-"""The field's maze as a task: Solvers with memory that see 5x5 cells, measured by episodes."""
+"""The partially observable maze as a task: Solvers with memory, measured by episodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ EPISODES_AT_ONCE = 4096  # that are played together on named levels
 
 
 class ViewMazeTask(GridTask):
-    """The field's maze, and Solvers with memory.
+    """The partially observable maze, and Solvers with memory.
 
     A policy with memory has no exact evaluation: everything that is measured is played.
 

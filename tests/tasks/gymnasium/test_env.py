@@ -129,8 +129,8 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
     [
         ({"kind": "return"}, "success.least: missing"),
         ({"kind": "info"}, "success.key: missing"),
-        ({"kind": "survived", "least": 1.0}, "success.least: is of no use"),
-        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: is of no use"),
+        ({"kind": "survived", "least": 1.0}, "success.least: has no effect"),
+        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:

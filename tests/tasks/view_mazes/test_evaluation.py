@@ -96,16 +96,6 @@ def test_playing_all_at_once_is_playing_one_by_one() -> None:
     assert 0 < float(found["success"].mean()) < 1
 
 
-def test_a_solver_gets_the_same_in_any_company() -> None:
-    agent, levels = solvers(), random_levels(E, side=5)
-    shared = performance(agent, levels, 12, 2, generator())
-    own = played_performance(agent, levels.expand(K, E), 12, 2, generator())
-    assert bool((shared == own).all())
-    few = torch.stack([levels, random_levels(E, side=5, seed=5)])
-    other = performance(agent, few, 12, 2, generator())  # type: ignore[arg-type]
-    assert bool((other[0] == shared[0]).all())
-
-
 def test_scripted_solvers_get_what_they_must() -> None:
     levels = ViewLevel.from_text([">..G", "<..G", ">#.G"])
     straight = performance(always(FORWARD), levels, 10, 1, generator())
@@ -138,7 +128,9 @@ def test_scores_count_episodes_and_bound_them() -> None:
     scores = task(8).results_of(agent, levels, lambda n: 5 + n)
     assert [(s.level, s.solver) for s in scores] == [(n, k) for n in levels for k in range(K)]
     # The wide one, of another size than the others, is played alone.
-    alone = performance(agent, levels["wide"].unsqueeze(0), 10, 8, Streams(0, "scores").generator("wide"))
+    alone = performance(
+        agent, levels["wide"].unsqueeze(0), 10, 8, Streams(0, "scores").generator("wide")
+    )
     for score, success in zip(scores[-K:], alone["success"][:, 0].tolist(), strict=True):
         assert score.results["success"] == success
     for score in scores:
