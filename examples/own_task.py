@@ -1,6 +1,6 @@
 """A whole task in forty lines: stop a sledge at a place, on ice, against the wind.
 
-    PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=domain_randomization
+    PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=currot
 
 trains, and what it wrote is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) as
 any other run. `proposer_rl/task.py` has all that can be replaced; a picture, say.
@@ -67,6 +67,7 @@ class SledgeTask(Task):
     def __init__(self, *, levels: int, solver: SolverSettings, context: ComputeContext) -> None:
         space = ParameterSpace({"distance": intervals(1.0, 9.0, 4), "wind": points([0, 1])})
         far = ParameterSpace({"distance": intervals(7.0, 9.0), "wind": points([1])})
+        self.target_shares = space.shares(far)  # for curricula that move towards the target
         distributions = {"target": far, "all": space}
         kinds = {"distributions": distributions, "target": "target", "space": space}
         super().__init__(**kinds, solver=solver, context=context, levels=levels)

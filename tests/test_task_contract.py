@@ -168,7 +168,8 @@ def test_a_solver_reaches_the_same_whatever_is_evaluated_with_it(task: Task) -> 
     own = performance(agent, levels.reshape(K, E))
     for k, some in enumerate((levels[:E], levels[E:])):
         torch.testing.assert_close(own["return"][k], performance(agent, some)["return"][k])
-    assert task.exact_performance or not same(performance(agent, levels, 3), both)
+    if not task.exact_performance and both["success"].any():  # else all episodes are alike
+        assert not same(performance(agent, levels, 3), both)
 
 
 def test_evaluation_levels_are_the_same_in_every_run(task: Task) -> None:

@@ -114,7 +114,9 @@ def mean_performance(
     if count == 0:  # of which there is no environment
         empty = torch.zeros(levels.batch_size)
         return TensorDict({"return": empty, "success": empty.clone()}, levels.batch_size)
-    every: Any = torch.cat([levels] * episodes, 1)
+    # Played in parts, the episodes of a level belong together.
+    side = 1 if at_once is None else 2
+    every: Any = torch.stack([levels] * episodes, side).flatten(1, 2)
     size = at_once or every.batch_size[1]
     parts = []
     for some in every.split(size, 1):
@@ -133,4 +135,5 @@ def mean_performance(
             returns[:, place] += after["reward"].squeeze(-1) * counts / reward_scale
             success[:, place] += (ended & counts).float()
         parts.append(TensorDict({"return": returns, "success": success}, some.batch_size))
-    return torch.cat(parts, 1).unflatten(1, (episodes, count)).mean(1)
+    shape = (episodes, count) if side == 1 else (count, episodes)
+    return torch.cat(parts, 1).unflatten(1, shape).mean(side)

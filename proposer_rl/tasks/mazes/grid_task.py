@@ -35,8 +35,7 @@ class GridTask(Task):
         maze: the inner environment's settings: ``height``, ``width``, ``max_steps`` and others.
         distributions: settings by name.
         target: the name of the one that the Solver is to master.
-        make_distribution: makes one of settings, height and width.
-        make_space: makes the Proposer's bins.
+        space: settings of the Proposer's bins.
         encoder_channels: of the convolutions with which a Proposer reads a probe.
         evaluation: settings: ``distributions``, ``levels``, ``seed`` and ``episodes``.
         solver: the Solver's training.
@@ -69,8 +68,7 @@ class GridTask(Task):
         maze: Any,
         distributions: Mapping[str, Any],
         target: str,
-        make_distribution: Callable[[Any, int, int], Any],
-        make_space: Callable[[], Any],
+        space: Any,
         encoder_channels: Sequence[int],
         evaluation: Any,
         solver: SolverSettings,
@@ -79,18 +77,18 @@ class GridTask(Task):
         check_names(distributions, target, evaluation.distributions)
         self.maze = maze
         self.grid = (maze.height, maze.width)
-        self._kinds, self._make_distribution = dict(distributions), make_distribution
-        self._target = target
+        self.device = torch.device(context.device)  # of what is made next
+        self._kinds, self._target = dict(distributions), target
         self._encoder_channels = encoder_channels
         rules = asdict(maze)
         rules.pop("observe_agent", None)
         super().__init__(
             distributions={
-                name: named(f"distributions.{name}", make_distribution, kind, *self.grid)
+                name: named(f"distributions.{name}", self.make_distribution, kind, *self.grid)
                 for name, kind in distributions.items()
             },
             target=target,
-            space=named("space", make_space),
+            space=named("space", self.make_space, space),
             solver=solver,
             context=context,
             measured_on=evaluation.distributions,
@@ -154,6 +152,14 @@ class GridTask(Task):
             "Measured on": f"{kinds}; {self._levels} fixed levels each"
             + ("" if self.exact_metrics else f", episodes on each: {self.episodes}"),
         }
+
+    @abstractmethod
+    def make_distribution(self, settings: Any, height: int, width: int) -> Any:
+        """The levels of a distribution's settings on a grid."""
+
+    @abstractmethod
+    def make_space(self, settings: Any) -> Any:
+        """The Proposer's bins."""
 
     @abstractmethod
     def fewest_steps(self, levels: Level) -> Tensor:
@@ -259,7 +265,7 @@ class GridTask(Task):
             else:  # the same levels and names however it was spelt
                 size = [int(cells) for cells in asked.group(2, 3)]
                 known = f"{known}@{size[0]}x{size[1]}"
-                grid = named(f"--levels {known}", self._make_distribution, kind, *size)
+                grid = named(f"--levels {known}", self.make_distribution, kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
         if name in shipped_sets():

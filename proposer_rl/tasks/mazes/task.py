@@ -95,10 +95,11 @@ class MazeTask(GridTask, ExactTask):
     ) -> None:
         if make_network is None:
             check_network(maze, network)
-        device = torch.device(context.device)
         if context.precision == "auto":
             own = make_network is not None
-            precision = "fp32" if own else faster_precision(network.channels, device)
+            precision = (
+                "fp32" if own else faster_precision(network.channels, torch.device(context.device))
+            )
             context = context._replace(precision=precision)
         self._network = network
         self._make_network = make_network
@@ -106,15 +107,7 @@ class MazeTask(GridTask, ExactTask):
             maze=maze,
             distributions=distributions,
             target=target,
-            make_distribution=lambda kind, height, width: LevelDistribution(
-                kind.specifications, kind.mechanism, height, width, device
-            ),
-            make_space=lambda: SpecificationSpace(
-                space.obstacle_fractions,
-                space.path_lengths,
-                space.mechanism,
-                *(maze.height, maze.width, device),
-            ),
+            space=space,
             encoder_channels=encoder_channels,
             evaluation=evaluation,
             solver=solver,
@@ -138,6 +131,18 @@ class MazeTask(GridTask, ExactTask):
             else RolloutEvaluator(*self._rules, episodes=evaluation.episodes)
         )
         self.board = MazeBoard(self)
+
+    def make_distribution(
+        self, settings: DistributionSettings, height: int, width: int
+    ) -> LevelDistribution:
+        """The levels of a distribution's settings on a grid."""
+        kind = (settings.specifications, settings.mechanism)
+        return LevelDistribution(*kind, height, width, self.device)
+
+    def make_space(self, settings: SpaceSettings) -> SpecificationSpace:
+        """The Proposer's bins."""
+        axes = (settings.obstacle_fractions, settings.path_lengths)
+        return SpecificationSpace(*axes, settings.mechanism, *self.grid, self.device)
 
     @property
     def target_shares(self) -> Tensor:

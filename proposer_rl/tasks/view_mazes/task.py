@@ -86,13 +86,11 @@ class ViewMazeTask(GridTask):
         self._network = network
         self._named_episodes = evaluation.named_episodes
         self._draws = Streams(evaluation.seed, "scores")  # of named levels
-        device = torch.device(context.device)
         super().__init__(
             maze=maze,
             distributions=distributions,
             target=target,
-            make_distribution=partial(ViewDistribution, device=device),
-            make_space=lambda: ViewSpace(space, maze.height, maze.width, device),
+            space=space,
             encoder_channels=encoder_channels,
             evaluation=evaluation,
             solver=solver,
@@ -100,6 +98,16 @@ class ViewMazeTask(GridTask):
         )
         self.title = f"{maze.height}×{maze.width} mazes seen through 5×5 cells"
         self.board = ViewBoard(self, self._named_episodes, self._draws)
+
+    def make_distribution(
+        self, settings: DistributionSettings, height: int, width: int
+    ) -> ViewDistribution:
+        """The levels of a distribution's settings on a grid."""
+        return ViewDistribution(settings, height, width, self.device)
+
+    def make_space(self, settings: SpaceSettings) -> ViewSpace:
+        """The Proposer's bins."""
+        return ViewSpace(settings, *self.grid, self.device)
 
     @property
     def target_shares(self) -> Tensor:
