@@ -243,7 +243,7 @@ class Task(ABC):
         ``success`` the probability of success, where that has a meaning. An exact evaluation has no
         use for the generator, which is on the CPU.
         """
-        return mean_performance(
+        performance = mean_performance(
             agent,
             self.evaluation_environment,
             for_copies(agent, levels),
@@ -253,7 +253,8 @@ class Task(ABC):
             greedy=self.greedy,
             reward_scale=self.reward_scale,
             at_once=self.episodes_at_once,
-        ).select(*self.results)
+        )
+        return performance if "success" in self.results else performance.exclude("success")
 
     @torch.no_grad()
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from signal import SIGKILL
@@ -78,8 +79,8 @@ def test_the_shortest_task_has_every_command(
     assert 1 <= trained["distance"] <= 9 and 0 <= trained["wind"] <= 1
     watch([str(run), "--once"])
     assert "distance" in capsys.readouterr().out
-    evaluate([str(run), "--levels", "all", "-o", str(tmp_path / "rows.csv")])
-    rows = read_csv(tmp_path / "rows.csv")
+    evaluate([str(run), "--levels", "all", "-o", str(tmp_path / "rows.json")])
+    rows = json.loads((tmp_path / "rows.json").read_text())
     assert len(rows) == 2 * 128 and all(0 <= row["success"] <= 1 for row in rows)
     with pytest.raises(SystemExit):
         evaluate([str(run), "--levels", "here"])
