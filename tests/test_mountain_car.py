@@ -87,7 +87,7 @@ def test_the_shortest_task_has_every_command(
     assert "--levels here: must be one of: target, all" in capsys.readouterr().err
     session = open_session(run)
     assert session.about()["board"] is None and session.about()["task_levels"] == "sledges"
-    drawn = Drawn(source="distribution", name="target", seed=3, checkpoint=4, solver=1)
+    drawn = Drawn(source="distribution", name="target", seed=3, checkpoint=1, solver=1)
     for shown in (session.levels(drawn), session.levels(OfCurriculum(source="curriculum", row=0))):
         assert all(level["picture"] and "wind" in level["text"][1] for level in shown["levels"])
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [along_training])
