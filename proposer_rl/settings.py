@@ -218,8 +218,7 @@ class ComputeSettings:
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
-        graphs: replay updates and evaluations as CUDA graphs on a GPU; untried, so it has to be asked
-            for.
+        graphs: replay updates and evaluations as CUDA graphs on a GPU, where it is untried.
         threads: CPU threads of one operation; None leaves torch's choice.
         cores: copies of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
