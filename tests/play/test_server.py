@@ -123,7 +123,7 @@ def test_every_checkpoint_is_examined_as_the_command_does(
         told = asked(page, "examine", {**EXAMINE, "checkpoint": number, "solver": solver})
         found = evaluate(load(file), str(tmp_path / "drawn.txt"))
         assert told["updates"] == found.updates == 2 * number
-        results = found.scores[solver].results
+        results = found.results[solver].results
         for name in ("success", "return"):
             assert told["results"][name] == pytest.approx(results[name], abs=1e-5)
         successes.add(told["results"]["success"])
@@ -139,7 +139,7 @@ def test_a_solver_with_memory_is_examined_as_the_command_does(
         question = {"checkpoint": number, "solver": 0, "rows": rows}
         told = asked(view_page, "examine", question)
         assert told == asked(view_page, "examine", question)
-        (score,) = evaluate(load(file), str(tmp_path / "drawn.txt")).scores
+        (score,) = evaluate(load(file), str(tmp_path / "drawn.txt")).results
         for name in ("success", "return"):
             assert told["results"][name] == pytest.approx(score.results[name], abs=1e-5)
         paths = told["paths"]
