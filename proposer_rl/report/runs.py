@@ -54,7 +54,7 @@ class Run:
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
         levels: what was reached on every level at the end, [levels], by the measurement's column.
-        sheets: pictures of levels by their captions, as the curriculum told of them last.
+        sheets: pictures of levels by their captions, as the curriculum recorded them last.
     """
 
     folder: Path

@@ -9,12 +9,12 @@ import pytest
 
 from proposer_rl.report.charts import charts
 from proposer_rl.report.comparisons import primary
-from proposer_rl.report.decision import ranking, spread
+from proposer_rl.report.measures import COSTS
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.page import commands, incomplete
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.series import COSTS
 from proposer_rl.report.studies import Study, read_studies
+from research.ranking import ranking, spread
 from tests.report.folders import TASK, cycle, write_run
 
 CYCLES = [cycle(0, [0.1, 0.2], [[1, 1, 1], [1, 1, 1]])]
