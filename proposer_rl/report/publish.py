@@ -123,7 +123,7 @@ def _light(run: Run) -> Run:
 def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
     """A mapping without this machine's folders; of a checkpoint begun with its last two parts.
 
-    Seeds of Proposers are called by the folders above their last lifetimes.
+    Seeds of Proposers are called by the folders above those of their last Solvers.
     """
     text = json.dumps(dict(value))
     if os.path.isabs(reused):

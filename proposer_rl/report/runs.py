@@ -23,7 +23,7 @@ from proposer_rl.report.records import (
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
-_LIFETIME = re.compile(r"lifetime_(\d{1,9})")
+_STUDENT = re.compile(r"lifetime_(\d{1,9})")
 
 
 class Waiting(NamedTuple):
@@ -82,11 +82,9 @@ class Run:
         return str(self.config.get("ablation", "none"))
 
     @property
-    def lifetime(self) -> int | None:
-        """Which Solver of several lifetimes this was, from 0; None for a run of one."""
-        found = (
-            _LIFETIME.fullmatch(self.folder.name) if self.config.get("lifetimes", 1) != 1 else None
-        )
+    def student(self) -> int | None:
+        """Which of several Solvers of one Proposer this was, from 0; None for a lone one."""
+        found = _STUDENT.fullmatch(self.folder.name)
         return int(found[1]) if found else None
 
     @property

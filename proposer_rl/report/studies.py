@@ -229,7 +229,7 @@ def _variant(run: Run) -> dict[str, Any]:
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
     kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
     kept["cycle_length"] = run.config["schedule"].get("cycle_length")
-    kept["lifetime"] = run.lifetime
+    kept["student"] = run.student
     return kept
 
 
@@ -288,7 +288,7 @@ def _groups(runs: Sequence[Run]) -> tuple[Group, ...]:
 
 def _plain_label(run: Run) -> str:
     named = run.method if run.ablation == "none" else f"{run.method}, {run.ablation}"
-    return named if run.lifetime is None else f"{named}, lifetime {run.lifetime}"
+    return named if run.student is None else f"{named}, student {run.student}"
 
 
 def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ FASTER = "Performance gain learns faster than the baseline."
 ALIKE = "Out of distribution the methods end up alike."
 SLIGHTLY = "Performance gain beats task difficulty slightly, not significantly."
 HARDER = "Proposals start easy and grow harder."
-GAINS = "The maximum gain of the replicas stays positive, the mean falls below zero."
+GAINS = "The maximum gain of the replicas stays positive while the mean falls below zero."
 
 
 def verdicts(study: Study) -> dict[str, str]:
