@@ -31,7 +31,8 @@ def section(study: Study, figures: str) -> str:
     ]
     for table in (methods, pairs):
         if table.rows:
-            parts += [f"### {table.title}", table.note, table.to_markdown().strip()]
+            parts += [f"### {escape_markdown(table.title)}", escape_markdown(table.note)]
+            parts.append(table.to_markdown().strip())
     commands = "\n".join(page.commands(study))
     return "\n\n".join([*parts, "### Commands", f"```bash\n{commands}\n```"])
 

@@ -104,7 +104,7 @@ def test_the_page_says_what_was_run_and_what_is_unfinished(report: Path) -> None
 def test_there_are_figures_and_tables_for_other_tools(report: Path) -> None:
     figures = {path.name for path in (report.parent / "figures").iterdir()}
     names = ("learning_curves", "cost", "worst_levels", "difficulty", "gains", "proposals")
-    more = ("worst_share", "level_by_level", "told")
+    more = ("worst_share", "level_by_level", "recorded")
     for name in (*names, *more, "levels", "samples", "diagnostics"):
         for suffix in ("svg", "png"):
             assert f"tiny_scale_2_4_mazes_{name}.{suffix}" in figures
