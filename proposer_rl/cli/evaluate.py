@@ -29,7 +29,9 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
-from proposer_rl.report.generalisation import (
+from proposer_rl.report.reading import UnreadableRun, begun, find_runs
+from proposer_rl.report.runs import Run
+from proposer_rl.report.scores import (
     LONGEST_NAME,
     check_names,
     generalisation_table,
@@ -39,9 +41,7 @@ from proposer_rl.report.generalisation import (
     whole,
     write_scores,
 )
-from proposer_rl.report.generalisation import Score as RunScore
-from proposer_rl.report.reading import UnreadableRun, begun, find_runs
-from proposer_rl.report.runs import Run
+from proposer_rl.report.scores import Score as RunScore
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from proposer_rl.cli.instruments import evaluate
+from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.train import main as train
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
