@@ -140,10 +140,10 @@ def _check_names(
 
 def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
     adapters = _adapters(function)
-    read = {}
-    for name, value in values.items():
-        adapter = adapters.get(name)
-        read[name] = value if adapter is None else _read(name, value, adapter)
+    read = dict(values)
+    for name, adapter in adapters.items():  # in the signature's order: the first is told
+        if name in values and adapter is not None:
+            read[name] = _read(name, values[name], adapter)
     return read
 
 

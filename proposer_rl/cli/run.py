@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,8 @@ def live(
     for lifetime in range(config.lifetimes):
         folder = RunFolder(path / f"lifetime_{lifetime}" if config.lifetimes > 1 else path)
         # What `auto` has become, so that a run goes on in the same precision elsewhere.
-        check_same_run(folder, config.model_copy(update={"precision": made.task.precision}))
+        precision: Any = made.task.precision
+        check_same_run(folder, replace(config, precision=precision))
         scope: tuple[str | int, ...] = ()
         if before is not None:
             scope = ("lifetime", lifetime)

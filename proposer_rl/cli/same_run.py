@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
         ConfigError: naming the settings that differ, or what the folder holds instead of a run.
         StorageError: if the file cannot be read or written.
     """
-    now = config.model_dump(mode="json", exclude=FREE)
+    now = {key: value for key, value in asdict(config).items() if key not in FREE}
     free = FREE_SCHEDULE if config.lifetimes == 1 else FREE_SCHEDULE - {"updates"}
     now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in free}
     file = folder.path / "config.json"
@@ -66,9 +67,8 @@ def as_begun(config: RunConfig, path: Path) -> RunConfig:
         return config
     files = (path / "config.json", path / "lifetime_0" / "config.json")
     begun = next((stored_config(file) for file in files if file.is_file()), None)
-    precision = begun.get("precision") if isinstance(begun, dict) else None
-    known = precision in ("fp32", "bf16")
-    return config.model_copy(update={"precision": precision}) if known else config
+    precision: Any = begun.get("precision") if isinstance(begun, dict) else None
+    return replace(config, precision=precision) if precision in ("fp32", "bf16") else config
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
