@@ -372,7 +372,7 @@ def begun(*arguments: Any) -> float:
 def test_bad_input_gets_one_line_and_exit_code_2(
     arguments, message, train, capsys, monkeypatch
 ) -> None:
-    monkeypatch.setattr("proposer_rl.cli.run.live", begun)
+    monkeypatch.setattr("proposer_rl.cli.run.proceed", begun)
     assert train(*arguments, "hydra.run.dir=run") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ")

@@ -65,7 +65,6 @@ def build(
     made: Made,
     folder: RunFolder,
     signals: StopSignals | None = None,
-    scope: tuple[str | int, ...] = (),
     status: Status | None = None,
 ) -> Experiment:
     """Put an experiment together.
@@ -75,7 +74,6 @@ def build(
         made: as :func:`parts` makes it.
         folder: the run's.
         signals: which may ask the run to stop.
-        scope: of its random draws; empty, or the lifetime.
         status: which tells what the run is doing.
     """
     return Experiment(
@@ -86,7 +84,6 @@ def build(
         log=make_log(config.logger, folder.path, run_name(config)),
         progress=config.compute.progress,
         signals=signals,
-        scope=scope,
         status=status,
     )
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Interval, Len
+from annotated_types import Ge, Len
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -65,7 +65,6 @@ class RunConfig:
     ablation: str
     curriculum: dict[str, Any]
     task: dict[str, Any]
-    lifetimes: Annotated[int, Interval(ge=1, le=LARGEST)]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]
     seeds: Annotated[list[Annotated[int, Ge(0)]], Len(1)]
