@@ -121,7 +121,7 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
             yield _trained(f"cartpole_{method}", "task=cartpole", f"+method={method}", *GYMNASIUM)
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/cartpole_perf_gain", "-o", "report"]
-        yield ["eval", f"{RUN}/target", f"{RUN}/views"]
+        yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))
     elif extra == "alp-gmm":
         # More than 250 episodes, after which a mixture is fitted for the first time.
         yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
