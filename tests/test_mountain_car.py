@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from proposer_rl.cli.instruments import evaluate
+from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.play import open_session
 from proposer_rl.cli.report import main as report
 from proposer_rl.cli.watch import main as watch

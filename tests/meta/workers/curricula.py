@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from proposer_rl.cli.build import make_in_context, make_task
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.meta.rewards import Reward, performance_gain
@@ -41,7 +41,7 @@ def make(
     maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
-        return make_in_context(maker, solver, ComputeContext(torch.device(device)))
+        return maker(solver=solver, context=ComputeContext(torch.device(device)))
 
     task = make_task(settings)
     found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)
