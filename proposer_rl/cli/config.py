@@ -22,6 +22,7 @@ from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ComputeSettings,
+    FilterSettings,
     HandDesignedSettings,
     LoggerSettings,
     PoolSettings,
@@ -63,6 +64,7 @@ class RunConfig(BaseModel):
     scale: str
     ablation: str
     curriculum: dict[str, Any]
+    filter: FilterSettings | None
     task: dict[str, Any]
     lifetimes: Annotated[int, Field(ge=1, le=LARGEST)]
     checkpoint: str | None
@@ -106,7 +108,7 @@ def read_config(config: DictConfig) -> RunConfig:
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
             f"checkpoint={checked.checkpoint}: method={checked.method} takes none; "
-            "frozen_proposer does, and a run goes on with hydra.run.dir=FOLDER"
+            "those with a Proposer do, and a run goes on with hydra.run.dir=FOLDER"
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")

@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
-from proposer_rl.curricula import require_gradients
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -26,6 +25,7 @@ from proposer_rl.meta.rewards import log_success, log_success_gain
 from proposer_rl.meta.signal import performance_at, uneven_shares
 from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
+from proposer_rl.task import DifferentiableTask
 
 CANDIDATES = 32  # levels of each bin that are scored
 
@@ -34,10 +34,11 @@ def run(arguments: argparse.Namespace) -> None:
     """Measure, print and write what ``bin/foresight`` was asked."""
     runs = [stored_run(folder) for folder in arguments.folders]
     for run in runs:
-        try:
-            require_gradients(run.task)
-        except TypeError as error:
-            raise ConfigError(str(error)) from error
+        if not isinstance(run.task, DifferentiableTask):
+            raise ConfigError(
+                f"first-order gain needs gradients: {type(run.task).__name__} must define "
+                "differentiable_performance(agent, levels)"
+            )
     found = [(run, file) for run in runs for file in run.files]
     rows: list[dict[str, Any]] = []
     for run, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):

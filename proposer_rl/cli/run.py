@@ -94,7 +94,6 @@ def live(
             if latest is None:
                 raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
             made.curriculum.load_state_dict(latest[1]["curriculum"])
-            made.curriculum.begin()
         finished = _finished(folder.path, config)
         if finished is not None:
             tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {folder.path}")
