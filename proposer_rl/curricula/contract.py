@@ -249,7 +249,7 @@ class Inbox:
                 raise ValueError(f"the outcome's {name} is not finite on every level")
         if not {"number", "place", "size"} <= {*notes.keys()}:
             raise ValueError(f"the batch is of another curriculum: its notes are {[*notes.keys()]}")
-        if not notes.numel():
+        if not batch.count:
             return
         number, places = int(notes["number"][0, 0]), set(notes["place"][0].tolist())
         if bool((notes["number"] != number).any()) or not 0 <= number < self._next:

@@ -59,7 +59,7 @@ def expected_best(law: EpisodeLaw, episodes: int) -> Tensor:
 
 
 def learnability(student: Student, levels: Levels, episodes: int) -> Tensor:
-    """p (1 - p) of the probability p of success.
+    """P (1 - p) of the probability p of success.
 
     Raises:
         NoSuccessError: if there is no success.

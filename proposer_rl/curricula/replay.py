@@ -195,7 +195,7 @@ class ReplayCurriculum(Curriculum):
             evidence |= scored._asdict()
         if self._edits and self._parents == "easy":
             evidence["easy"] = _easiness(student, outcome)
-        self._came_back["levels"] += notes.numel()
+        self._came_back["levels"] += notes.batch_size.numel()
         self._came_back["replayed"] += int(notes["replayed"].sum())
         self._inbox.put(batch, **evidence)
 
@@ -248,7 +248,7 @@ class ReplayCurriculum(Curriculum):
     def _take_in(self) -> None:
         """Take in what episodes on levels have shown, and note what remains to be done."""
         for evidence in self._inbox.take(whole=self._edits > 0 and self._parents == "easy"):
-            self._last = evidence.select("level")
+            self._last = evidence.select("level", "place")
             if self.scorer.from_episodes:
                 self._take(evidence, Scored(*(evidence[name] for name in Scored._fields)))
             if self._edits or not self.scorer.from_episodes:

@@ -171,7 +171,7 @@ class Scorer:
         elif self._name == "learnability" and success is not None:
             score = success * (1 - success)
         else:
-            needed = "success" if self._name == "learnability" else "a rollout"
+            needed = "success" if self._name == "learnability" else "rollout"
             raise ValueError(f"score={self._name}: the outcome has no {needed}")
         return Scored(score, best.float(), solved)
 

@@ -237,7 +237,7 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
 
 
 def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
-    """log pi(a_t | s_t) of what K Solvers played, rollout [K, P, T]: float [K, P, T]."""
+    """Log pi(a_t | s_t) of what K Solvers played, rollout [K, P, T]: float [K, P, T]."""
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
     with set_recurrent_mode(True):
         steps = agent.decode(rollout.select(*agent.step_keys), context)
