@@ -36,8 +36,8 @@ class TransportCurriculum(BinCurriculum):
         space: that has the bins.
         target_shares: the target as shares of the bins, float [N].
         delta: least performance of a bin that is drawn from.
-        epsilon: how far the distribution moves at a scoring pass; neighbouring bins of an axis with n
-            values are about 2 / (n - 1) apart.
+        epsilon: how far the distribution moves at a scoring pass; neighbouring bins of an axis with
+            n values are about 2 / (n - 1) apart.
         every: batches between two scoring passes.
         probes: levels of each bin.
         measure: of performance, ``"success"`` or ``"return"``.

@@ -138,8 +138,8 @@ class SampledFirstOrderCurriculum(_AlignedBins):
     The direction is the policy gradient of episodes that are played on the target, whose frames
     count; it is averaged as the scores are. The score of a bin is the mean alignment of the
     student's own training episodes on it, which cost nothing, so that a part of each batch goes to
-    all bins alike. The advantages of a batch, or of the part of it that comes in between two
-    proposals, are standardised, as PPO does by default.
+    all bins alike. Where training standardises the advantages of a batch, so do the scores, over
+    what comes in of it between two proposals.
 
     Where there is no success on the target there is no direction, but noise.
 
@@ -197,15 +197,19 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         """
         if "rollout" not in outcome.keys():
             raise ValueError("alignment: the outcome has no rollout")
-        return dict(student.sampled_alignment(self._direction, outcome["rollout"]).items())
+        parts = student.sampled_alignment(self._direction, outcome["rollout"])
+        return {**dict(parts.items()), "steps": outcome["steps"]}
 
     def learn(self, evidence: TensorDict) -> None:
         """Score the bins that were trained on."""
-        mean, square = (evidence[key].mean(-1, keepdim=True) for key in ("advantage", "square"))
-        spread = (square - mean.square()).clamp_min(0).sqrt().clamp_min(1e-6)
-        score = self.scores["score"]
-        aligned = ((evidence["slope"] - mean * evidence["drift"]) / spread).to(score)
-        means, counts = means_of_bins(evidence["bins"], aligned, score.shape[-1])
+        aligned, score = evidence["slope"], self.scores["score"]
+        if "drift" in evidence.keys():
+            mean, square = (evidence[key].mean(-1, keepdim=True) for key in ("advantage", "square"))
+            count = evidence["steps"].sum(-1, keepdim=True)
+            variance = (square - mean.square()).clamp_min(0) * count / (count - 1).clamp_min(1)
+            spread = variance.sqrt().clamp_min(1e-6)
+            aligned = (aligned - mean * evidence["drift"]) / spread
+        means, counts = means_of_bins(evidence["bins"], aligned.to(score), score.shape[-1])
         averaged = self.smoothing * score + (1 - self.smoothing) * means
         self.scores = {"score": torch.where(counts > 0, averaged, score)}
 

@@ -24,8 +24,8 @@ SOURCES = ("exact", "episodes")
 class LearningProgressCurriculum(BinCurriculum):
     """Draws each student's batch from bins by their bidirectional learning progress.
 
-    With p the student's success in a bin at a scoring pass, f and s a fast and a slow average of it and g
-    the function :func:`stretched`,
+    With p the student's success in a bin at a scoring pass, f and s a fast and a slow average of it
+    and g the function :func:`stretched`,
 
         f <- fast f + (1 - fast) p,    s <- slow s + (1 - slow) f,    LP = |g(f) - g(s)|,
         share of a bin = (1 - exploration) LP / (sum of all LP) + exploration / N,

@@ -7,6 +7,7 @@ begins. :class:`TaskStudent` is ours and gives all that its task allows.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
@@ -163,10 +164,10 @@ class Student:
     def sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
         """What the alignment of levels is made of, by a rollout [K, n, T] on them.
 
-        With advantages A_t that are not standardised: ``slope``, the slope along the direction of
-        the mean over the steps of A_t log pi; ``drift``, that of log pi alone; and ``advantage``
-        and ``square``, the means of A_t and of its square. So a batch can be standardised when all
-        of it has come in. Each [K, n].
+        ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi,
+        with advantages A_t that are not standardised. Where the students' training standardises
+        them over a batch: ``drift``, the slope of log pi alone; and ``advantage`` and ``square``,
+        the means of A_t and of its square, so that this can be done when all of it has come in.
         """
         raise self._refusal("sampled_alignment")
 
@@ -182,23 +183,17 @@ class Student:
         return UnfitStudentError(f"{name}: {self.lacks(name)}")
 
 
+def _signature(name: str) -> str:
+    _, *arguments = inspect.signature(getattr(Student, name)).parameters
+    return f"({', '.join(arguments)})"
+
+
 SIGNATURES = {
-    "values": "(levels)",
-    "play": "(levels, generators)",
-    "performance": "(levels, generator)",
-    "exact_performance": "(levels)",
-    "probe": "(levels)",
-    "optimal_return": "(levels)",
-    "episode_law": "(levels)",
-    "gradient_norms": "(levels)",
-    "policy_gradient_norms": "(rollout)",
-    "target_direction": "(levels, measure)",
-    "alignment": "(direction, levels, step)",
-    "sampled_direction": "(rollout)",
-    "sampled_alignment": "(direction, rollout)",
-    "snapshot": "()",
-    "restore": "(snapshot)",
+    name: _signature(name)
+    for name, method in vars(Student).items()
+    if inspect.isfunction(method) and name[0] != "_" and name not in ("spend", "lacks")
 }
+"""What a student can have, with the arguments of each."""
 
 
 def require(student: Student, needs: Iterable[str], who: str) -> None:
@@ -333,9 +328,11 @@ class TaskStudent(Student):
             return torch.stack([(advantage * log_prob).mean(-1), log_prob.mean(-1)], -1)
 
         found = alignment(agent, direction, self._learner.settings.learning_rate, gained)
-        parts = {"slope": found[..., 0], "drift": found[..., 1]}
-        moments = {"advantage": advantage.mean(-1), "square": advantage.square().mean(-1)}
-        return TensorDict({**parts, **moments}, found.shape[:2])
+        parts = {"slope": found[..., 0]}
+        if self._learner.settings.normalize_advantage:
+            parts["drift"] = found[..., 1]
+            parts |= {"advantage": advantage.mean(-1), "square": advantage.square().mean(-1)}
+        return TensorDict(parts, found.shape[:2])
 
     def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
         """Train on levels [K, n], with an update for each ``batch_size`` of them.

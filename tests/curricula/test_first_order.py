@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -200,8 +201,10 @@ def sampled(**options: Any) -> SampledFirstOrderCurriculum:
     return SampledFirstOrderCurriculum(task.space, task.target, **options)
 
 
-def test_sampled_scores_are_inner_products_with_the_sampled_direction() -> None:
+@pytest.mark.parametrize("standardised", [False, True])
+def test_sampled_scores_are_inner_products_with_the_sampled_direction(standardised: bool) -> None:
     solvers, curriculum = learner(), sampled(smoothing=0.0)
+    solvers.settings = replace(solvers.settings, normalize_advantage=standardised)
     own = streams(0, 0, 1)
     student = taught(Mazes(), solvers)
     batch = curriculum.propose(student, P, own)
