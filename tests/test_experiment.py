@@ -154,10 +154,10 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
     class Demanding(SamplingCurriculum):
-        needs = ("exact_performance",)
+        needs = ("episode_law",)
 
     cars = mountain_cars()
-    with pytest.raises(UnfitStudentError, match="Demanding needs a student with exact_performance"):
+    with pytest.raises(UnfitStudentError, match="Demanding needs a student with episode_law"):
         Experiment(
             cars,
             cars.learner([Streams(0)]),
