@@ -50,7 +50,6 @@ class Experiment:
         progress: whether to draw a progress bar.
         signals: which may ask the run to stop; None where nothing does. A curriculum whose
             improvement takes long lets them interrupt it: see :meth:`StopSignals.check`.
-        scope: put before the address of every random draw; tells several lives of one seed apart.
         status: which tells what the run is doing; a curriculum may tell it of the parts of an
             improvement.
 
@@ -71,7 +70,6 @@ class Experiment:
         log: Log | None = None,
         progress: bool = True,
         signals: StopSignals | None = None,
-        scope: Sequence[str | int] = (),
         status: Status | None = None,
     ) -> None:
         check_headline(task, schedule)
@@ -89,7 +87,6 @@ class Experiment:
         self._log = log
         self._progress = progress
         self._signals = signals or StopSignals()
-        self._scope = tuple(scope)
         self._status = status or Status()
         self._headline: list[float] = []
         self._checkpoints = 0
@@ -307,7 +304,7 @@ class Experiment:
             yield seed, {str(key): float(value) for key, value in values[copy].items()}
 
     def _streams(self, *scope: str | int) -> list[Streams]:
-        return [Streams(seed, *self._scope, *scope) for seed in self.seeds]
+        return [Streams(seed, *scope) for seed in self.seeds]
 
     def _headline_text(self) -> str:
         if not self._headline:

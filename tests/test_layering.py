@@ -165,7 +165,9 @@ def test_nothing_but_mazes_knows_mazes() -> None:
     assert {name: where for name, where in found.items() if where} == {}
     graph = imports(ROOT)
     for name in found.keys() - {""}:
-        assert not any(f"{other}.".startswith((".tasks.mazes.", ".tasks.view_mazes.")) for other in graph[name]), name
+        assert not any(
+            f"{other}.".startswith((".tasks.mazes.", ".tasks.view_mazes.")) for other in graph[name]
+        ), name
 
 
 @pytest.mark.parametrize(

@@ -27,10 +27,10 @@ class MixtureCurriculum(Curriculum):
 
     A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
     coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
-    that of the nearest earlier task in the student's whole history. The first ``warmup`` points
-    are drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is fitted
-    to the points and the progress of the last ``refit``, from which all but a part of the draws
-    come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
+    that of the nearest earlier task in the student's whole history. The first ``warmup`` points are
+    drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
+    fitted to the points and the progress of the last ``refit``, from which all but a part of the
+    draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
     :mod:`~proposer_rl.curricula.mixtures`).
 
     Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.

@@ -209,8 +209,8 @@ class Inbox:
 
     It numbers batches and the places of their levels in the notes (``number``, ``place``, and the
     ``size`` n of the batch, each int64 [K, n]), keeps what curricula reduce an outcome to, and
-    hands it out sorted. A curriculum takes it at its next proposal and when it logs, so that between two
-    proposals the order of returns has no effect.
+    hands it out sorted. A curriculum takes it at its next proposal and when it logs, so that
+    between two proposals the order of returns has no effect.
 
     Args:
         like: a level of the kind that ``level`` in the evidence holds; None if there is none.

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from proposer_rl.cli.build import make_in_place, make_task
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.meta.rewards import Reward, performance_gain
@@ -63,7 +63,7 @@ def make(
     maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
-        return make_in_place(maker, solver, Place(torch.device(device)))
+        return maker(solver=solver, place=Place(torch.device(device)))
 
     task = make_task(settings)
     found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)
