@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -23,26 +21,6 @@ COPIES = 3
 OVERRIDES = ["+method=perf_gain", "+scale=smoke", f"proposer.rollouts={COPIES}"]
 # Three actions for each copy: the Proposer's forward pass is over all copies, wherever it is made.
 OVERRIDES += ["proposer.advance=best", "proposer.action_repeat=1", "compute.threads=1"]
-
-
-class Hangs(BaseException):
-    """Not an Exception: nothing may take it for the loss of a worker."""
-
-
-@contextmanager
-def within(seconds: int) -> Iterator[None]:
-    """Fail instead of waiting for ever."""
-
-    def give_up(*_: object) -> None:
-        raise Hangs(f"nothing came of it for {seconds} seconds")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def config(*overrides: str) -> RunConfig:
