@@ -128,8 +128,8 @@ def test_a_solver_is_trained_with_it(
 
 def test_learners_of_ones_own_train_in_the_meta_environment(example: Load) -> None:
     own = example("own_learner")
+    check_env_specs(own.meta_environment())
     env = own.meta_environment()
-    check_env_specs(env)
     env.fork(env.solvers.snapshot()[0], Streams(0))
     before = env.reset()["return"]
     gains = []

@@ -166,7 +166,7 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
             seeds=[0],
             folder=RunFolder(tmp_path / "run"),
         )
-    assert not (tmp_path / "run").exists()
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> None:
