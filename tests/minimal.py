@@ -92,7 +92,7 @@ RUN = "runs"
 SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
 GYMNASIUM = [
     *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
-    "proposer.validation_levels=2",
+    "proposer.validation_levels=2", "proposer.probe_levels=2",
 ]  # fmt: skip
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 
@@ -120,8 +120,8 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         for method in ("first_order_sampled", "perf_gain"):
             yield _trained(f"cartpole_{method}", "task=cartpole", f"+method={method}", *GYMNASIUM)
         yield ["watch", RUN, "--once"]
-        yield ["report", RUN, "-o", "report"]
-        yield ["eval", f"{RUN}/target", f"{RUN}/views"]
+        yield ["report", f"{RUN}/cartpole_perf_gain", "-o", "report"]
+        yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))
     elif extra == "alp-gmm":
         # More than 250 episodes, after which a mixture is fitted for the first time.
         yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")

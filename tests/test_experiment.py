@@ -162,7 +162,7 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
             cars,
             cars.learner([Streams(0)]),
             Demanding(cars.space),
-            schedule=Schedule(**LENGTHS, headline=cars.measurements[0], threshold=0.5),
+            schedule=Schedule(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
             seeds=[0],
             folder=RunFolder(tmp_path / "run"),
         )

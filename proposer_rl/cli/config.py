@@ -45,7 +45,7 @@ OmegaConf.register_new_resolver(
 LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
-GIVEN_TO_TASKS = ("solver", "place")
+GIVEN_TO_TASKS = ("solver", "context")
 
 
 class ConfigError(ValueError):

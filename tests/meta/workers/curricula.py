@@ -14,7 +14,7 @@ from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Parts, Workers, proposer
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 from tests.tiny import composed
 
 COPIES = 3
@@ -41,7 +41,7 @@ def make(
     maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
-        return maker(solver=solver, place=Place(torch.device(device)))
+        return maker(solver=solver, context=ComputeContext(torch.device(device)))
 
     task = make_task(settings)
     found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)
