@@ -28,9 +28,7 @@ def programs() -> dict[str, list[str]]:
     """The module behind every command of bin/ that is a Python program, and its first arguments."""
     found = {}
     for file in (ROOT / "bin").iterdir():
-        started = re.search(
-            r'-m ((?:proposer_rl|research).*) "', file.read_text(encoding="utf-8")
-        )
+        started = re.search(r'-m ((?:proposer_rl|research).*) "', file.read_text(encoding="utf-8"))
         if started:
             found[file.name] = started[1].split()
     return found

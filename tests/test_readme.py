@@ -13,13 +13,13 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from proposer_rl.cli.instruments import evaluate as evaluate_main
+from proposer_rl.cli.eval import main as evaluate_main
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.report import main as report_main
 from proposer_rl.cli.train import main
 from proposer_rl.cli.watch import main as watch_main
-from proposer_rl.report.curves import cost_curves, learning_curves
-from proposer_rl.report.generalisation import write_scores
+from proposer_rl.report.curves import cost_curves
+from proposer_rl.report.scores import write_scores
 from tests.commands import call, trained_run
 from tests.report.folders import write_run, write_seconds
 from tests.tasks.gymnasium.toys import TINY
@@ -113,7 +113,6 @@ def test_the_commands_about_runs_run(
     Image.new("RGB", (100, 100)).save(picture, "PNG")
     monkeypatch.setattr("proposer_rl.report.style._render", lambda *_: picture.getvalue())
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [cost_curves])
-    monkeypatch.setattr("proposer_rl.report.pages.DRAWINGS", [learning_curves, cost_curves])
     for number, arguments in enumerate(found):
         for folder in takewhile(lambda word: not word.startswith("-"), arguments):
             write_run(tmp_path / str(number) / folder / "run")

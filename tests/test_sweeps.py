@@ -277,7 +277,7 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
     assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
     frozen = "sweeps/medium/frozen_proposer-none-seed_107"
     assert made == [
-        (frozen, "results/medium/lives/0/lifetime_2", 107, "none"),
+        (frozen, "results/medium/proposer.pt", 107, "none"),
         ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
     ]
 

@@ -26,7 +26,7 @@ from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
 from proposer_rl.settings import ArgumentError, ComputeSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 
 
 class Made(NamedTuple):
@@ -99,18 +99,18 @@ def make_task(config: RunConfig) -> Task:
     use(device)
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
-    place = Place(device, config.precision, compute.cores)
+    context = ComputeContext(device, config.precision, compute.cores)
     try:
-        task = task_maker(config.task)(solver=config.solver, place=place)
+        task = task_maker(config.task)(solver=config.solver, context=context)
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
     return recorded(task) if compute.graphs else task
 
 
 def _make_in_worker(
-    maker: Maker, solver: SolverSettings, place: Place, graphs: bool, device: str
+    maker: Maker, solver: SolverSettings, context: ComputeContext, graphs: bool, device: str
 ) -> Any:
-    task = maker(solver=solver, place=place._replace(device=torch.device(device)))
+    task = maker(solver=solver, context=context._replace(device=torch.device(device)))
     return recorded(task) if graphs else task
 
 
@@ -202,9 +202,9 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
         cores=cores,
         ray_address=compute.ray_address,
     )
-    place = Place(precision=task.precision, cores=cores)
+    context = ComputeContext(precision=task.precision, cores=cores)
     make: Callable[[str], Any] = partial(
-        _make_in_worker, task_maker(config.task), config.solver, place, compute.graphs
+        _make_in_worker, task_maker(config.task), config.solver, context, compute.graphs
     )
     return Workers(settings, make, tell)
 

@@ -44,7 +44,7 @@ OmegaConf.register_new_resolver(
 LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
-GIVEN_TO_TASKS = ("solver", "place")
+GIVEN_TO_TASKS = ("solver", "context")
 
 
 class ConfigError(ValueError):
@@ -118,7 +118,7 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(settings: Mapping[str, Any]) -> Maker:
-    """What makes the task, called with ``solver`` and ``place`` besides.
+    """What makes the task, called with ``solver`` and ``context`` besides.
 
     Args:
         settings: ``task`` of the configuration.
