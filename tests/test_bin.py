@@ -146,7 +146,7 @@ STAGES_IN_ORDER = {
 
 @pytest.mark.parametrize("failing", ["ruff", "mypy", "sphinx", "pytest", "nothing"])
 def test_a_stage_that_fails_gives_its_status(failing: str, tmp_path: Path) -> None:
-    """Without format and lint nothing else begins; the others are side by side, and all are told."""
+    """Without format and lint nothing else begins; the others run side by side."""
     file = tmp_path / "python3"
     file.write_text(STAGES)
     file.chmod(0o755)
