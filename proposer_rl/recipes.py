@@ -22,6 +22,7 @@ CONFIG_FOLDER = next(
     (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
     PACKAGE / "conf",
 )
+MISSING = "???"  # in a file: to be given
 KEYS = {"task": "task", "method": "curriculum"}
 """Where the settings of a group's files stand in the configuration."""
 
@@ -54,7 +55,7 @@ class Recipe:
         return [f"{group}={self.name}", *given]
 
 
-def own(group: Literal["task", "method"], make: Callable[..., Any], **settings: Any) -> Recipe:
+def own_recipe(group: Literal["task", "method"], make: Callable[..., Any], **settings: Any) -> Recipe:
     """A recipe for a class or function of one's own, which other processes can import.
 
     Args:
@@ -91,7 +92,11 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
         raise AttributeError(f"there is no {name!r}; there are: {known}")
     settings = _settings(group, name)
     parameters = [
-        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=value)
+        inspect.Parameter(
+            key,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if value == MISSING else value,
+        )
         for key, value in settings.items()
     ]
 
@@ -99,6 +104,9 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
         unknown = [key for key in given if key not in settings]
         if unknown:
             raise ArgumentError(f"{unknown[0]}: unknown; there are: {', '.join(settings)}")
+        for key, value in settings.items():
+            if value == MISSING and key not in given:
+                raise ArgumentError(f"{key}: missing")
         return Recipe(group, name, given)
 
     make.__name__ = make.__qualname__ = name
