@@ -109,10 +109,10 @@ def train(
     """
     from proposer_rl.cli.compose import compose_and_run
 
-    task, curriculum = (
-        recipe_function(group, given)() if isinstance(given, str) else given
-        for group, given in (("task", task), ("method", curriculum))
-    )
+    if isinstance(task, str):
+        task = recipe_function("task", task)()
+    if isinstance(curriculum, str):
+        curriculum = recipe_function("method", curriculum)()
     overrides = [*task.overrides(), *curriculum.overrides()]
     if scale is not None:
         overrides.append(f"+scale={scale}")
@@ -124,4 +124,5 @@ def train(
     overrides.append(f"compute.progress={override_value(progress)}")
     if updates is not None:
         overrides.append(f"schedule.updates={override_value(updates)}")
-    return Run(compose_and_run(overrides, None if folder is None else Path(folder)))
+    own = {**task.own(), **curriculum.own()}
+    return Run(compose_and_run(overrides, own, None if folder is None else Path(folder)))

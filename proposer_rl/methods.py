@@ -28,13 +28,13 @@ from proposer_rl.curricula import (
     ReplayRule,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
+    Schedule,
     Scorer,
     SelectionCurriculum,
     SomeBins,
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula import Schedule as StagedCurriculum
 from proposer_rl.curricula.buffer import Prioritization
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
@@ -136,7 +136,7 @@ def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -
         )
     if not isinstance(until, Sequence) or any(type(end) is not int for end in until):
         raise ValueError(f"until must be a list of whole numbers, got {until!r}")
-    return StagedCurriculum([SamplingCurriculum(known[name]) for name in distributions], until)
+    return Schedule([SamplingCurriculum(known[name]) for name in distributions], until)
 
 
 def proposer(

@@ -7,6 +7,7 @@ The names, their settings and the defaults are those of the files in ``conf/task
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ CONFIG_FOLDER = next(
     (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
     PACKAGE / "conf",
 )
+KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
+CONSTANTS = {"null", "true", "false", "nan", "inf"}
 MISSING = "???"  # in a file: to be given
 KEYS = {"task": "task", "method": "curriculum"}
 """Where the settings of a group's files stand in the configuration."""
@@ -44,18 +47,25 @@ class Recipe:
     target: str | None = None
 
     def overrides(self) -> list[str]:
-        """The same on the command line."""
-        key = KEYS[self.group]
+        """The same on the command line, but for what is one's own."""
         if self.target is not None:
-            own = {"_target_": self.target, **self.settings}
-            named = [f"++method={self.name}"] if self.group == "method" else ["~task"]
-            return [*named, f"++{key}={override_value(own)}"]
+            return ["~task"] if self.group == "task" else []
         group = "task" if self.group == "task" else "+method"
+        key = KEYS[self.group]
         given = [f"++{key}.{name}={override_value(v)}" for name, v in self.settings.items()]
         return [f"{group}={self.name}", *given]
 
+    def own(self) -> dict[str, Any]:
+        """The part of the configuration that no file has: one's own task or curriculum."""
+        if self.target is None:
+            return {}
+        named = {"method": self.name} if self.group == "method" else {}
+        return {**named, KEYS[self.group]: {"_target_": self.target, **self.settings}}
 
-def own_recipe(group: Literal["task", "method"], make: Callable[..., Any], **settings: Any) -> Recipe:
+
+def own_recipe(
+    group: Literal["task", "method"], make: Callable[..., Any], **settings: Any
+) -> Recipe:
     """A recipe for a class or function of one's own, which other processes can import.
 
     Args:
@@ -116,14 +126,14 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
 
 
 def override_value(value: Any) -> str:
-    """A value of Python's as Hydra's grammar of overrides takes it.
+    r"""A value of Python's as Hydra's grammar of overrides takes it.
 
     Raises:
         ArgumentError: if it is neither a number, a text, a list nor a mapping of such.
 
     Example:
         >>> override_value({"a": [1, None, True], "b": "it's"})
-        "{a: [1, null, true], b: 'it\\\\'s'}"
+        "{a: [1, null, true], b: 'it\\'s'}"
     """
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -139,7 +149,12 @@ def override_value(value: Any) -> str:
 
 
 def _key(key: Any) -> str:
-    return str(key) if str(key).isidentifier() else override_value(str(key))
+    if not isinstance(key, str) or not KEY.fullmatch(key) or key.casefold() in CONSTANTS:
+        raise ArgumentError(
+            f"{key!r}: a name must begin with a letter, and have letters, digits, underscores, "
+            "hyphens and single spaces alone"
+        )
+    return key
 
 
 def _settings(group: str, name: str) -> dict[str, Any]:

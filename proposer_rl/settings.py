@@ -83,6 +83,22 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def signed(made: type[T]) -> type[T]:
+    """Show a class's constructor as its signature, which TorchRL's metaclass of environments hides.
+
+    Example:
+        >>> from torchrl.envs import EnvBase
+        >>> @signed
+        ... class Env(EnvBase):
+        ...     def __init__(self, levels, *, max_steps=25): ...
+        >>> inspect.signature(Env)
+        <Signature (levels, *, max_steps=25)>
+    """
+    _, *parameters = inspect.signature(made.__init__).parameters.values()
+    made.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return made
+
+
 def arguments(
     function: Callable[..., Any], values: Mapping[str, Any], given: Collection[str] = ()
 ) -> dict[str, Any]:
@@ -338,7 +354,7 @@ class ProposerSettings:
 
 
 @settings
-class Schedule:
+class ScheduleSettings:
     """How long a run is, and what happens how often; all in Solver updates.
 
     Attributes:

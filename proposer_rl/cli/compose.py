@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -22,12 +24,13 @@ from proposer_rl.cli.run import carry_out
 from proposer_rl.runs.signals import StopSignals
 
 
-def compose_and_run(overrides: Sequence[str], folder: Path | None) -> Path:
+def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:
     """Train as ``bin/train`` with these overrides does.
 
     Args:
         overrides: as on the command line.
-        folder: the run's; None for the one that the configuration names.
+        own: what takes the place of top-level keys; of a task or curriculum that no file has.
+        folder: the run's; None for a new one below ``outputs/``.
 
     Returns:
         The run's folder.
@@ -37,12 +40,18 @@ def compose_and_run(overrides: Sequence[str], folder: Path | None) -> Path:
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
     with _composed(overrides) as config:
-        path = Path(OmegaConf.select(config, "hydra.run.dir")) if folder is None else folder
         with open_dict(config):
             del config["hydra"]
+            for key, value in own.items():
+                config[key] = value
+        path = folder or Path("outputs") / str(config.method) / _moment(config.seed)
         check_groups(list(overrides))
         carry_out(read_config(config), path, StopSignals())
     return path
+
+
+def _moment(seed: Any) -> str:
+    return f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{seed}"
 
 
 @contextmanager

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE
+from proposer_rl.recipes import CONFIG_FOLDER as CONFIG_FOLDER
+from proposer_rl.recipes import PACKAGE as PACKAGE
 
 # In the order in which they are given on the command line, and what each decides.
 GROUPS = {
