@@ -36,8 +36,12 @@ Count = Annotated[int, Interval(ge=1, le=1_000_000)]
 """Of what is counted, at least one: more than a million would not fit, or never come to pass."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, or a probability."""
+Decay = Annotated[float, Interval(ge=0, lt=1)]
+"""The share of the old in a running average."""
 Positive = Annotated[float, Gt(0)]
 """A number above zero."""
+NotNegative = Annotated[float, Ge(0)]
+"""Zero, or a number above it."""
 
 
 class ArgumentError(ValueError):

@@ -151,9 +151,7 @@ def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.Mon
         "schedule": {"headline": "target_success"},
     }
     task = prl.tasks.own(SledgeTask, levels=8)
-    run = prl.train(
-        task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False
-    )
+    run = prl.train(task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False)
     assert "target_success" in run.metrics
     assert type(run.task()).__name__ == "SledgeTask"
     curriculum = prl.curricula.own(again, probability=0.5)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from proposer_rl.curricula.alp_gmm import MixtureCurriculum
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.buffer import (
@@ -33,18 +32,18 @@ from proposer_rl.curricula.contract import (
     LearnedCurriculum,
     outcome_of,
 )
-from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
-from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
-from proposer_rl.curricula.learning_progress import LearningProgressCurriculum
-from proposer_rl.curricula.paired import PairedProposer
+from proposer_rl.curricula.gaussians import MixtureCurriculum
 from proposer_rl.curricula.problem_proposer import ProblemProposer
+from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer
+from proposer_rl.curricula.progress import LearningProgressCurriculum
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.selection import SelectionCurriculum
 from proposer_rl.curricula.student import Student, TaskStudent, UnfitStudentError, require
+from proposer_rl.curricula.transport import TransportCurriculum
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 __all__ = [

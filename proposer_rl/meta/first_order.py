@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -54,7 +55,7 @@ SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 Direction = Mapping[str, Tensor]
 """By the parameters' names, [K, ...]: a direction in which K Solvers can be moved."""
 
-MEASURES = ("log_success", "return")
+Measure = Literal["log_success", "return"]
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
@@ -73,8 +74,9 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     """
     if measure == "return":
         return mean_return(performance)
-    if measure not in MEASURES:
-        raise ValueError(f"measure must be {' or '.join(MEASURES)}, got {measure!r}")
+    if measure not in get_args(Measure):
+        known = " or ".join(get_args(Measure))
+        raise ValueError(f"measure={measure!r}: must be {known}")
     mean, success = mean_log_success(performance), performance["success"]
     hopeless = (success <= 0).all(1)
     if bool(hopeless.any()):

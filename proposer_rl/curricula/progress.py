@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
-from proposer_rl.curricula.checks import one_of, part
 from proposer_rl.curricula.contract import Batch
-from proposer_rl.curricula.probes import Probes
+from proposer_rl.curricula.probes import Measure, Probes
 from proposer_rl.curricula.student import Student
+from proposer_rl.settings import Count, Decay, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
 Q = 0.1  # the success that is stretched to one half
-SOURCES = ("exact", "episodes")
 
 
 class LearningProgressCurriculum(BinCurriculum):
@@ -46,38 +45,30 @@ class LearningProgressCurriculum(BinCurriculum):
             which is of probabilities.
         fast, slow: share of the old in either average.
         exploration: part of each batch that is drawn uniformly.
-
-    Raises:
-        ValueError: if a value is out of range.
     """
 
     shown = ("score", "performance")
+    remembers = (*BinCurriculum.remembers, "_episodes", "_probes")
 
+    @checked
     def __init__(
         self,
         space: Space,
         *,
-        every: int = 1,
-        source: str = "exact",
-        probes: int = 16,
-        measure: str = "success",
-        fast: float = 0.9,
-        slow: float = 0.9,
-        exploration: float = 0.2,
+        every: Count = 1,
+        source: Literal["exact", "episodes"] = "exact",
+        probes: Count = 16,
+        measure: Measure = "success",
+        fast: Decay = 0.9,
+        slow: Decay = 0.9,
+        exploration: Share = 0.2,
     ) -> None:
         super().__init__(space, every=every)
-        self._source = one_of("source", source, SOURCES)
-        self._probes = Probes(space, probes, measure)
-        self._fast = part("fast", fast, below_one=True)
-        self._slow = part("slow", slow, below_one=True)
-        self._exploration = part("exploration", exploration)
+        self.needs = ("performance",) if source == "exact" else ()
+        self._source, self._probes = source, Probes(space, probes, measure)
+        self._fast, self._slow, self._exploration = fast, slow, exploration
         # Sum and number of what came of each bin since the last scoring pass, [K, N].
         self._episodes: list[Tensor] = []
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """The performance on its probes, where progress is read from them."""
-        return ("performance",) if self._source == "exact" else ()
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Move the averages by the performance on the probes, or in the episodes since."""
@@ -132,17 +123,6 @@ class LearningProgressCurriculum(BinCurriculum):
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
         return progress_shares(self.scores["score"], self._exploration)
-
-    def state_dict(self) -> dict[str, Any]:
-        """What came since the last scoring pass and the probes, too."""
-        more = {"episodes": list(self._episodes), "probes": self._probes.state_dict()}
-        return {**super().state_dict(), **more}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        super().load_state_dict(state)
-        self._episodes = list(state["episodes"])
-        self._probes.load_state_dict(state["probes"])
 
 
 def stretched(success: Tensor, q: float = Q) -> Tensor:

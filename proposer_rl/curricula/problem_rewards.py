@@ -1,4 +1,4 @@
-"""A Proposer that is rewarded for the regret between two students: PAIRED."""
+"""Rewards of a Proposer of single problems: first-order gain, and regret (PAIRED)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,58 @@ from torch import Tensor
 from proposer_rl.curricula.contract import Batch, Inbox
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.student import Student, TaskStudent
+from proposer_rl.meta.first_order import Measure
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import PPOSettings
+from proposer_rl.settings import Count, Positive, PPOSettings, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
+
+
+class FirstOrderProposer(ProblemProposer):
+    """A problem's reward is its alignment with the target direction.
+
+    Args:
+        space: see :class:`ProblemProposer`.
+        target: the distribution that is to be mastered.
+        agent: see :class:`ProblemProposer`.
+        settings: the same.
+        probe_levels: probes C.
+        target_levels: fresh levels E of the target that the direction is taken from.
+        step: of the differences that tell the alignments, in learning rates.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
+    """
+
+    needs = ("probe", "target_direction", "alignment")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        *,
+        probe_levels: int = 16,
+        target_levels: Count = 256,
+        step: Positive = 1.0,
+        measure: Measure = "log_success",
+    ) -> None:
+        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
+        self._target_levels, self._step, self._measure = target_levels, step, measure
+
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The alignment of each level, which is evaluated on either side of the student."""
+        target = self.target.sample(self._target_levels, stream.generator("target"))
+        reached, direction = student.target_direction(target.unsqueeze(0), self._measure)
+        aligned = student.alignment(direction, levels, self._step)
+        return aligned, {
+            "target_performance": float(reached.mean()),
+            "alignment": float(aligned.mean()),
+            "alignment_sd": float(aligned.std(correction=0)),
+        }
 
 
 class PairedProposer(ProblemProposer):
@@ -39,6 +87,8 @@ class PairedProposer(ProblemProposer):
         probe_levels: probes C.
     """
 
+    needs = ("probe", "performance")
+
     def __init__(
         self,
         space: Space,
@@ -52,11 +102,6 @@ class PairedProposer(ProblemProposer):
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
         self.antagonist = antagonist
         self._inbox = Inbox(target.sample(1, torch.Generator())[0])
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Performance, too."""
-        return (*super().needs, "performance")
 
     def reward(
         self, student: Student, levels: Levels, stream: Streams

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCounts
-from proposer_rl.curricula.checks import one_of, part, whole
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.mixtures import TaskMixture, draw, fit, require_scikit_learn
 from proposer_rl.curricula.student import Student
+from proposer_rl.extras import install_command
+from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
 LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
 CHUNK = 2**16  # earlier episodes that are compared at once
-SOURCES = ("episodes", "exact")
+TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
+
+
+class TaskMixture(NamedTuple):
+    """Gaussians over points and progress; the last of the D + 1 coordinates is progress.
+
+    Attributes:
+        means: float64 [J, D + 1].
+        covariances: float64 [J, D + 1, D + 1].
+    """
+
+    means: Tensor
+    covariances: Tensor
 
 
 class MixtureCurriculum(Curriculum):
@@ -31,7 +46,7 @@ class MixtureCurriculum(Curriculum):
     drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
     fitted to the points and the progress of the last ``refit``, from which all but a part of the
     draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
-    :mod:`~proposer_rl.curricula.mixtures`).
+    :func:`fit` and :func:`draw`).
 
     Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.
     Bins and not points are compared: between two points with a border of bins in between, the
@@ -52,31 +67,35 @@ class MixtureCurriculum(Curriculum):
         exploration: part of the draws that come uniformly from the box.
 
     Raises:
-        ValueError: if a value is out of range, or scikit-learn is missing.
+        ValueError: if scikit-learn is missing, or the numbers of episodes are not in order.
     """
 
+    remembers = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
+
+    @checked
     def __init__(
         self,
         space: Space,
         *,
-        source: str = "episodes",
-        warmup: int = 250,
-        refit: int = 250,
-        components: int = 10,
-        exploration: float = 0.2,
+        source: Literal["episodes", "exact"] = "episodes",
+        warmup: TwoOrMore = 250,
+        refit: TwoOrMore = 250,
+        components: TwoOrMore = 10,
+        exploration: Share = 0.2,
     ) -> None:
-        require_scikit_learn()
-        self.space = space
-        self._source = one_of("source", source, SOURCES)
-        self._components = whole("components", components, 2)
-        self._refit = whole("refit", refit, 2)
-        self._warmup = whole("warmup", warmup, 2)
-        self._exploration = part("exploration", exploration)
-        if not self._components <= self._refit <= self._warmup:
+        if find_spec("sklearn") is None:
             raise ValueError(
-                f"components={components} must be at most refit={refit}, and that at most "
+                f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"
+            )
+        if not components <= refit <= warmup:
+            raise ArgumentError(
+                f"components={components}: must be at most refit={refit}, and that at most "
                 f"warmup={warmup}: a mixture is fitted to that many episodes"
             )
+        self.space = space
+        self.needs = ("performance",) if source == "exact" else ()
+        self._source, self._components, self._refit = source, components, refit
+        self._warmup, self._exploration = warmup, exploration
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
         self._mixtures: list[TaskMixture] = []  # of each student
@@ -84,11 +103,6 @@ class MixtureCurriculum(Curriculum):
         self._inbox = Inbox()
         self._counts = BinCounts(space)
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """The performance, where it is the source."""
-        return ("performance",) if self._source == "exact" else ()
 
     @property
     def episodes(self) -> int:
@@ -132,24 +146,10 @@ class MixtureCurriculum(Curriculum):
             "clipped": clipped / drawn if drawn else 0.0,
         }
 
-    def state_dict(self) -> dict[str, Any]:
-        """Histories, mixtures, and what is logged."""
-        return {
-            "history": dict(self._history),
-            "mixtures": [mixture._asdict() for mixture in self._mixtures],
-            "fitted": self._fitted,
-            "counts": self._counts.counts,
-            "drawn": self._drawn,
-            "inbox": self._inbox.state_dict(),
-        }
-
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        self._history = dict(state["history"])
-        self._mixtures = [TaskMixture(**mixture) for mixture in state["mixtures"]]
-        self._fitted = state["fitted"]
-        self._counts.counts, self._drawn = state["counts"], state["drawn"]
-        self._inbox.load_state_dict(state["inbox"])
+        """Go on with histories and mixtures."""
+        super().load_state_dict(state)
+        self._mixtures = [TaskMixture(*mixture) for mixture in self._mixtures]
 
     def _take_in(self) -> None:
         """Add tasks, returns and progress to the histories."""
@@ -200,6 +200,58 @@ class MixtureCurriculum(Curriculum):
         return torch.where(explored.unsqueeze(-1), uniform, kept)
 
 
+def fit(points: Tensor, most: int, generator: torch.Generator) -> TaskMixture:
+    """The mixture of 2 to ``most`` Gaussians with the least AIC.
+
+    Full covariances, expectation maximisation from one start by k-means
+    (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
+
+    Args:
+        points: float [n, D + 1], n at least ``most``.
+        most: components that are tried.
+        generator: of the starts.
+    """
+    # Only this method needs it, and it takes a second to import.
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+    from threadpoolctl import threadpool_limits
+
+    data = points.double().numpy()
+    seeds = torch.randint(2**31, (most - 1,), generator=generator).tolist()
+    # Several threads would add up in any order, and the same run would not come out again.
+    with warnings.catch_warnings(), threadpool_limits(1):
+        # Fewer distinct points than components, or slow convergence: the AIC decides on what came.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        mixtures = [
+            GaussianMixture(count, random_state=seed).fit(data)
+            for count, seed in zip(range(2, most + 1), seeds, strict=True)
+        ]
+        best = min(mixtures, key=lambda one: float(one.aic(data)))
+    return TaskMixture(torch.from_numpy(best.means_), torch.from_numpy(best.covariances_))
+
+
+def draw(mixture: TaskMixture, count: int, generator: torch.Generator) -> Tensor:
+    """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
+
+    Where no Gaussian has progress, all are alike.
+
+    Args:
+        mixture: of points with D coordinates.
+        count: number P of draws.
+        generator: of the CPU.
+
+    Returns:
+        float64 [P, D].
+    """
+    progress = mixture.means[:, -1].clamp(min=0)
+    weights = progress if bool(progress.sum() > 0) else torch.ones_like(progress)
+    which = torch.multinomial(weights, count, replacement=True, generator=generator)
+    # Without its last coordinate a Gaussian is one of the others' means and covariances.
+    means, spread = mixture.means[:, :-1], mixture.covariances[:, :-1, :-1]
+    noise = torch.randn(count, means.shape[1], 1, generator=generator, dtype=means.dtype)
+    return means[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
+
+
 def nearest(points: Tensor, places: Tensor) -> Tensor:
     """The place nearest to each point, the last of equally near ones.
 
@@ -215,15 +267,15 @@ def nearest(points: Tensor, places: Tensor) -> Tensor:
         tensor([2, 2])
     """
     best = torch.full((len(points),), torch.inf, dtype=points.dtype)
-    found = torch.zeros(len(points), dtype=torch.int64)
+    which = torch.zeros(len(points), dtype=torch.int64)
     for start in range(0, len(places), CHUNK):
         some = places[start : start + CHUNK].flip(0)  # min takes the first, flipped the last
         # Through a matrix product, equal distances would not come out equal.
         apart = torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist")
         least, index = apart.min(1)
-        found = torch.where(least <= best, start + len(some) - 1 - index, found)
+        which = torch.where(least <= best, start + len(some) - 1 - index, which)
         best = torch.minimum(best, least)
-    return found
+    return which
 
 
 def absolute_progress(
