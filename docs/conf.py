@@ -34,7 +34,7 @@ extensions = [
     "sphinx.ext.autosummary",  # a page for every module, without a list to keep
     "sphinx.ext.napoleon",  # docstrings in Google's style
 ]
-exclude_patterns = ["_*"]
+exclude_patterns = ["_*", "findings"]
 templates_path = ["_templates"]
 
 # bin/docs fails on warnings: nothing unlinked, nothing linked that is not there.
