@@ -51,7 +51,13 @@ def shown() -> Iterator[tuple[str, tuple[str, ...]]]:
                 yield command[1], tuple(words)
 
 
+def settings(words: tuple[str, ...]) -> tuple[str, ...]:
+    """Of the arguments of a run those that differ in more than seeds, folders and flags."""
+    return tuple(w for w in words if "=" in w and not re.match(r"'?(seeds?|hydra\.\w+\.dir)=", w))
+
+
 TRAIN = sorted({words for program, words in shown() if program == "train"})
+SETTINGS = {(settings(words), "--config-dir" in words) for words in TRAIN}
 OTHERS = sorted({(program, words) for program, words in shown() if program != "train"})
 
 
@@ -68,9 +74,8 @@ def test_the_settings_exist(tmp_path: Path) -> None:
     """Every key and group of every bin/train in the pages, also of those that no test executes."""
     for text in (CONFIGURATION, PAGES["how_to/gymnasium_environment"]):
         write_files(text, tmp_path)
-    assert len(TRAIN) > 40
-    for arguments in TRAIN:
-        words = [word for word in arguments if "=" in word]
+    assert len(SETTINGS) > 40
+    for words, own in sorted(SETTINGS):
         words = [
             word.replace("checkpoint=", "+checkpoint=") for word in words if "/job" not in word
         ]
@@ -78,9 +83,9 @@ def test_the_settings_exist(tmp_path: Path) -> None:
             override.input_line
             if not override.is_sweep_override()
             else f"{override.input_line.partition('=')[0]}={next(override.sweep_string_iterator())}"
-            for override in OverridesParser.create().parse_overrides(words)
+            for override in OverridesParser.create().parse_overrides(list(words))
         ]
-        if "--config-dir" in arguments:
+        if own:
             overrides.append(f"hydra.searchpath=[file://{tmp_path / 'my_conf'}]")
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
