@@ -1,8 +1,8 @@
 """A task of your own: on which mountain cars should a Solver train to master a weak engine?
 
 A level is a gravity, an engine's power and a start. The Solver, an MLP, is to master a weak engine,
-with which chance hardly ever reaches the top; a Proposer mixes 20 kinds of cars. All that the
-commands ask of a task is in `MountainCarTask` (the contract is `proposer_rl/task.py`):
+with which chance hardly ever reaches the top; a Proposer mixes 20 kinds of cars. `MountainCarTask`
+gives an environment, a network and pictures; what it stands on is in `proposer_rl/task.py`.
 
     PYTHONPATH=examples bin/train --config-dir examples/conf task=mountain_car +method=perf_gain
 
@@ -13,23 +13,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 
-from proposer_rl import PPO, ActorCritic, Place, Population, SolverSettings, Streams
-from proposer_rl.learning import first_episode_success
-from proposer_rl.models import categorical
-from proposer_rl.runs.pictures import png
-from proposer_rl.streams import each_from
+from proposer_rl import ComputeContext, SolverSettings, Task
 
 GRAVITIES, POWERS = (0.25, 0.5, 0.75, 1.0), (0.35, 0.7, 1.05, 1.4, 1.75)
 KINDS = torch.cartesian_prod(torch.tensor(GRAVITIES), torch.tensor(POWERS))
@@ -92,106 +86,52 @@ class Cars:
         return TensorDict(entries, choices.shape)
 
 
-class MountainCarTask:
-    """A `proposer_rl.task.Task`: levels are tensordicts, the Solver is an MLP, all on the CPU."""
+class Network(nn.Module):
+    """Logits of three actions and a value."""
 
-    device, precision, exact_performance = torch.device("cpu"), "fp32", True
+    def __init__(self) -> None:
+        super().__init__()
+        self.mlp = MLP(2, 4, 2, 32)
 
-    def __init__(self, *, levels: int, solver: SolverSettings, place: Place) -> None:
-        self.batch_size = solver.batch_size
-        self.space, self.target = Cars(torch.arange(len(KINDS))), Cars(TARGET)
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        return self.mlp(observation).split([3, 1], -1)
+
+
+class MountainCarTask(Task):
+    """Levels are tensordicts; the Solver is an MLP, measured by its most probable actions."""
+
+    title, noun, batched = "mountain cars", "cars", True
+    key = "Blue: start. Orange: top. Purple: where the car was."
+    exact_performance = True
+
+    def __init__(self, *, levels: int, solver: SolverSettings, context: ComputeContext) -> None:
+        target, kinds = Cars(TARGET), Cars(torch.arange(len(KINDS)))
         self.target_shares = torch.bincount(TARGET, minlength=len(KINDS)).float()
-        self.distributions = {"target": self.target, "all": self.space}
-        self.measurements = [
-            f"{name}_{what}" for name in self.distributions for what in ("success", "return")
-        ]
-        self._solver = solver
-        self._levels = levels
-        self._measured_on = {
-            name: cars.sample(levels, Streams(0, "evaluation", name).generator())
-            for name, cars in self.distributions.items()
-        }
+        super().__init__(
+            distributions={"target": target, "all": kinds},
+            target="target",
+            space=kinds,
+            solver=solver,
+            context=context,
+            levels=levels,
+            greedy=True,
+            measured={"levels": levels, "steps": solver.ppo.horizon},
+        )
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        return {
-            "title": "mountain cars",
-            "levels": "cars",
-            "distributions": list(self.distributions),
-            "space": {name: list(values) for name, values in self.space.axes.items()},
-            "about": {"Measured on": f"{self._levels} cars of a weak engine, and of all kinds"},
-            "key": "Blue: start. Orange: top. Purple: where the car was.",
-            "measured": {"levels": self._levels, "steps": self._solver.ppo.horizon},
-            "exact": True,
-            "samples": {name: self.record(c[:6], None) for name, c in self._measured_on.items()},
-        }
+    def environment(self, levels: TensorDictBase) -> MountainCar:
+        return MountainCar(levels)
 
-    def learner(self, streams: Sequence[Streams]) -> PPO:
-        make = each_from(streams, lambda: MLP(2, 4, 2, 32))
-        network = Population(make, len(streams), batched=True)
-        split = TensorDictModule(lambda x: x.split([3, 1], -1), ["x"], ["logits", "state_value"])
-        head = TensorDictSequential(TensorDictModule(network, ["observation"], ["x"]), split)
-        agent = ActorCritic(head, distribution_class=categorical, copies=len(streams))
-        levels = self.target.sample(self.batch_size, torch.Generator())
-        env = MountainCar(levels.expand(len(streams), self.batch_size))
-        return PPO(env, agent, self._solver.ppo)
+    def network(self) -> nn.Module:
+        return Network()
 
-    def performance(
-        self, agent: ActorCritic, levels: TensorDictBase, generator: torch.Generator
-    ) -> TensorDict:
-        """Whether the most probable actions lead to the top in time, and their return."""
-        env = MountainCar(levels.expand(agent.copies, levels.batch_size[-1]))
-        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            after = env.rollout(self._solver.ppo.horizon, agent.actor(), break_when_any_done=False)
-        done = after["next", "terminated"].squeeze(-1).long()
-        playing = done.cumsum(-1) - done == 0
-        returns = (after["next", "reward"].squeeze(-1) * playing).sum(-1)
-        success = first_episode_success(after).float()
-        return TensorDict({"return": returns, "success": success}, env.batch_size)
-
-    def probe(self, agent: ActorCritic, levels: TensorDictBase) -> Tensor:
-        """Probabilities of the first action, [K, C, 3]."""
-        state = MountainCar(levels.expand(agent.copies, *levels.batch_size)).reset()
-        return agent(state)["logits"].softmax(-1)
-
-    def probe_encoder(self, features: int) -> nn.Module:
-        return nn.Linear(3, features)
-
-    def measure(self, agent: ActorCritic) -> TensorDict:
-        measured = {
-            f"{name}_{what}": performance[what].mean(1)
-            for name, performance in self.performances(agent).items()
-            for what in ("success", "return")
-        }
-        return TensorDict(measured, [agent.copies])
-
-    def performances(self, agent: ActorCritic) -> dict[str, TensorDict]:
-        return {
-            name: self.performance(agent, levels, torch.Generator())
-            for name, levels in self._measured_on.items()
-        }
-
-    def statistics(self, levels: TensorDictBase, rollout: TensorDictBase) -> TensorDict:
-        means = {name: levels[name].mean(-1) for name in ("gravity", "power")}
-        success = first_episode_success(rollout).float().mean(-1)
-        return TensorDict({**means, "train_success": success}, levels.batch_size[:1])
-
-    def record(
-        self, levels: TensorDictBase, rollout: TensorDictBase | None
-    ) -> list[dict[str, Any]]:
+    def pictures(self, levels: TensorDictBase, rollout: TensorDictBase | None) -> list[np.ndarray]:
         places = [[float(level["start"])] for level in levels]
         if rollout is not None:
             seen = 0.9 * rollout["next", "observation"][..., 0]
             done = rollout["next", "done"].squeeze(-1).long()
             first = done.cumsum(-1) - done == 0
             places = [p + s[e].tolist() for p, s, e in zip(places, seen, first, strict=True)]
-        return [
-            {
-                "picture": png(draw_valley(where)),
-                "text": [f"gravity {level['gravity']:.2f}", f"power {level['power']:.2f}"],
-            }
-            for level, where in zip(levels, places, strict=True)
-        ]
+        return [draw_valley(where) for where in places]
 
 
 def draw_valley(places: Sequence[float]) -> np.ndarray:

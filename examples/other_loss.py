@@ -21,7 +21,7 @@ from mountain_car import MountainCarTask
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.objectives import A2CLoss, ReinforceLoss
 
-from proposer_rl import Place, PPOSettings, SolverSettings, Streams, performance_gain
+from proposer_rl import ComputeContext, PPOSettings, SolverSettings, Streams, performance_gain
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.settings import LearningSettings, ProposerSettings
 
@@ -44,7 +44,9 @@ def main(cycles: int = 20) -> None:
     """Train a Proposer for mountain cars with each; every cycle begins with a fresh Solver."""
     torch.set_num_threads(1)
     ppo = PPOSettings(horizon=40, learning_rate=4e-3)
-    task = MountainCarTask(levels=64, solver=SolverSettings(batch_size=16, ppo=ppo), place=Place())
+    task = MountainCarTask(
+        levels=64, solver=SolverSettings(batch_size=16, ppo=ppo), context=ComputeContext()
+    )
     settings = ProposerSettings(
         meta_episode_length=UPDATES,
         action_repeat=UPDATES // 2,

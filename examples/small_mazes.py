@@ -11,9 +11,9 @@ from torch import nn
 
 from proposer_rl import (
     PPO,
+    ComputeContext,
     Curriculum,
     Experiment,
-    Place,
     PPOSettings,
     Schedule,
     SolverSettings,
@@ -45,7 +45,7 @@ def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
         encoder_channels=[8, 16],
         evaluation=EvaluationSettings(distributions=["id"], levels=128),
         solver=SolverSettings(batch_size=32, ppo=ppo),
-        place=Place(),
+        context=ComputeContext(),
         make_network=network,
     )
 

@@ -25,13 +25,14 @@ from proposer_rl.models import (
 )
 from proposer_rl.settings import PPOSettings, Schedule, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 
 __all__ = [
     "PPO",
     "ActorCritic",
+    "ComputeContext",
     "Curriculum",
     "ExactEvaluator",
     "Experiment",
@@ -43,7 +44,6 @@ __all__ = [
     "Mixture",
     "MixtureHead",
     "PPOSettings",
-    "Place",
     "Population",
     "ProblemChoices",
     "ProblemHead",

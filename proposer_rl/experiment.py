@@ -48,7 +48,7 @@ class Experiment:
             improvement.
 
     Raises:
-        ValueError: if the headline is none of the task's measurements.
+        ValueError: if the headline is none of the task's metrics.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ class Experiment:
 
     def _measure_levels(self) -> None:
         """Append what every copy reaches on each single level that it was measured on."""
-        for name, performance in self.task.performances(self.learner.agent).items():
+        for name, performance in self.task.evaluate(self.learner.agent).items():
             for copy, seed in enumerate(self.seeds):
                 reached = {str(key): value[copy].tolist() for key, value in performance.items()}
                 row = {"seed": seed, "updates": self.updates, "distribution": name, **reached}
@@ -263,7 +263,7 @@ class Experiment:
 
     def _record(self, levels: Any, update: Update) -> None:
         """Append how the training went and samples of its levels, for every copy."""
-        told = self.task.statistics(levels, update.rollout), update.metrics
+        told = self.task.training_metrics(levels, update.rollout), update.metrics
         for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
             self._append("training.csv", seed, {**values, **training})
         some = slice(RECORDED_LEVELS)
@@ -358,10 +358,10 @@ def check_headline(task: Task, schedule: Schedule) -> None:
     """Refuse to sum runs up by what is not measured, or not reached.
 
     Raises:
-        ValueError: if the headline is none of the task's measurements, or a rate that is to reach
+        ValueError: if the headline is none of the task's metrics, or a rate that is to reach
             what no rate can.
     """
-    headline, threshold, known = schedule.headline, schedule.threshold, list(task.measurements)
+    headline, threshold, known = schedule.headline, schedule.threshold, list(task.metrics)
     if headline not in known:
         raise ValueError(f"schedule.headline={headline!r}: must be one of {known}")
     if not can_reach(headline, threshold):

@@ -1,4 +1,8 @@
-"""Every setting that is not a task's: plain frozen dataclasses, their defaults and their ranges.
+"""What an argument may be is said once, in the signature; and the settings that are no task's.
+
+:func:`checked` holds a constructor or a factory to the types and bounds of its own signature, for
+whoever calls it; the command line asks the same of what it makes, by :func:`arguments`, and puts
+its key before the line. The settings are frozen dataclasses that are checked in this way, too.
 
 ``conf/train.yaml`` lists the same values (a test compares them) and says in a line what each does.
 A rule that joins several settings stands where the object is built that needs it.
@@ -6,24 +10,215 @@ A rule that joins several settings stands where the object is built that needs i
 
 from __future__ import annotations
 
+import functools
+import inspect
+import json
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeVar, dataclass_transform
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    dataclass_transform,
+    get_type_hints,
+)
 
 from annotated_types import Ge, Gt, Interval, Le, Len
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticUserError
 
 T = TypeVar("T")
+P = ParamSpec("P")
+
+Count = Annotated[int, Interval(ge=1, le=1_000_000)]
+"""Of what is counted, at least one: more than a million would not fit, or never come to pass."""
+Share = Annotated[float, Interval(ge=0, le=1)]
+"""A part of a whole, or a probability."""
+Positive = Annotated[float, Gt(0)]
+"""A number above zero."""
+
+
+class ArgumentError(ValueError):
+    """An argument is not allowed: one line ``name=value: what is allowed``.
+
+    Rules that join several arguments raise it in the same form. A callable that passes on what it
+    was given as one argument puts that argument's name and a dot before the line.
+    """
+
+
+def checked(function: Callable[P, T]) -> Callable[P, T]:
+    """Hold every call of a function to its signature; of a class, decorate ``__init__``.
+
+    What may be given stands in the annotations alone: ``step: Positive``,
+    ``source: Literal["exact", "episodes"]``, ``every: Annotated[int, Interval(ge=1, le=100)]``.
+    See :func:`arguments` for how values are read. Defaults are not checked.
+
+    Raises:
+        ArgumentError: by the decorated function, for the first argument that is not allowed.
+
+    Example:
+        >>> @checked
+        ... def softmax(scores: list[float], temperature: Positive = 1.0) -> float:
+        ...     return max(scores) / temperature
+        >>> softmax([1, 2], temperature=0)
+        Traceback (most recent call last):
+        ...
+        proposer_rl.settings.ArgumentError: temperature=0: input should be greater than 0
+    """
+    signature = inspect.signature(function)
+    variadic = [
+        p.name for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+    ]
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        _check_names(function, kwargs, (), missing=False)
+        bound = signature.bind(*args, **kwargs)
+        given = {name: value for name, value in bound.arguments.items() if name not in variadic}
+        bound.arguments.update(_checked_values(function, given))
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+def arguments(
+    function: Callable[..., Any], values: Mapping[str, Any], given: Collection[str] = ()
+) -> dict[str, Any]:
+    """Check arguments against the signature of what will be called with them.
+
+    Numbers are read strictly (true is no number, "3" is none, 1.0 no integer), infinity and NaN are
+    refused, a list may stand for a tuple and a mapping for settings. An argument whose type says
+    nothing that could be checked, such as a task, is passed on as it is.
+
+    Args:
+        function: a class or function.
+        values: by name.
+        given: names of arguments that it gets otherwise.
+
+    Returns:
+        The same arguments, with the values as the signature's types have them.
+
+    Raises:
+        ArgumentError: for the first value that is not allowed, and what is; for an unknown name,
+            and which there are; for a name that is missing.
+        NameError: if the annotations name what cannot be found.
+
+    Example:
+        >>> def learn(rate: Positive, source: Literal["exact", "episodes"] = "exact"): ...
+        >>> arguments(learn, {"rate": 1})
+        {'rate': 1.0}
+        >>> arguments(learn, {"rat": 1})
+        Traceback (most recent call last):
+        ...
+        proposer_rl.settings.ArgumentError: rat: unknown; there are: rate, source
+    """
+    _check_names(function, values, given)
+    return _checked_values(function, values)
+
+
+def _check_names(
+    function: Callable[..., Any],
+    values: Mapping[str, Any],
+    given: Collection[str],
+    missing: bool = True,
+) -> None:
+    parameters = inspect.signature(function).parameters.values()
+    named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    known = [p.name for p in named if p.name not in ("self", *given)]
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    for name in values:
+        if name not in known and not takes_any:
+            there_are = f"there are: {', '.join(known)}" if known else "there are none"
+            raise ArgumentError(f"{name}: unknown; {there_are}")
+    for parameter in named:
+        asked = parameter.default is parameter.empty and parameter.name in known
+        if missing and asked and parameter.name not in values:
+            raise ArgumentError(f"{parameter.name}: missing")
+
+
+def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    adapters = _adapters(function)
+    read = dict(values)
+    for name, adapter in adapters.items():  # in the signature's order: the first is told
+        if name in values and adapter is not None:
+            read[name] = _read(name, values[name], adapter)
+    return read
+
+
+@functools.cache
+def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None]:
+    typed = function.__init__ if inspect.isclass(function) else function
+    hints = get_type_hints(typed, include_extras=True)
+    hints.pop("return", None)
+    return {name: _adapter(hint) for name, hint in hints.items()}
+
+
+def _adapter(hint: Any) -> TypeAdapter[Any] | None:
+    """What reads values of a type; None for one that pydantic knows nothing of, as a task."""
+    for config in (ConfigDict(allow_inf_nan=False), None):  # a dataclass has its own
+        try:
+            return TypeAdapter(hint, config=config)
+        except PydanticUserError:
+            continue
+    return None
+
+
+def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError, RecursionError):
+        text = None
+    try:
+        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
+        if text is not None:
+            return adapter.validate_json(text, strict=True)
+        return adapter.validate_python(value, strict=True)
+    except ValidationError as error:
+        raise ArgumentError(_first_line(error, name, value)) from error
+
+
+def _first_line(error: ValidationError, name: str, value: Any) -> str:
+    errors = error.errors()
+    # Of a union pydantic tells what is wrong with every member; one of another kind is not meant.
+    others = [e["loc"][:-1] for e in errors if e["loc"][-1:] == ("kind",)]
+    meant = [e for e in errors if not any(e["loc"][: len(other)] == other for other in others)]
+    details = (meant or errors)[0]
+    # Where it stands in the value: a union's member is named in the place, too, and is no key.
+    loc: list[int | str] = []
+    folder = inner = value
+    for part in details["loc"]:
+        try:
+            folder, inner = inner, inner[part]
+        except (LookupError, TypeError):
+            if details["type"] != "missing":
+                continue
+        loc.append(part)
+    key = ".".join(map(str, [name, *loc]))
+    message = details["msg"].removeprefix("Value error, ")
+    if not meant:  # of a kind that there is not: the members' kinds are what there is
+        kinds = {str(e["ctx"]["expected"]) for e in errors if e["loc"][-1:] == ("kind",)}
+        message = f"input should be one of {', '.join(sorted(kinds))}"
+    if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = ", ".join(sorted(map(str, folder.keys() - {loc[-1]})))
+        return f"{key}: unknown" + (f"; there are: {known}" if known else "")
+    if details["type"] == "missing":
+        return f"{key}: missing"
+    given = repr(details["input"])
+    given = given if len(given) <= 80 else f"{given[:77]}..."
+    return f"{key}={given}: {message[0].lower()}{message[1:]}"
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def settings(cls: type[T]) -> type[T]:
-    """A frozen, keyword-only dataclass.
+    """A frozen, keyword-only dataclass whose constructor is :func:`checked`.
 
-    Ranges stand in the annotations (``Annotated[int, Ge(1)]``). Library code constructs the class
-    like any dataclass; the command line validates its values against the annotations first, and
-    refuses keys that the class does not have, and infinite numbers.
+    Ranges stand in the annotations (``Annotated[int, Ge(1)]``).
     """
     decorated = dataclass(frozen=True, kw_only=True)(cls)
     decorated.__pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # type: ignore[attr-defined]
+    decorated.__init__ = checked(decorated.__init__)  # type: ignore[method-assign]
     return decorated
 
 
@@ -218,7 +413,7 @@ class ComputeSettings:
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
-        graphs: replay updates and evaluations as CUDA graphs on a GPU.
+        graphs: replay updates and evaluations as CUDA graphs on a GPU, where it is untried.
         threads: CPU threads of one operation; None leaves torch's choice.
         cores: copies of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
@@ -229,7 +424,7 @@ class ComputeSettings:
     """
 
     device: str = "auto"
-    graphs: bool = True
+    graphs: bool = False
     threads: Annotated[int, Ge(1), Le(1024)] | None = None
     cores: Annotated[int, Ge(1), Le(1024)] | None = None
     collector: Literal["single", "multiprocess", "ray"] = "single"

@@ -17,7 +17,7 @@ class Streams:
 
     A generator's state depends only on the seed and its key, such as ``("actions", step, copy)``.
     So nothing has to be saved to resume a run, a new consumer of random numbers changes no other,
-    and copies draw the same numbers wherever and in whatever company they run.
+    and replicas draw the same numbers wherever and in whatever company they run.
 
     Args:
         seed: the run's seed.

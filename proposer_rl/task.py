@@ -1,40 +1,53 @@
-"""The contract of a task: what loops, curricula, commands and reports may ask of an environment.
+"""The contract of a task, and what all tasks share.
 
-A task is any object with these members; nothing is inherited. What it takes as a level is its own
-business: a tensordict or tensorclass of any content, whose batch shape alone is looked at. K are
-Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
+A task is an environment in which Solvers are trained, and how they are measured there. What it
+takes as a level is its own business: a tensordict or tensorclass of any content, whose batch shape
+alone matters. K are Solvers, P the levels of one update, T its steps, E validation levels, C
+probes, N bins.
 
-:class:`~proposer_rl.tasks.mazes.task.MazeTask` is one, ``examples/mountain_car.py`` another.
-Methods that
-need more of a task than all of them have ask for it by name, with the optional parts below.
+:class:`Task` asks for three things: levels to draw from, an environment that plays them, and a
+network; all the rest can be replaced. ``examples/own_task.py`` is a whole task in forty lines.
+Curricula that need more of a task than all of them have ask for it by name, with the optional parts
+below.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO
-from proposer_rl.models import ActorCritic
-from proposer_rl.streams import Streams
+from proposer_rl.learning import PPO, first_episode_return, first_episode_success
+from proposer_rl.learning.episodes import mean_performance
+from proposer_rl.models import ActorCritic, Population, categorical, normal
+from proposer_rl.runs.pictures import pixels, png, written
+from proposer_rl.settings import SolverSettings
+from proposer_rl.streams import Streams, each_from
 
 Levels = Any
 """A tensordict or tensorclass of levels."""
 
+SAMPLES = 6  # levels of each distribution that a reader is shown
+NAMED = 128  # levels of a distribution that are evaluated one by one
+
 
 class NoSuccessError(ValueError):
-    """A task tells no success, and it was asked for; the message is a line that says what to do."""
+    """A task has no success, and it was asked for; the message is a line that says what to do."""
 
     exit_code = 2
 
 
-class Place(NamedTuple):
+class ComputeContext(NamedTuple):
     """Where and how exactly a task computes; what makes a task is called with one.
 
     Attributes:
@@ -57,67 +70,169 @@ class Distribution(Protocol):
 
 
 class Space(Distribution, Protocol):
-    """The levels that a Proposer chooses among, in N bins; ``sample`` draws evenly from them.
-
-    Attributes:
-        axes: the values along each axis, by the axis's name; the bins are their product, the last
-            axis running fastest.
-        size: the number N of bins.
-        coordinates: of each bin, scaled to [-1, 1] along every axis, float32 [N, D] on the CPU.
-    """
-
-    axes: Mapping[str, Sequence[float]]
-    size: int
-    coordinates: Tensor
-
-    def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, P] of bins, int64 [K, P], on the task's device; copy k's from generator k."""
-
-
-@runtime_checkable
-class Task(Protocol):
-    """An environment in which Solvers are trained, and how they are looked at.
-
-    Attributes:
-        device: where Solvers and levels live.
-        precision: of the Solvers' networks, ``"fp32"`` or ``"bf16"``.
-        batch_size: levels P of an update of one Solver.
-        target: the distribution that is to be mastered.
-        space: what a Proposer chooses among.
-        distributions: by name, for curricula by hand.
-        measurements: the names of what :meth:`measure` tells.
-        exact_performance: whether :meth:`performance` draws nothing at random.
-    """
-
-    device: torch.device
-    precision: str
-    batch_size: int
-    target: Distribution
-    space: Space
-    distributions: Mapping[str, Distribution]
-    measurements: Sequence[str]
-    exact_performance: bool
+    """The levels that a Proposer chooses among, in N bins; ``sample`` draws uniformly from them."""
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """What a reader of a run is told of the task, for JSON.
+    def axes(self) -> Mapping[str, Sequence[float]]:
+        """The values along each axis, by the axis's name.
 
-        - ``title``: of its runs, and ``levels``: what levels are called;
-        - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
-        - ``space``: the axes of the Proposer's bins;
-        - ``about``: texts by their labels; ``key`` and ``text_key``: what is to be seen in a
-          record's picture and in its text;
-        - ``measured``: all that must be equal for two runs' measurements to be comparable;
-        - ``exact``: whether the measurements draw nothing at random;
-        - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
+        The bins are their product, the last axis running fastest.
         """
+
+    @property
+    def size(self) -> int:
+        """The number N of bins."""
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Of each bin, scaled to [-1, 1] along every axis: float32 [N, D] on the CPU."""
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
+        """Levels [K, P] of bins, int64 [K, P], on the task's device; row k from generator k."""
+
+
+class LevelResult(NamedTuple):
+    """What one Solver reaches on one level, as ``bin/eval`` lists it.
+
+    Attributes:
+        level: the level's name.
+        solver: the Solver's number among those of a population.
+        about: what the level is like, by name.
+        results: the performance, ``success`` and ``return``, and whatever else there is, by name.
+        note: a few words for below a picture.
+        picture: draws what the Solver does there, uint8 [H, W, 3].
+    """
+
+    level: str
+    solver: int
+    about: Mapping[str, float]
+    results: Mapping[str, float]
+    note: str
+    picture: Callable[[], NDArray[np.uint8]]
+
+
+class Task(ABC):
+    """An environment in which Solvers are trained, and how they are measured.
+
+    One word has one meaning. A **performance** is what Solvers reach on levels: return and success.
+    To **evaluate** is to find it on the fixed evaluation levels, one by one. **Metrics** are the
+    numbers that sum this up (:meth:`measure`), or the training (:meth:`training_metrics`).
+    **Records** are levels as pictures and text. **Facts** describe the task for readers.
+
+    A task must give :meth:`environment`, :meth:`network`, a ``title``, and call this constructor.
+
+    Args:
+        distributions: by name, for hand-designed curricula and to be measured on.
+        target: the name of the one that is to be mastered.
+        space: what a Proposer chooses among.
+        solver: the Solver's training.
+        context: device, precision and cores.
+        measured_on: names of the distributions that Solvers are measured on; None for all.
+        levels: fixed evaluation levels E of each of them, the same in every run.
+        seed: from which they are drawn, and the actions of the evaluations' episodes.
+        max_steps: of an episode in evaluations; None for the horizon of the training's rollouts.
+        episodes: played on each level to measure a performance.
+        greedy: whether their actions are the most probable ones; else they are drawn.
+        measured: all further settings that must be equal for two runs' metrics to be comparable,
+            for JSON.
+
+    Attributes:
+        title: of its runs.
+        noun: what levels are called, in the plural.
+        key: what is to be seen in a record's picture.
+        text_key: what is to be seen in a record's text; None where it explains itself.
+        results: entries of a performance, ``"return"`` and, where it has a meaning, ``"success"``.
+        exact_performance: whether :meth:`performance` draws nothing at random.
+        exact_metrics: whether :meth:`measure` draws nothing at random.
+        default_levels: the name that :meth:`level_results` takes where none is given.
+        reward_scale: that rewards of training were multiplied with; returns are given without it.
+        batched: as of :class:`~proposer_rl.models.Population`.
+        episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
+        batch_size: levels P of an update of one Solver.
+        evaluated_on: the fixed evaluation levels [E], by the distributions' names.
+
+    Raises:
+        ValueError: naming the key, if there is no distribution of some name.
+    """
+
+    title: str
+    noun: str = "levels"
+    key: str = "The level's numbers."
+    text_key: str | None = None
+    results: Sequence[str] = ("success", "return")
+    exact_performance: bool = False
+    reward_scale: float = 1.0
+    batched: bool | None = None
+    episodes_at_once: int | None = None
+
+    def __init__(
+        self,
+        *,
+        distributions: Mapping[str, Distribution],
+        target: str,
+        space: Space,
+        solver: SolverSettings,
+        context: ComputeContext,
+        measured_on: Sequence[str] | None = None,
+        levels: int = 64,
+        seed: int = 0,
+        max_steps: int | None = None,
+        episodes: int = 1,
+        greedy: bool = False,
+        measured: Mapping[str, Any] | None = None,
+    ) -> None:
+        names = list(distributions if measured_on is None else measured_on)
+        check_names(distributions, target, names)
+        self.device = torch.device(context.device)
+        self.precision = "fp32" if context.precision == "auto" else context.precision
+        self.batch_size = solver.batch_size
+        self.distributions: Mapping[str, Any] = dict(distributions)
+        self.target: Any = distributions[target]
+        self.space: Any = space
+        self.solver = solver
+        self.cores = context.cores
+        self.max_steps = max_steps or solver.ppo.horizon
+        self.episodes, self.greedy = episodes, greedy
+        self.default_levels = names[0]
+        self._levels, self._seed = levels, seed
+        self._measured = dict(measured or {"levels": [levels, seed], "target": target})
+        self.evaluated_on = {name: self.evaluation_levels(name) for name in names}
+
+    @abstractmethod
+    def environment(self, levels: Levels) -> EnvBase:
+        """An environment that plays levels [*B] from its next reset on.
+
+        It has a method ``set_levels(levels [*B])``; it plays those from its next reset on. An
+        episode's success is its entry ``success``, bool [*B, 1], or else that it terminated.
+        """
+
+    def evaluation_environment(self, levels: Levels) -> EnvBase:
+        """The same for evaluations and probes, which make one for each batch of levels [K, E]."""
+        return self.environment(levels)
+
+    @abstractmethod
+    def network(self) -> nn.Module:
+        """The network of one Solver, without buffers, its weights from torch's default generator.
+
+        Where :meth:`actor_critic` is not replaced: from ``observation`` [*B, ...] to logits
+        [*B, A], or locations and log-scales [*B, D, 2] of continuous actions, and values [*B, 1].
+        """
+
+    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
+        """K networks as the agent of an environment [K, P]."""
+        module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
+        discrete = isinstance(env.full_action_spec["action"], Categorical)
+        distribution = categorical if discrete else normal
+        return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
-        """PPO of K fresh Solvers, one for each of the streams, in their environment [K, P].
-
-        The environment has a method ``set_levels(levels [K, P])``; it plays them from its next
-        reset on.
-        """
+        """PPO of K fresh Solvers, one for each of the streams, in their environment [K, P]."""
+        copies, make = len(streams), each_from(streams, self.network)
+        population = Population(make, copies, self.precision, self.cores, self.batched)
+        # A placeholder of the right shape; every update sets its own levels.
+        level = next(iter(self.evaluated_on.values()))[:1]
+        env = self.environment(level.expand(copies, self.batch_size))
+        return PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
 
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator
@@ -128,31 +243,203 @@ class Task(Protocol):
         ``success`` the probability of success, where that has a meaning. An exact evaluation has no
         use for the generator, which is on the CPU.
         """
+        performance = mean_performance(
+            agent,
+            self.evaluation_environment,
+            for_copies(agent, levels),
+            generator,
+            max_steps=self.max_steps,
+            episodes=self.episodes,
+            greedy=self.greedy,
+            reward_scale=self.reward_scale,
+            at_once=self.episodes_at_once,
+        )
+        return performance if "success" in self.results else performance.exclude("success")
 
+    @torch.no_grad()
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
-        """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...]."""
+        """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
+
+        Here at the beginning of each level: probabilities of n actions, or the means of continuous
+        ones, [K, C, D].
+        """
+        copies = for_copies(agent, levels)
+        if not copies.batch_size.numel():
+            return torch.zeros(*copies.batch_size, self._actions, device=self.device)
+        state = self.evaluation_environment(copies).reset()
+        state.update(agent.no_memory(state))
+        logits = agent(state)[agent.logits_key]
+        return logits.softmax(-1) if logits.ndim == 3 else logits[..., 0]
 
     def probe_encoder(self, features: int) -> nn.Module:
-        """A network from probes [*B, ...] to features [*B, features]."""
+        """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
+        return nn.Linear(self._actions, features)
+
+    @property
+    def metrics(self) -> list[str]:
+        """The names of what :meth:`measure` gives."""
+        return [f"{name}_{result}" for name in self.evaluated_on for result in self.results]
 
     def measure(self, agent: ActorCritic) -> TensorDictBase:
-        """Measurements of K Solvers by name, each float [K]: the columns of ``metrics.csv``."""
+        """Metrics of K Solvers by name, each float [K]: the columns of ``metrics.csv``.
 
-    def performances(self, agent: ActorCritic) -> Mapping[str, TensorDictBase]:
-        """What K Solvers reach on each of the levels behind the measurements.
-
-        By the names of the distributions measured on, a :meth:`performance` each, [K, E].
+        Here ``<name>_success`` and ``<name>_return``, means over the evaluation levels of each
+        distribution measured on.
         """
+        means = {
+            f"{name}_{result}": performance[result].mean(1)
+            for name, performance in self.evaluate(agent).items()
+            for result in self.results
+        }
+        return TensorDict(means, [agent.copies])
 
-    def statistics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
-        """What Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K]."""
+    def evaluate(self, agent: ActorCritic) -> Mapping[str, TensorDictBase]:
+        """The performance of K Solvers on every evaluation level, [K, E] by distribution.
+
+        The random numbers of the actions are the same every time.
+        """
+        return {
+            name: self.performance(agent, levels, self.stream("actions", name))
+            for name, levels in self.evaluated_on.items()
+        }
+
+    def evaluation_levels(self, name: str) -> Levels:
+        """The fixed evaluation levels [E] of a distribution."""
+        return self.distributions[name].sample(self._levels, self.stream("levels", name))
+
+    def stream(self, use: str, name: str) -> torch.Generator:
+        """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
+        scope = {"levels": "evaluation", "actions": "episodes"}[use]
+        return Streams(self._seed, scope, name).generator()
+
+    def training_metrics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
+        """What Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K].
+
+        The columns of ``training.csv``: here means of the entries that are axes of the space, and
+        of the first episodes' success and return.
+        """
+        means = {name: levels[name].double().mean(-1) for name in self._numbers(levels)}
+        if "success" in self.results:
+            means["train_success"] = first_episode_success(rollout).float().mean(-1)
+        means["train_return"] = first_episode_return(rollout).mean(-1) / self.reward_scale
+        return TensorDict(means, levels.batch_size[:1])
 
     def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
-        """Levels [n], and what one Solver did there [n, T], for JSON and to be looked at.
+        """Levels [n], and what one Solver did there [n, T], as pictures and text, for JSON.
 
         Each record has a ``picture``, a PNG in base64, and may have ``text``, its lines as they
         are shown in a terminal, and anything else.
         """
+        texts = [
+            [f"{name} {float(level[name]):.4g}" for name in self._numbers(levels)]
+            for level in levels
+        ]
+        pictures = self.pictures(levels, rollout) or map(written, texts)
+        return [{"picture": png(p), "text": t} for p, t in zip(pictures, texts, strict=True)]
+
+    def pictures(
+        self, levels: Levels, rollout: TensorDictBase | None
+    ) -> Sequence[NDArray[np.uint8]]:
+        """Pictures uint8 [H, W, 3] for :meth:`record`; none for the level's numbers instead."""
+        return []
+
+    @property
+    def exact_metrics(self) -> bool:
+        """Whether :meth:`measure` draws nothing at random."""
+        return self.exact_performance
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Texts about the task, by their labels."""
+        names = ", ".join(self.evaluated_on)
+        return {"Measured on": f"{names}; {self._levels} fixed levels each"}
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What readers of a run need to know of the task, for JSON.
+
+        - ``title``: of its runs, and ``levels``: what levels are called;
+        - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
+        - ``space``: the axes of the Proposer's bins;
+        - ``about``: texts by their labels; ``key`` and ``text_key``: what is to be seen in a
+          record's picture and in its text;
+        - ``measured``: all that must be equal for two runs' metrics to be comparable;
+        - ``exact``: whether the metrics draw nothing at random;
+        - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
+        """
+        return {
+            "title": self.title,
+            "levels": self.noun,
+            "distributions": list(self.evaluated_on),
+            "space": {name: list(values) for name, values in self.space.axes.items()},
+            "about": self.about,
+            "key": self.key,
+            **({"text_key": self.text_key} if self.text_key else {}),
+            "measured": self._measured,
+            "exact": self.exact_metrics,
+            "samples": {
+                name: self.record(levels[:SAMPLES], None)
+                for name, levels in self.evaluated_on.items()
+            },
+        }
+
+    def level_results(
+        self, agent: ActorCritic, name: str, max_steps: int | None
+    ) -> Sequence[LevelResult]:
+        """What K Solvers reach on each level of a named set, in the set's order.
+
+        Args:
+            agent: K Solvers.
+            name: of the set: here of a distribution.
+            max_steps: step limit of every level; None for the task's choice. Here nothing else.
+
+        Raises:
+            ValueError: if there is no such set, or its levels are none for these Solvers.
+            StorageError: if a file cannot be read.
+        """
+        if name not in self.distributions:
+            raise ValueError(f"--levels {name}: must be one of: {', '.join(self.distributions)}")
+        if max_steps is not None:
+            raise ValueError("--max-steps: the step limit of this task's levels is fixed")
+        streams = Streams(0, "eval", name)
+        levels = self.distributions[name].sample(NAMED, streams.generator())
+        performance = self.performance(agent, levels, streams.generator()).cpu()
+        copies, count = performance.batch_size
+
+        def picture(index: int) -> NDArray[np.uint8]:
+            return pixels(self.record(levels[index : index + 1], None)[0]["picture"])
+
+        return [
+            LevelResult(
+                level=f"{name}_{i:03}",
+                solver=k,
+                about={},
+                results={str(key): float(value) for key, value in performance[k, i].items()},
+                note="",
+                picture=partial(picture, i),
+            )
+            for i in range(count)
+            for k in range(copies)
+        ]
+
+    @property
+    def _actions(self) -> int:
+        """Number of actions to choose from, or of the parts of a continuous one."""
+        level = next(iter(self.evaluated_on.values()))[:1]
+        spec = self.evaluation_environment(level.expand(1, 1)).full_action_spec["action"]
+        return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
+
+    def _numbers(self, levels: Levels) -> list[str]:
+        """Axes of the space that are entries of the levels."""
+        return [name for name in self.space.axes if name in levels.keys()]
+
+
+class ExactTask(Task):
+    """A task whose performance has gradients; see :class:`DifferentiableTask`."""
+
+    @abstractmethod
+    def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
+        """As :meth:`DifferentiableTask.differentiable_performance`."""
 
 
 @runtime_checkable
@@ -164,10 +451,6 @@ class DifferentiableTask(Protocol):
 
         Where gradients are enabled, with gradients towards the agent's parameters.
         """
-
-
-class ExactTask(Task, DifferentiableTask, Protocol):
-    """A whole task whose performance has gradients."""
 
 
 @runtime_checkable
@@ -213,7 +496,7 @@ class EpisodeLaw(NamedTuple):
 
 @runtime_checkable
 class EnumerableTask(Protocol):
-    """A task all of whose episodes can be told: scores of spread and of the critic, exactly."""
+    """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
 
     def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
         """The law of the episodes of K Solvers, each on its own levels [K, E]."""
@@ -224,147 +507,29 @@ class EditableTask(Protocol):
     """A task whose levels can be changed a little."""
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, n] after ``count`` small random edits each; copy k's from generator k."""
+        """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
 
 
-class Score(NamedTuple):
-    """What one Solver does on one named level.
+def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
+    """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
+    return levels.expand(agent.copies, levels.batch_size[-1])
 
-    Attributes:
-        level: its name.
-        solver: the Solver's number among those of a population.
-        about: what the level is like, by name.
-        results: ``success`` and ``return``, and whatever else the task tells, by name.
-        note: a few words for below a picture.
-        picture: draws what the Solver does there, uint8 [H, W, 3].
+
+def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
+    """Refuse unknown names of distributions.
+
+    Raises:
+        ValueError: naming the key.
     """
-
-    level: str
-    solver: int
-    about: Mapping[str, float]
-    results: Mapping[str, float]
-    note: str
-    picture: Callable[[], NDArray[np.uint8]]
+    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
 
 
-@runtime_checkable
-class ScoringTask(Protocol):
-    """A task with named levels: files of them, sets that come along.
-
-    Attributes:
-        default_levels: name of the set that is taken where none is named.
-    """
-
-    default_levels: str
-
-    def scores(self, agent: ActorCritic, name: str, max_steps: int | None) -> Sequence[Score]:
-        """How K Solvers do on each level of a set, in the set's order.
-
-        Args:
-            agent: K Solvers.
-            name: of the set: a file, a distribution or whatever else there is.
-            max_steps: step limit of every level; None for the task's choice.
-
-        Raises:
-            ValueError: if there is no such set, or its levels are none for these Solvers.
-            StorageError: if a file cannot be read.
-        """
-
-
-class CellKind(NamedTuple):
-    """What a cell of a drawing can be.
-
-    Attributes:
-        mark: its character.
-        name: what it is called, one word.
-        once: whether a drawing has exactly one of it, or of all kinds of its name.
-    """
-
-    mark: str
-    name: str
-    once: bool = False
-
-
-class Board(Protocol):
-    """Levels as drawings with one character per cell, and all that a Solver does on one.
-
-    Attributes:
-        kinds: of cells, the empty one first.
-        size: rows and columns of the run's own levels.
-        actions: the arrow key of each action, up, down, left or right, in any order.
-        sets: names of the sets of levels that come along.
-    """
-
-    kinds: Sequence[CellKind]
-    size: tuple[int, int]
-    actions: Sequence[str]
-    sets: Sequence[str]
-
-    def read(self, rows: Sequence[str]) -> Levels:
-        """The level [] that is drawn.
-
-        Raises:
-            ValueError: if it is none, or none for the Solvers of this task.
-        """
-
-    def draw(self, level: Levels) -> list[str]:
-        """The drawing of a level [], one text for each row; the inverse of :meth:`read`."""
-
-    def drawing(self, record: Mapping[str, Any]) -> list[str]:
-        """The drawing of the level in one of the task's records (:meth:`Task.record`)."""
-
-    def level_set(self, name: str) -> Mapping[str, Levels]:
-        """The levels [] of one of the sets, by their names."""
-
-    def read_file(self, text: str) -> Mapping[str, Levels]:
-        """The levels [] in the text of a file, by their names.
-
-        Raises:
-            ValueError: if it is no such text.
-        """
-
-    def write_file(self, name: str, level: Levels) -> str:
-        """The text of a file with one level [].
-
-        Raises:
-            ValueError: if the name or the level cannot stand in a file.
-        """
-
-    def examine(
-        self, agent: ActorCritic, solver: int, level: Levels, max_steps: int | None
-    ) -> dict[str, Any]:
-        """What one of K Solvers does on a level [] with H x W cells, for JSON.
-
-        A way is a list of places: row and column, and where an agent turns its direction, too: 0
-        right, 1 down, 2 left, 3 up.
-
-        - ``results``: numbers by name, ``success`` and ``return`` of the sampled policy among them;
-        - ``episodes``: by how many they were found; absent where they are exact;
-        - ``policy``: for every cell the probability of each action; None where there is none to
-          take: [H][W][A]; absent where a Solver does not act by the cell alone;
-        - ``maps``: further numbers of every cell by what they are, [H][W], None where there is
-          none;
-        - ``paths``: ``solver``, the way of the most probable actions, ``shortest``, or None where
-          there is no path, and without a policy ``sampled``, ways of sampled episodes;
-        - ``next``: where each action leads from each place, [A][H * W], cells counted row by row,
-          or [A][H * W * 4], the directions of each cell one after another;
-        - ``goal``: the cell (row, column) that ends an episode with success;
-        - ``max_steps``, ``step_penalty`` (of an episode that reaches the goal), ``missed`` (the
-          return of one that does not): the rules.
-
-        Args:
-            agent: K Solvers.
-            solver: which of them.
-            level: as :meth:`read` gives it.
-            max_steps: step limit; None for the task's choice.
-
-        Raises:
-            ValueError: if what the Solver answers is no policy.
-        """
-
-
-@runtime_checkable
-class PlayableTask(Protocol):
-    """A task whose levels can be drawn by hand, and played in ``bin/play``."""
-
-    board: Board
+def named(key: str, make: Any, *arguments: Any) -> Any:
+    """Make something, naming the key in whatever is wrong with its value."""
+    try:
+        return make(*arguments)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from error

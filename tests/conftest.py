@@ -4,6 +4,8 @@ import os
 
 # Before anything imports pyplot: tests draw into files, also where there is no display.
 os.environ.setdefault("MPLBACKEND", "Agg")
+# And before PyTorch, as commands do: how threads wait beside other processes.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import signal
 from collections.abc import Callable, Iterator

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
+from tensordict.nn import CudaGraphModule, cudagraphs
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -84,21 +88,36 @@ class Tape(TorchDispatchMode):
 
 
 class Tapes:
-    """A :class:`proposer_rl.learning.cuda_graphs.Recorder` for the CPU."""
+    """Lets tensordict's ``CudaGraphModule`` record tapes on the CPU in the place of CUDA graphs.
 
-    def __init__(self) -> None:
+    Attributes:
+        recorded: how many there have been.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.recorded = 0
+        stream = SimpleNamespace(wait_stream=lambda other: None)
+        for name, stand_in in {
+            "is_available": lambda: True,
+            "Stream": lambda device: stream,
+            "current_stream": lambda device=None: stream,
+            "stream": lambda stream: nullcontext(),
+            "synchronize": lambda device=None: None,
+            "CUDAGraph": Tape,
+            "graph": self._record,
+        }.items():
+            monkeypatch.setattr(torch.cuda, name, stand_in)
+        for name in ("PYTREE_REGISTERED_TDS", "PYTREE_REGISTERED_LAZY_TDS"):
+            monkeypatch.setattr(cudagraphs, name, ())  # it would take them out for good
+        own = staticmethod(lambda tensor: None)
+        monkeypatch.setattr(CudaGraphModule, "_check_device_and_grad", own)
 
-    def warm_up(self, function: Callable[[], Any]) -> Any:
-        return function()
-
-    def record(self, function: Callable[[], Any]) -> tuple[Any, Callable[[], object]]:
+    @contextmanager
+    def _record(self, tape: Tape, stream: object) -> Iterator[None]:
         self.recorded += 1
-        tape = Tape()
         with tape:
-            result = function()
+            yield
         tape.put_back()
-        return result, tape.replay
 
 
 def _tensors(tree: Any) -> list[Tensor]:

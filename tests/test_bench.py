@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from proposer_rl.report.timing import read_timing
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import MazeEnv, generate_levels
 from research.benchmarks.__main__ import main
@@ -26,6 +25,7 @@ from research.benchmarks.report import number, summary
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from research.benchmarks.timing import interleave, ratio, threads
+from research.timing import read_timing
 from tests.commands import call
 from tests.report.folders import write_run
 

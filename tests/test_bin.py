@@ -36,7 +36,7 @@ def python(tmp_path: Path) -> dict[str, str]:
 
 
 def test_they_are_all_there() -> None:
-    assert {"bench", "eval", "look", "play", "report", "snr", "train", "watch"} <= MODULES.keys()
+    assert {"bench", "eval", "play", "report", "research", "train", "watch"} <= MODULES.keys()
     assert all(os.access(file, os.X_OK) for file in BIN.iterdir() if file.name != "_environment")
 
 

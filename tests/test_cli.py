@@ -25,7 +25,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted
-from tests.same_run import assert_same_run, tables
+from tests.same_run import tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
@@ -161,7 +161,7 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
     own = Path("own/method/mine.yaml")
     own.parent.mkdir(parents=True)
     own.write_text((CONFIG_FOLDER / "method/target.yaml").read_text())
-    arguments = ["+method=mine", *SMOKE, "lifetimes=2"]
+    arguments = ["+method=mine", *SMOKE]
     ends = [("hydra.run.dir=run", "run"), ("+sweep=quick hydra.sweep.dir=all seed=3", "all/")]
     for words, folder in ends:
         assert train("--config-dir", "own", *words.split(), *arguments) == 128 + signal.SIGTERM
@@ -170,7 +170,7 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
         assert path.startswith("PYTHONPATH=own parts") and command == "bin/train"
         assert words[:2] == ["--config-dir", "own"] and {*arguments} <= {w.lower() for w in words}
         assert not any(word.startswith("+sweep") for word in words)
-        assert folder in words[-1] and "lifetime_" not in words[-1]
+        assert folder in words[-1]
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -233,15 +233,6 @@ def test_a_precision_that_nobody_wrote_is_told_in_one_line(train, capsys) -> Non
     assert error.startswith("error: precision='fp32': the run in") and "'fp8'" in error
 
 
-def test_lives_go_on_in_the_precision_that_they_began_with(train, monkeypatch) -> None:
-    command = ["+method=perf_gain", *SMOKE, "schedule.updates=2", "hydra.run.dir=run"]
-    assert train(*command, "lifetimes=2") == 0
-    shutil.rmtree("run/lifetime_1")  # as if the run had been stopped between the lives
-    monkeypatch.setattr("proposer_rl.tasks.mazes.task.faster_precision", lambda *_: "bf16")
-    assert train(*command, "lifetimes=2") == 0
-    assert json.loads(Path("run/lifetime_1/config.json").read_text())["precision"] == "fp32"
-
-
 def test_multirun_goes_over_methods_and_seeds(train) -> None:
     assert train("-m", "+method=target,domain_randomization", "seed=0,1", *SMOKE) == 0
     summaries = [json.loads(file.read_text()) for file in Path().glob("multirun/*/*/summary.json")]
@@ -261,27 +252,3 @@ def test_the_module_runs_as_a_program() -> None:
     assert result.returncode == 0, result.stderr
     assert "outputs/target/" in result.stdout
     shutil.rmtree("outputs")
-
-
-def test_a_proposer_goes_on_learning_over_several_lifetimes(train) -> None:
-    arguments = ["+method=perf_gain", *SMOKE, "lifetimes=2", "task.evaluation.levels=16"]
-    assert train(*arguments, "hydra.run.dir=whole") == 0
-    first, second = Path("whole/lifetime_0"), Path("whole/lifetime_1")
-    # The first is the run that it would be alone; the second has another Solver, and the Proposer.
-    alone = [a for a in arguments if not a.startswith("lifetimes")]
-    assert train(*alone, "hydra.run.dir=alone") == 0
-    assert_same_run(first, Path("alone"))
-    steps = []
-    for folder in (first, second):
-        latest = load_latest(folder / "checkpoints")
-        assert latest is not None
-        steps += {int(entry["step"]) for entry in latest[1]["curriculum"]["proposer"].values()}
-    assert steps == [4, 8]  # Adam's steps: 2 cycles of 2 epochs in each lifetime
-    assert tables(first)["metrics.csv"][0] != tables(second)["metrics.csv"][0]
-    # The second has begun with what was learnt at the first's end, which cannot be later now.
-    assert train(*arguments, "schedule.updates=12", "hydra.run.dir=whole") == 2
-    # Interrupted between two lifetimes, it goes on as if it had not been.
-    shutil.copytree("whole", "again")
-    shutil.rmtree("again/lifetime_1")
-    assert train(*arguments, "hydra.run.dir=again") == 0
-    assert_same_run(Path("again/lifetime_1"), second)

@@ -21,13 +21,16 @@ from tests.processes import ROOT
 from tests.tasks.gymnasium.toys import TINY
 from tests.test_kill import METHODS
 
-QUIET = ["+scale=smoke", "compute.progress=false"]
+# Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
+FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
+SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5"]
+QUIET = ["+scale=smoke", *FEW, *SHORT]
 CALLED = {
     **{method: [f"+method={method}", *QUIET] for method in METHODS if "frozen" not in method},
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
     "with_a_choice": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
-    "window": ["+method=perf_gain", "task=view_maze_smoke", "compute.progress=false"],
+    "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT],
     "gymnasium": ["+method=perf_gain", "task=cartpole", *TINY],
 }
 
@@ -59,7 +62,7 @@ def run_there() -> Iterator[Run]:
 def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> None:
     said = run_there(tmp_path, *CALLED[name])
     assert said == "", said
-    assert read_csv(tmp_path / "metrics.csv")[-1]["updates"] in (4, 6)
+    assert read_csv(tmp_path / "metrics.csv")[-1]["updates"] in (3, 4)
 
 
 def test_a_frozen_proposer_comes_from_another_device(

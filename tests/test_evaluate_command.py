@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
+from proposer_rl.cli.eval import main
 from proposer_rl.cli.evaluate import SHOWN, load
-from proposer_rl.cli.instruments import evaluate as main
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.tasks.mazes.level_files import shipped_levels

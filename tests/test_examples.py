@@ -45,7 +45,8 @@ def numbers(text: str, pattern: str) -> list[float]:
 def test_each_says_what_it_shows_and_is_listed(name: str) -> None:
     text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
     docstring = text.split('"""')[1]
-    started = "task=mountain_car" if name == "mountain_car" else f"python examples/{name}.py"
+    is_task = (EXAMPLES / "conf" / "task" / f"{name}.yaml").exists()
+    started = f"task={name}" if is_task else f"python examples/{name}.py"
     assert text.startswith('"""') and started in docstring
     assert f"{name}.py" in (ROOT / "docs/how_to/own_parts.md").read_text(encoding="utf-8")
 

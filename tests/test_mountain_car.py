@@ -1,7 +1,8 @@
-"""A task of another kind goes through the commands as mazes do."""
+"""Tasks of other kinds go through the commands as mazes do: cars, and the shortest task."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from signal import SIGKILL
@@ -10,10 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from proposer_rl.cli.eval import main as evaluate
+from proposer_rl.cli.play import open_session
 from proposer_rl.cli.report import main as report
 from proposer_rl.cli.watch import main as watch
+from proposer_rl.play.requests import Drawn, OfCurriculum
 from proposer_rl.report.levels import along_training, side_by_side
 from proposer_rl.runs.folder import read_csv
+from tests.commands import trained_run
 from tests.processes import Processes
 from tests.same_run import assert_same_run
 from tests.tiny import EXAMPLES
@@ -56,3 +61,35 @@ def test_it_trains_is_killed_goes_on_and_is_looked_at(
         # The valley's ground and its top, in the task's own colours.
         ground, top = (np.abs(drawn - c).max(-1) <= 3 for c in ((250, 250, 250), (230, 159, 0)))
         assert ground.mean() > 0.1 and top.any()
+
+
+def test_the_shortest_task_has_every_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    run = trained_run(
+        tmp_path / "run",
+        *("--config-dir", f"{EXAMPLES}/conf", "task=own_task", "+method=domain_randomization"),
+        *("compute.progress=false", "schedule.updates=4", "task.levels=8", "solver.batch_size=4"),
+        *("seeds=[0,1]", "solver.ppo.horizon=10"),
+    )
+    measured = read_csv(run / "metrics.csv")[-1]
+    assert {"target_success", "target_return", "all_success"} <= measured.keys()
+    trained = read_csv(run / "training.csv")[-1]
+    assert 1 <= trained["distance"] <= 9 and 0 <= trained["wind"] <= 1
+    watch([str(run), "--once"])
+    assert "distance" in capsys.readouterr().out
+    evaluate([str(run), "--levels", "all", "-o", str(tmp_path / "rows.json")])
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert len(rows) == 2 * 128 and all(0 <= row["success"] <= 1 for row in rows)
+    with pytest.raises(SystemExit):
+        evaluate([str(run), "--levels", "here"])
+    assert "--levels here: must be one of: target, all" in capsys.readouterr().err
+    session = open_session(run)
+    assert session.about()["board"] is None and session.about()["task_levels"] == "sledges"
+    drawn = Drawn(source="distribution", name="target", seed=3, checkpoint=1, solver=1)
+    for shown in (session.levels(drawn), session.levels(OfCurriculum(source="curriculum", row=0))):
+        assert all(level["picture"] and "wind" in level["text"][1] for level in shown["levels"])
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [along_training])
+    report([str(run), "-q", "-o", str(tmp_path / "report")])
+    assert "Sledges along training" in (tmp_path / "report" / "report.html").read_text("utf-8")

@@ -14,11 +14,11 @@ from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.meta.rewards import performance_gain
 from proposer_rl.methods import Parts, proposer
-from proposer_rl.report.decision import EXACT, GRADIENTS, TARGET
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.tasks.mazes.task import MazeTask
+from research.ranking import EXACT, GRADIENTS, TARGET
 from tests.tiny import TASK, composed
 
 NEEDS = needs([CONFIG_FOLDER])

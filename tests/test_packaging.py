@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tarfile
 import tomllib
+import zipfile
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -16,77 +17,86 @@ from typing import NamedTuple
 import pytest
 import yaml
 
+from proposer_rl.cli.config import methods
+from proposer_rl.cli.places import CONFIG_FOLDER, names
+from tests import minimal
 from tests.processes import python
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-class Installed(NamedTuple):
-    """A source archive, and the folder that the wheel made of it is installed in."""
+class Built(NamedTuple):
+    """A source archive, the wheel made of it, and the folder that this is unpacked in."""
 
     archive: Path
+    wheel: Path
     site: Path
-
-    def __call__(self, command: str, *arguments: str, folder: Path) -> str:
-        """Calls an installed command; the checkout is neither the folder nor on the path."""
-        environment = os.environ | {"PYTHONPATH": str(self.site), "OMP_NUM_THREADS": "1"}
-        process = subprocess.run(
-            [sys.executable, str(self.site / "bin" / command), *arguments],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert process.returncode == 0, process.stderr
-        return process.stdout
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """Without the network: what is needed besides comes from the environment of the tests."""
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """Without the network: what builds it is an extra of the tests."""
     folder = tmp_path_factory.mktemp("dist")
 
-    def run(*arguments: str) -> None:
-        command = [sys.executable, "-m", *arguments]
-        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    def build(target: str, source: Path) -> None:
+        command = [sys.executable, "-m", "hatchling", "build", "--target", target]
+        process = subprocess.run(
+            [*command, "--directory", str(folder)],
+            cwd=source, capture_output=True, text=True, check=False,
+        )  # fmt: skip
         assert process.returncode == 0, process.stderr
 
-    offline = ("--quiet", "--no-index", "--no-deps", "--disable-pip-version-check")
-    run("hatchling", "build", "--target", "sdist", "--directory", str(folder))
+    build("sdist", ROOT)
     (archive,) = folder.glob("*.tar.gz")
-    run("pip", "wheel", *offline, "--no-build-isolation", "-w", str(folder), str(archive))
+    with tarfile.open(archive) as tar:
+        tar.extractall(folder / "source", filter="data")
+    (source,) = (folder / "source").iterdir()
+    build("wheel", source)  # of the archive, as an index would
     (wheel,) = folder.glob("*.whl")
-    run("pip", "install", *offline, "--target", str(folder / "site"), str(wheel))
-    return Installed(archive, folder / "site")
+    with zipfile.ZipFile(wheel) as unpacked:
+        unpacked.extractall(folder / "site")
+    return Built(archive, wheel, folder / "site")
 
 
-def test_it_trains_is_watched_and_reports_from_an_empty_folder(
-    installed: Installed, tmp_path: Path
+# Each extra that a method, a task or a command names; the empty one is none.
+NAMED = ["", "alp-gmm", "box2d", "minigrid", "play", "tensorboard"]
+
+
+@pytest.mark.parametrize("extra", NAMED, ids=[extra or "none" for extra in NAMED])
+def test_everything_runs_where_only_what_it_requires_is_installed(
+    built: Built, extra: str, tmp_path: Path
 ) -> None:
-    said = installed("proposer-train", "+method=target", "+scale=smoke", folder=tmp_path)
-    assert "target, seed 0: " in said
-    (run,) = tmp_path.glob("outputs/target/*")
-    assert (run / "summary.json").is_file()
-    hydra = yaml.safe_load((run / ".hydra" / "hydra.yaml").read_text())["hydra"]
-    sources = {source["provider"]: source["path"] for source in hydra["runtime"]["config_sources"]}
-    assert sources["main"] == str(installed.site / "proposer_rl" / "conf")
-    said = installed("proposer-watch", "outputs", "--once", folder=tmp_path)
-    assert "target, seed 0" in said and "finished" in said
-    installed("proposer-report", "outputs", "-o", "report", folder=tmp_path)
-    assert (tmp_path / "report" / "report.html").is_file()
+    """The tests' tools are not there: what imports one of them, or expects it, fails here alone."""
+    python = minimal.make_environment(tmp_path / "environment", built.wheel, extra)
+    (tmp_path / "work").mkdir()
+    kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
+    process = subprocess.run(
+        [str(python), "-I", minimal.__file__, extra],
+        cwd=tmp_path / "work",
+        env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 0, process.stdout[-1000:] + process.stderr[-4000:]
+    done = [line.split()[1:] for line in process.stdout.splitlines() if line.startswith("DID ")]
+    assert done == list(minimal.commands(extra, methods()))
 
 
-def test_a_sweep_finds_its_configuration(installed: Installed, tmp_path: Path) -> None:
-    arguments = ["+sweep=quick", "+method=target", "+scale=smoke", "seed=0"]
-    installed("proposer-train", *arguments, folder=tmp_path)
-    (summary,) = tmp_path.glob("sweeps/quick/*/summary.json")
-    assert summary.parent.name == "target-none-seed_0"
+def test_every_method_task_and_command_is_called() -> None:
+    called = [words for extra in NAMED for words in minimal.commands(extra, methods())]
+    words = {word for command in called for word in command}
+    assert {f"+method={method}" for method in methods()} <= words
+    # Of view mazes the smallest; task=gymnasium is what the others are made of; task=maze is given.
+    tasks = set(names(CONFIG_FOLDER, "task"))
+    tasks -= {"maze", "gymnasium", "view_maze", "view_maze_quick"}
+    assert {f"task={task}" for task in tasks} <= words
+    assert {f"proposer-{name}" for name, *_ in called} == PROJECT["scripts"].keys()
 
 
-def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -> None:
-    package = installed.site / "proposer_rl"
+def test_a_wheel_holds_the_package_and_its_configuration(built: Built) -> None:
+    package = built.site / "proposer_rl"
     assert (package / "py.typed").is_file()
     for source, made in ((ROOT / "conf", package / "conf"), (ROOT / "proposer_rl", package)):
         wanted = {
@@ -95,7 +105,7 @@ def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -
             if path.is_file() and path.suffix != ".pyc"
         }
         assert wanted <= {path.relative_to(made) for path in made.rglob("*") if path.is_file()}
-    (distribution,) = metadata.distributions(path=[str(installed.site)])
+    (distribution,) = metadata.distributions(path=[str(built.site)])
     assert distribution.version == PROJECT["version"]
     assert distribution.metadata["License-Expression"] == "MIT"
     assert [file.name for file in distribution.files or [] if file.name == "LICENSE"]
@@ -104,8 +114,8 @@ def test_a_wheel_holds_the_package_and_its_configuration(installed: Installed) -
     assert top - {".."} == {"proposer_rl", distribution._path.name}
 
 
-def test_a_source_archive_holds_no_results_and_no_tests(installed: Installed) -> None:
-    with tarfile.open(installed.archive) as archive:
+def test_a_source_archive_holds_no_results_and_no_tests(built: Built) -> None:
+    with tarfile.open(built.archive) as archive:
         top = {name.split("/")[1] for name in archive.getnames()}
     assert {"proposer_rl", "conf", "docs", "examples", "README.md", "CHANGELOG.md"} <= top
     assert "LICENSE" in top
@@ -133,12 +143,8 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert headings[0] == version
 
 
-def test_levels_and_the_gymnasium_environment_come_along(
-    installed: Installed, tmp_path: Path
-) -> None:
-    said = installed("proposer-eval", "--help", folder=tmp_path)
-    assert "that comes along: shapes" in " ".join(said.split())
+def test_the_gymnasium_environment_comes_along(built: Built, tmp_path: Path) -> None:
     code = "import gymnasium; print(gymnasium.make('proposer_rl.tasks.mazes:proposer_rl/Maze-v0'))"
-    process = python(code, path=installed.site, folder=tmp_path)
+    process = python(code, path=built.site, folder=tmp_path)
     assert process.returncode == 0, process.stderr
     assert "proposer_rl/Maze-v0" in process.stdout

@@ -269,7 +269,7 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
 
     def note(config: RunConfig, *_):
         path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
-        made.append((str(path), config.checkpoint, config.seed, config.lifetimes, config.ablation))
+        made.append((str(path), config.checkpoint, config.seed, config.ablation))
         raise KeyError("enough")
 
     monkeypatch.setattr("proposer_rl.cli.run.parts", note)
@@ -277,8 +277,8 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
     assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
     frozen = "sweeps/medium/frozen_proposer-none-seed_107"
     assert made == [
-        (frozen, "results/medium/lives/0/lifetime_2", 107, 1, "none"),
-        ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, 1, "paper_literal"),
+        (frozen, "results/medium/proposer.pt", 107, "none"),
+        ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
     ]
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
 from tests.tasks.gymnasium.toys import walk_task
-from tests.tiny import mountain_cars, tiny_task, tiny_view_task
+from tests.tiny import mountain_cars, sledges, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5
 
@@ -24,6 +24,7 @@ K, P, C, E = 2, 4, 3, 5
 TASKS = {
     "mazes": tiny_task,
     "cars": mountain_cars,
+    "sledges": sledges,
     "walk": walk_task,
     "views": tiny_view_task,
 }
@@ -115,8 +116,8 @@ def test_a_learner_trains_on_the_levels_that_are_set(task: Task) -> None:
         came.append((levels, update.rollout, learner.snapshot()))
     assert same(came[0][2], came[1][2]) and not same(came[0][2], came[2][2])
     levels, rollout, _ = came[0]
-    statistics = task.statistics(levels, rollout)
-    assert statistics.batch_size == (K,) and len(list(statistics.keys())) > 0
+    metrics = task.training_metrics(levels, rollout)
+    assert metrics.batch_size == (K,) and len(list(metrics.keys())) > 0
     for records in (task.record(levels[0], rollout[0]), task.record(levels[0], None)):
         assert len(json.loads(json.dumps(records))) == P
         for record in records:
@@ -147,20 +148,44 @@ def test_solvers_are_measured_and_seen(task: Task) -> None:
     encoder = task.probe_encoder(6)
     assert encoder(probes).shape == (K, C, 6)
     measured = task.measure(agent)
-    assert measured.batch_size == (K,) and set(measured.keys()) == set(task.measurements)
-    for name, performance in task.performances(agent).items():
+    assert measured.batch_size == (K,) and set(measured.keys()) == set(task.metrics)
+    for name, performance in task.evaluate(agent).items():
         assert performance.batch_size[0] == K
         torch.testing.assert_close(performance["success"].mean(1), measured[f"{name}_success"])
 
 
-def test_what_a_reader_is_told(task: Task) -> None:
+def test_a_solver_reaches_the_same_whatever_is_evaluated_with_it(task: Task) -> None:
+    """Whatever the other Solvers are, and whatever levels they have."""
+    agent, alone = (task.learner(streams()[:copies]).agent for copies in (K, 1))
+    levels = task.space.sample(2 * E, Streams(1).generator())
+
+    def performance(of: Any, on: Any, seed: int = 2) -> Any:
+        with torch.no_grad():
+            return task.performance(of, on, Streams(seed).generator())
+
+    both = performance(agent, levels)
+    torch.testing.assert_close(performance(alone, levels)["return"], both["return"][:1])
+    own = performance(agent, levels.reshape(K, E))
+    for k, some in enumerate((levels[:E], levels[E:])):
+        torch.testing.assert_close(own["return"][k], performance(agent, some)["return"][k])
+    if not task.exact_performance and both["success"].any():  # else all episodes are alike
+        assert not same(performance(agent, levels, 3), both)
+
+
+def test_evaluation_levels_are_the_same_in_every_run(task: Task) -> None:
+    again = type(task).evaluation_levels
+    for name, levels in task.evaluated_on.items():
+        assert same(again(task, name), levels)
+
+
+def test_facts_say_what_readers_need(task: Task) -> None:
     facts = json.loads(json.dumps(task.facts))
     assert facts.keys() - {"text_key"} == {
         "title", "levels", "distributions", "space", "about", "key", "measured", "samples",
         "exact",
     }  # fmt: skip
     for name in facts["distributions"]:
-        assert f"{name}_success" in task.measurements
+        assert f"{name}_success" in task.metrics
         assert all("picture" in record for record in facts["samples"][name])
     assert list(facts["space"]) == list(task.space.axes)
     assert facts == json.loads(json.dumps(task.facts))

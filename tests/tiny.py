@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.settings import (
@@ -53,7 +55,7 @@ def tiny_task(**changed: Any) -> MazeTask:
         "encoder_channels": [8, 8],
         "evaluation": EvaluationSettings(distributions=["id"], levels=8),
         "solver": SolverSettings(batch_size=4, ppo=ppo),
-        "place": Place(),
+        "context": ComputeContext(),
     }
     return MazeTask(**{**parts, **changed})
 
@@ -61,20 +63,25 @@ def tiny_task(**changed: Any) -> MazeTask:
 TASK = tiny_task()
 
 
-def mountain_cars() -> Task:
+def example_task(module: str, name: str) -> Task:
+    """A task of an example, which is imported as a script in its folder would import it."""
     sys.path.insert(0, EXAMPLES)
     try:
-        from mountain_car import MountainCarTask
+        make = getattr(import_module(module), name)
     finally:
         sys.path.remove(EXAMPLES)
     solver = SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2))
-    return MountainCarTask(levels=8, solver=solver, place=Place())
+    return make(levels=8, solver=solver, context=ComputeContext())
 
 
-def tiny_view_task() -> ViewMazeTask:
+mountain_cars = partial(example_task, "mountain_car", "MountainCarTask")
+sledges = partial(example_task, "own_task", "SledgeTask")
+
+
+def tiny_view_task(**changed: Any) -> ViewMazeTask:
     """5x5 mazes that Solvers with memory see through a window, in four bins."""
     kind = ScatteredSettings(fewest=5, most=5, solvable=True)
-    return ViewMazeTask(
+    parts: dict[str, Any] = dict(
         maze=ViewMazeSettings(height=5, width=5, max_steps=8),
         distributions={"id": kind, "ood": PerfectSettings()},
         target="id",
@@ -85,8 +92,9 @@ def tiny_view_task() -> ViewMazeTask:
         solver=SolverSettings(
             batch_size=4, ppo=PPOSettings(horizon=8, epochs=2, learning_rate=3e-3)
         ),
-        place=Place(),
+        context=ComputeContext(),
     )
+    return ViewMazeTask(**{**parts, **changed})
 
 
 def learners(copies: int) -> PPO:

@@ -8,10 +8,8 @@ from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 
-from proposer_rl.cli.config import ConfigError, RunConfig, TaskMaker, task_maker, why_not_made
+from proposer_rl.cli.config import ConfigError, Maker, RunConfig, curriculum_maker, task_maker
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.outcome import run_name
@@ -26,9 +24,9 @@ from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ComputeSettings, SolverSettings
+from proposer_rl.settings import ArgumentError, ComputeSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 
 
 class Made(NamedTuple):
@@ -67,7 +65,6 @@ def build(
     made: Made,
     folder: RunFolder,
     signals: StopSignals | None = None,
-    scope: tuple[str | int, ...] = (),
     status: Status | None = None,
 ) -> Experiment:
     """Put an experiment together.
@@ -77,7 +74,6 @@ def build(
         made: as :func:`parts` makes it.
         folder: the run's.
         signals: which may ask the run to stop.
-        scope: of its random draws; empty, or the lifetime.
         status: which tells what the run is doing.
     """
     return Experiment(
@@ -88,7 +84,6 @@ def build(
         log=make_log(config.logger, folder.path, run_name(config)),
         progress=config.compute.progress,
         signals=signals,
-        scope=scope,
         status=status,
     )
 
@@ -104,23 +99,18 @@ def make_task(config: RunConfig) -> Task:
     use(device)
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
-    place = Place(device, config.precision, compute.cores)
+    context = ComputeContext(device, config.precision, compute.cores)
     try:
-        task = make_in_place(task_maker(config.task), config.solver, place)
+        task = task_maker(config.task)(solver=config.solver, context=context)
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
     return recorded(task) if compute.graphs else task
 
 
-def make_in_place(maker: TaskMaker, solver: SolverSettings, place: Place) -> Any:
-    """Make the task of some settings somewhere."""
-    return maker.make(**maker.settings, solver=solver, place=place)
-
-
 def _make_in_worker(
-    maker: TaskMaker, solver: SolverSettings, place: Place, graphs: bool, device: str
+    maker: Maker, solver: SolverSettings, context: ComputeContext, graphs: bool, device: str
 ) -> Any:
-    task = make_in_place(maker, solver, place._replace(device=torch.device(device)))
+    task = maker(solver=solver, context=context._replace(device=torch.device(device)))
     return recorded(task) if graphs else task
 
 
@@ -137,12 +127,13 @@ def _curriculum(
 
     chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task, tell))
     try:
-        factory = instantiate(config.curriculum, _partial_=True)
-        curriculum = factory(chosen)
-    except (TypeError, ValueError, HydraException) as error:
-        raise ConfigError(
-            f"curriculum: {why_not_made(error, f'method={config.method}')}"
-        ) from error
+        curriculum = curriculum_maker(config.curriculum)(chosen)
+    except ArgumentError as error:
+        raise ConfigError(f"curriculum.{one_line(error)}") from error
+    except ConfigError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"curriculum: {one_line(error)}") from error
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
@@ -211,9 +202,9 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
         cores=cores,
         ray_address=compute.ray_address,
     )
-    place = Place(precision=task.precision, cores=cores)
+    context = ComputeContext(precision=task.precision, cores=cores)
     make: Callable[[str], Any] = partial(
-        _make_in_worker, task_maker(config.task), config.solver, place, compute.graphs
+        _make_in_worker, task_maker(config.task), config.solver, context, compute.graphs
     )
     return Workers(settings, make, tell)
 

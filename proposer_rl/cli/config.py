@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Len
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
+    ArgumentError,
     ComputeSettings,
     HandDesignedSettings,
     LoggerSettings,
@@ -28,6 +28,8 @@ from proposer_rl.settings import (
     ProposerSettings,
     Schedule,
     SolverSettings,
+    arguments,
+    settings,
 )
 
 # ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
@@ -42,7 +44,7 @@ OmegaConf.register_new_resolver(
 LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
-GIVEN_TO_TASKS = ("solver", "place")
+GIVEN_TO_TASKS = ("solver", "context")
 
 
 class ConfigError(ValueError):
@@ -51,23 +53,21 @@ class ConfigError(ValueError):
     exit_code = 2
 
 
-class RunConfig(BaseModel):
+@settings
+class RunConfig:
     """Every setting of a run; names and meaning as in ``conf/train.yaml``.
 
     What joins several settings is checked where the object is built that needs it.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     method: str
     scale: str
     ablation: str
     curriculum: dict[str, Any]
     task: dict[str, Any]
-    lifetimes: Annotated[int, Field(ge=1, le=LARGEST)]
     checkpoint: str | None
-    seed: Annotated[int, Field(ge=0)]
-    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    seed: Annotated[int, Ge(0)]
+    seeds: Annotated[list[Annotated[int, Ge(0)]], Len(1)]
     precision: Literal["auto", "fp32", "bf16"]
     hand_designed: HandDesignedSettings
     pool: PoolSettings
@@ -79,11 +79,15 @@ class RunConfig(BaseModel):
 
 
 @dataclass(frozen=True)
-class TaskMaker:
-    """What makes a run's task: its target, and the settings it is called with."""
+class Maker:
+    """What makes a part of a run: a callable, and the checked arguments that its settings are."""
 
     make: Callable[..., Any]
     settings: Mapping[str, Any]
+
+    def __call__(self, *parts: Any, **others: Any) -> Any:
+        """Make it of what else it needs."""
+        return self.make(*parts, **self.settings, **others)
 
 
 def read_config(config: DictConfig) -> RunConfig:
@@ -101,7 +105,7 @@ def read_config(config: DictConfig) -> RunConfig:
             raise ConfigError(f"{key}={value!r}: must be finite and at most {LARGEST:,} in size")
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
-    checked = _validated(RunConfig, values)
+    checked = _checked(values)
     read = (value for _, value in _leaves(checked.curriculum))
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
@@ -113,42 +117,60 @@ def read_config(config: DictConfig) -> RunConfig:
     return checked
 
 
-def task_maker(settings: Mapping[str, Any]) -> TaskMaker:
-    """What makes the task, with its settings checked against the types that its maker asks for.
+def task_maker(settings: Mapping[str, Any]) -> Maker:
+    """What makes the task, called with ``solver`` and ``place`` besides.
 
     Args:
         settings: ``task`` of the configuration.
 
     Raises:
-        ConfigError: if there is no such maker, naming the first wrong key.
+        ConfigError: if there is no such maker, or a setting is wrong, naming its key.
     """
-    values = dict(settings)
-    target = values.pop("_target_", None)
-    if not isinstance(target, str):
-        raise ConfigError("task._target_: missing: the class or function that makes the task")
-    try:
-        make = instantiate({"_target_": target, "_partial_": True}).func
-        parameters = inspect.signature(make).parameters
-        typed = make.__init__ if inspect.isclass(make) else make
-        hints = get_type_hints(typed, include_extras=True)  # bounds, too
-    except (HydraException, ImportError, AttributeError, TypeError, ValueError, NameError) as error:
-        raise ConfigError(f"task._target_={target}: {why_not_made(error)}") from error
-    missing = [name for name in GIVEN_TO_TASKS if name not in parameters]
+    make, values = _target("task", settings)
+    missing = [name for name in GIVEN_TO_TASKS if name not in inspect.signature(make).parameters]
     if missing:
+        target = settings["_target_"]
         raise ConfigError(
             f"task._target_={target}: makes no task: it takes no argument {missing[0]!r}"
         )
-    fields: dict[str, Any] = {
-        name: (
-            hints.get(name, Any),
-            ... if parameter.default is parameter.empty else parameter.default,
-        )
-        for name, parameter in parameters.items()
-        if name not in GIVEN_TO_TASKS
-    }
-    model = create_model("Task", __config__=ConfigDict(extra="forbid"), **fields)
-    checked = _validated(model, values, "task.")
-    return TaskMaker(make, {name: getattr(checked, name) for name in fields})
+    return _maker("task", make, values, GIVEN_TO_TASKS)
+
+
+def curriculum_maker(settings: Mapping[str, Any]) -> Maker:
+    """What makes the curriculum, called with its parts as the first argument.
+
+    Args:
+        settings: ``curriculum`` of the configuration.
+
+    Raises:
+        ConfigError: as :func:`task_maker`.
+    """
+    make, values = _target("curriculum", settings)
+    return _maker("curriculum", make, values, [*inspect.signature(make).parameters][:1])
+
+
+def _target(key: str, settings: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """The callable that ``_target_`` names, and its arguments; of these, too, some may be made."""
+    target = settings.get("_target_")
+    if not isinstance(target, str):
+        raise ConfigError(f"{key}._target_: missing: the class or function that makes the {key}")
+    try:
+        made = instantiate({**settings, "_partial_": True}, _convert_="all")
+        inspect.signature(made.func)
+    except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(f"{key}._target_={target}: {_why_not_found(error)}") from error
+    return made.func, made.keywords
+
+
+def _maker(
+    key: str, make: Callable[..., Any], values: Mapping[str, Any], given: Sequence[str]
+) -> Maker:
+    try:
+        return Maker(make, arguments(make, values, given))
+    except ArgumentError as error:
+        raise ConfigError(f"{key}.{error}") from error
+    except (NameError, TypeError) as error:  # of annotations that name nothing
+        raise ConfigError(f"{key}._target_={make.__name__}: {one_line(error)}") from error
 
 
 def saved_config(folder: Path) -> RunConfig:
@@ -163,7 +185,7 @@ def saved_config(folder: Path) -> RunConfig:
     values = stored_config(file)
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _validated(RunConfig, {**values, **free})
+        return _checked({**values, **free})
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
 
@@ -223,17 +245,9 @@ def methods() -> list[str]:
     return names(CONFIG_FOLDER, "method")
 
 
-def why_not_made(error: BaseException, called: str = "") -> str:
-    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does.
-
-    Args:
-        error: what happened.
-        called: the command's own name of what refuses a setting; its function's by default.
-    """
+def _why_not_found(error: BaseException) -> str:
+    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
     line = one_line(error).partition(", set env var HYDRA_FULL_ERROR")[0]
-    unknown = re.fullmatch(r"(\w+)\S*\(\) got an unexpected keyword argument (\S+)", line)
-    if unknown:
-        return f"{called or unknown[1]} has no setting {unknown[2]}"
     innermost = error
     while innermost.__cause__ is not None:
         innermost = innermost.__cause__
@@ -266,16 +280,11 @@ def _resolved(config: DictConfig) -> Any:
         raise ConfigError(str(error)) from error
 
 
-def _validated(model: Any, values: Any, prefix: str = "") -> Any:
+def _checked(values: Mapping[str, Any]) -> RunConfig:
     try:
-        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
-        return model.model_validate_json(json.dumps(values), strict=True)
-    except ValidationError as error:
-        raise ConfigError(_first_line(error, values, prefix)) from error
-    except TypeError as error:
-        raise ConfigError(
-            f"a value that is neither text, number, list nor mapping: {error}"
-        ) from error
+        return RunConfig(**arguments(RunConfig, values))
+    except ArgumentError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -285,30 +294,3 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from _leaves(inner, f"{key}.{part}" if key else str(part))
     else:
         yield key, value
-
-
-def _first_line(error: ValidationError, values: Any, prefix: str) -> str:
-    errors = error.errors()
-    # Of a union pydantic tells what is wrong with every member; one of another kind is not meant.
-    others = [e["loc"][:-1] for e in errors if e["loc"][-1:] == ("kind",)]
-    meant = [e for e in errors if not any(e["loc"][: len(other)] == other for other in others)]
-    details = (meant or errors)[0]
-    # A member's name is no key of the configuration.
-    loc = [part for part in details["loc"] if not str(part).endswith("Settings")]
-    *folder, last = loc or [""]
-    key = prefix + ".".join(map(str, loc))
-    message = details["msg"].removeprefix("Value error, ")
-    if not meant:  # of a kind that there is not: the members' kinds are what there is
-        kinds = {str(e["ctx"]["expected"]) for e in errors if e["loc"][-1:] == ("kind",)}
-        message = f"input should be one of {', '.join(sorted(kinds))}"
-    if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        siblings: Any = values
-        for part in folder:
-            siblings = siblings[part]
-        known = ", ".join(sorted(map(str, siblings.keys() - {last})))
-        return f"{key}: there is no such key; there are: {known}"
-    if details["type"] == "missing":
-        return f"{key}: missing"
-    given = repr(details["input"])
-    given = given if len(given) <= 80 else f"{given[:77]}..."
-    return f"{key}={given}: {message[0].lower()}{message[1:]}"

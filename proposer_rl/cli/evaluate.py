@@ -1,6 +1,7 @@
 """Trained Solvers on named levels.
 
-One run's are told level by level, those of several by their means, as a table of methods.
+One run's results are listed level by level, those of several by their means, as a table of
+methods.
 """
 
 from __future__ import annotations
@@ -13,13 +14,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -30,7 +29,9 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import ConfigError, saved_config
 from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
 from proposer_rl.models import ActorCritic
-from proposer_rl.report.generalisation import (
+from proposer_rl.report.reading import UnreadableRun, begun, find_runs
+from proposer_rl.report.runs import Run
+from proposer_rl.report.scores import (
     LONGEST_NAME,
     check_names,
     generalisation_table,
@@ -40,53 +41,48 @@ from proposer_rl.report.generalisation import (
     whole,
     write_scores,
 )
-from proposer_rl.report.generalisation import Score as RunScore
-from proposer_rl.report.reading import UnreadableRun, begun, find_runs
-from proposer_rl.report.runs import Run
+from proposer_rl.report.scores import Score as RunScore
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.lock import taking_turns
-from proposer_rl.runs.pictures import pixels
-from proposer_rl.streams import Streams
-from proposer_rl.task import Score, ScoringTask, Task
+from proposer_rl.task import LevelResult, Task
 
 SHOWN = 36  # levels in the table and on the sheet of pictures
 COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
-DRAWN = 128  # levels of a distribution, where the task has no named ones
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found.
+    """The result of an evaluation.
 
     Attributes:
         run: the run's folder.
         updates: Solver updates made at the checkpoint.
         seeds: of the run's Solvers, in their order.
         levels: what was evaluated on.
-        scores: one for each level and Solver.
+        results: one for each level and Solver.
     """
 
     run: Path
     updates: int
     seeds: list[int]
     levels: str
-    scores: Sequence[Score]
+    results: Sequence[LevelResult]
 
     def rows(self) -> list[dict[str, Any]]:
         """One mapping for each level and Solver, for JSON and CSV."""
         return [
             {
                 "run": self.run.name,
-                "seed": self.seeds[score.solver],
+                "seed": self.seeds[result.solver],
                 "updates": self.updates,
-                "level": score.level,
-                **score.about,
-                **score.results,
+                "level": result.level,
+                **result.about,
+                **result.results,
             }
-            for score in self.scores
+            for result in self.results
         ]
 
 
@@ -109,16 +105,16 @@ def _one(options: argparse.Namespace) -> None:
     """One run, level by level."""
     (checkpoint,), name = options.checkpoint, next(iter(options.levels), None)
     _refuse_table(options.output)
-    found = evaluate(load(checkpoint), name, options.max_steps)
-    _print(found)
+    evaluation = evaluate(load(checkpoint), name, options.max_steps)
+    _print(evaluation)
     if options.output is not None and options.output.suffix == ".csv":
-        rows = found.rows()
+        rows = evaluation.rows()
         table = to_csv(list(rows[0]), [list(row.values()) for row in rows])
         write_atomically(options.output, table.encode())
     else:
-        write_rows(found.rows(), options.output)
+        write_rows(evaluation.rows(), options.output)
     if options.pictures is not None:
-        write_atomically(options.pictures, _sheet(found))
+        write_atomically(options.pictures, _sheet(evaluation))
 
 
 def _refuse_table(output: Path | None) -> None:
@@ -156,11 +152,11 @@ def _compare(options: argparse.Namespace) -> None:
     for note in notes:
         print(note, file=sys.stderr)
     for study in studies:
-        found = generalisation_table(study, [score for score in scores if score.levels in names])
-        table = Table(box=SIMPLE_HEAD, title=Text(study.title), caption=found.note)
-        for column in found.columns:
+        table_of = generalisation_table(study, [score for score in scores if score.levels in names])
+        table = Table(box=SIMPLE_HEAD, title=Text(study.title), caption=table_of.note)
+        for column in table_of.columns:
             table.add_column(Text(column), justify="left" if column == "method" else "right")
-        for row in found.texts():
+        for row in table_of.texts():
             table.add_row(*map(Text, row))
         Console().print(table)
 
@@ -187,35 +183,35 @@ def _check_comparison(options: argparse.Namespace) -> None:
     if output is not None and output.suffix != ".csv":
         raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
     if options.max_steps is not None and output is not None:
-        raise ConfigError(f"--max-steps: --output {output} would not tell it; leave one out")
+        raise ConfigError(f"--max-steps: --output {output} does not record it; leave one out")
 
 
 def _stored(output: Path | None) -> list[RunScore]:
     return read_scores(output) if output is not None and output.exists() else []
 
 
-def _added(found: list[RunScore], scores: list[RunScore], output: Path | None) -> list[RunScore]:
-    """Scores with those found in place of older ones, as they then stand in the output.
+def _added(new: list[RunScore], scores: list[RunScore], output: Path | None) -> list[RunScore]:
+    """Scores with new ones in place of older ones, as they then stand in the output.
 
     Where there is one it counts as it is by now: other processes may have added to it.
     """
-    if output is None or not found:
-        return _replaced(scores, found)
+    if output is None or not new:
+        return _replaced(scores, new)
     with taking_turns(output):
-        scores = _replaced(_stored(output), found)
+        scores = _replaced(_stored(output), new)
         write_atomically(output, write_scores(scores))
     return scores
 
 
-def _replaced(scores: list[RunScore], found: list[RunScore]) -> list[RunScore]:
-    place = {score[:4] for score in found}
-    return [score for score in scores if score[:4] not in place] + found
+def _replaced(scores: list[RunScore], new: list[RunScore]) -> list[RunScore]:
+    place = {score[:4] for score in new}
+    return [score for score in scores if score[:4] not in place] + new
 
 
 def _missing(
     run: Run, names: Sequence[str], scores: list[RunScore], max_steps: int | None
 ) -> list[RunScore]:
-    """Scores of a run that there are none of yet, or that were of something else."""
+    """Scores of a run that are missing, or were of something else."""
     digests = {name: _digest(run.folder, name) for name in names}
     known = {name: scored(run, scores, name) for name in names}
     todo = [
@@ -237,7 +233,7 @@ def _digest(folder: Path, levels: str) -> str:
     """Of a run's settings and newest checkpoint, and of the levels where they are a file.
 
     Returns:
-        16 hexadecimal digits; nothing for a run without checkpoints, of which nothing can be told.
+        16 hexadecimal digits; nothing for a run without checkpoints.
     """
     checkpoints = checkpoint_files(folder / "checkpoints")
     if not checkpoints:
@@ -250,14 +246,14 @@ def _digest(folder: Path, levels: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def _summed(found: Evaluation, name: str, digest: str) -> list[RunScore]:
+def _summed(evaluation: Evaluation, name: str, digest: str) -> list[RunScore]:
     """The mean of each Solver."""
     summed = []
-    for solver, seed in enumerate(found.seeds):
-        own = [score.results for score in found.scores if score.solver == solver]
+    for solver, seed in enumerate(evaluation.seeds):
+        own = [each.results for each in evaluation.results if each.solver == solver]
         means = {key: float(np.mean([results[key] for results in own])) for key in own[0]}
         success = means.get("success", math.nan)
-        place = (found.run.name, seed, found.updates, name, len(own))
+        place = (evaluation.run.name, seed, evaluation.updates, name, len(own))
         summed.append(RunScore(*place, success, means["return"], digest))
     return summed
 
@@ -309,93 +305,61 @@ def evaluate(loaded: Loaded, name: str | None, max_steps: int | None = None) -> 
         OSError: if a file cannot be read.
     """
     run, updates, seeds, task, agent = loaded
-    if isinstance(task, ScoringTask):
-        name = name or task.default_levels
-        scores: Sequence[Score] = task.scores(agent, name, max_steps)
-    else:
-        name = name or next(iter(task.distributions))
-        scores = _on_distribution(task, agent, name, max_steps)
-    return Evaluation(run, updates, seeds, name, scores)
+    name = name or task.default_levels
+    return Evaluation(run, updates, seeds, name, task.level_results(agent, name, max_steps))
 
 
-def _on_distribution(
-    task: Task, agent: ActorCritic, name: str, max_steps: int | None
-) -> list[Score]:
-    """Scores on levels of a distribution, for a task that has no others."""
-    if name not in task.distributions:
-        raise ConfigError(f"--levels {name}: must be one of: {', '.join(task.distributions)}")
-    if max_steps is not None:
-        raise ConfigError("--max-steps: the step limit of this task's levels is fixed")
-    streams = Streams(0, "eval", name)
-    levels = task.distributions[name].sample(DRAWN, streams.generator())
-    performance = task.performance(agent, levels, streams.generator()).cpu()
-    copies, count = performance.batch_size
-    return [
-        Score(
-            level=f"{name}_{i:03}",
-            solver=k,
-            about={},
-            results={str(key): float(value) for key, value in performance[k, i].items()},
-            note="",
-            picture=partial(_picture, task, levels[i : i + 1]),
-        )
-        for i in range(count)
-        for k in range(copies)
-    ]
-
-
-def _picture(task: Task, level: Any) -> NDArray[np.uint8]:
-    return pixels(task.record(level, None)[0]["picture"])
-
-
-def _print(found: Evaluation) -> None:
-    first = [score for score in found.scores if score.solver == 0]
+def _print(evaluation: Evaluation) -> None:
+    first = [each for each in evaluation.results if each.solver == 0]
     shown = _hardest(first)
     some = f", the {len(shown)} hardest of {len(first)} levels" if len(shown) < len(first) else ""
-    seeds = ", ".join(map(str, found.seeds))
-    title = f"{found.run.name}, seed {seeds}, {found.updates} updates: {found.levels}{some}"
-    caption = "Means over the seeds." if len(found.seeds) > 1 else ""
+    seeds = ", ".join(map(str, evaluation.seeds))
+    run = f"{evaluation.run.name}, seed {seeds}, {evaluation.updates} updates"
+    title = f"{run}: {evaluation.levels}{some}"
+    caption = "Means over the seeds." if len(evaluation.seeds) > 1 else ""
     table = Table(box=SIMPLE_HEAD, title=Text(title), caption=caption)
     table.add_column("level", overflow="fold", min_width=16)
     for name in (*first[0].about, *first[0].results):
         table.add_column(name.replace("_", " "), justify="right")
-    for score in shown:
-        of_level = [other for other in found.scores if other.level == score.level]
-        about = [f"{value:g}" for value in score.about.values()]
-        table.add_row(Text(score.level), *about, *_means(of_level))
+    for level in shown:
+        of_level = [other for other in evaluation.results if other.level == level.level]
+        about = [f"{value:g}" for value in level.about.values()]
+        table.add_row(Text(level.level), *about, *_means(of_level))
     table.add_section()
-    table.add_row(f"mean of {len(first)}", *[""] * len(first[0].about), *_means(found.scores))
+    table.add_row(f"mean of {len(first)}", *[""] * len(first[0].about), *_means(evaluation.results))
     Console().print(table)
 
 
-def _hardest(scores: Sequence[Score]) -> list[Score]:
+def _hardest(results: Sequence[LevelResult]) -> list[LevelResult]:
     """All of a few levels; of many those with the least success, or return, in their order."""
-    ranked = sorted(scores, key=lambda s: s.results.get("success", s.results["return"]))
-    kept = {score.level for score in ranked[:SHOWN]}
-    return [score for score in scores if score.level in kept]
+    ranked = sorted(results, key=lambda each: each.results.get("success", each.results["return"]))
+    kept = {each.level for each in ranked[:SHOWN]}
+    return [each for each in results if each.level in kept]
 
 
-def _means(scores: Sequence[Score]) -> list[str]:
-    names = scores[0].results
-    means = {name: sum(score.results[name] for score in scores) / len(scores) for name in names}
+def _means(results: Sequence[LevelResult]) -> list[str]:
+    names = results[0].results
+    means = {name: sum(each.results[name] for each in results) / len(results) for name in names}
     return [f"{m:.1%}" if "success" in name else f"{m:.3f}" for name, m in means.items()]
 
 
-def _sheet(found: Evaluation) -> bytes:
+def _sheet(evaluation: Evaluation) -> bytes:
     """Pictures of the first Solver on the hardest levels side by side, a PNG file."""
-    scores = _hardest([score for score in found.scores if score.solver == 0])
-    columns = min(COLUMNS, len(scores))
-    rows = -(-len(scores) // columns)
+    shown = _hardest([each for each in evaluation.results if each.solver == 0])
+    columns = min(COLUMNS, len(shown))
+    rows = -(-len(shown) // columns)
     figure = Figure(figsize=(max(SIDE * columns, 5), (SIDE + 0.45) * rows + 0.7), layout="tight")
     # Names come from files: a dollar sign in one is no formula.
-    figure.suptitle(f"{found.run.name}, {found.updates} updates", fontsize=9, parse_math=False)
+    figure.suptitle(
+        f"{evaluation.run.name}, {evaluation.updates} updates", fontsize=9, parse_math=False
+    )
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
-    for axes, score in zip(grid.flat, scores, strict=False):
-        axes.imshow(score.picture())
-        result = score.results.get("success", score.results["return"])
-        caption = f"{score.level}: {result:.3g}\n{score.note}"
+    for axes, level in zip(grid.flat, shown, strict=False):
+        axes.imshow(level.picture())
+        result = level.results.get("success", level.results["return"])
+        caption = f"{level.level}: {result:.3g}\n{level.note}"
         axes.set_title(caption, fontsize=7, parse_math=False)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)

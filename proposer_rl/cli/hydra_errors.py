@@ -53,4 +53,4 @@ def _no_such_key(error: OmegaConfBaseException) -> str:
     if not isinstance(holder, DictConfig):
         return one_line(error)
     known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
-    return f"{error.full_key}: there is no such key; there are: {', '.join(known) or 'none'}"
+    return f"{error.full_key}: unknown; there are: {', '.join(known) or 'none'}"

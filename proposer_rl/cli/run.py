@@ -1,10 +1,10 @@
-"""One experiment from its checked settings: all its lifetimes, and what is written beside them."""
+"""One experiment from its checked settings, and what is written beside it."""
 
 from __future__ import annotations
 
 import json
-import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.report.levels import draw_run
 from proposer_rl.runs.checkpoint import (
-    CheckpointError,
     checkpoint_bytes,
     checkpoint_files,
     load_latest,
@@ -28,7 +27,6 @@ from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomical
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.streams import Streams
 
 SUMMARY = "summary.json"
 
@@ -49,7 +47,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     with locked(path), signals:
         try:
-            value = live(config, made, path, signals, status)
+            value = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin
             return value
         except Interrupted as stop:
@@ -64,45 +62,30 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
             made.curriculum.close()
 
 
-def live(
+def proceed(
     config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status | None = None
 ) -> float:
-    """Run all lifetimes: one Solver after another, on a curriculum that goes on learning.
+    """Begin a run, go on with it, or say that it is finished.
 
     Args:
         config: the run's settings.
-        made: as :func:`parts` makes it; the Solvers are those of the first lifetime.
-        path: the run's folder, which has one for each lifetime if there are several.
+        made: as :func:`parts` makes it.
+        path: the run's folder.
         signals: which may ask the run to stop.
         status: which tells what the run is doing.
 
     Returns:
-        The headline measurement at the end of the last lifetime.
+        The headline measurement at the end.
     """
-    value = math.nan
-    before: RunFolder | None = None
-    for lifetime in range(config.lifetimes):
-        folder = RunFolder(path / f"lifetime_{lifetime}" if config.lifetimes > 1 else path)
-        # What `auto` has become, so that a run goes on in the same precision elsewhere.
-        check_same_run(folder, config.model_copy(update={"precision": made.task.precision}))
-        scope: tuple[str | int, ...] = ()
-        if before is not None:
-            scope = ("lifetime", lifetime)
-            streams = [Streams(seed, *scope, "solver") for seed in config.seeds]
-            made = made._replace(learner=made.task.learner(streams))
-            latest = load_latest(before.path / "checkpoints")
-            if latest is None:
-                raise CheckpointError(f"{before.path}: holds no checkpoint to go on learning from")
-            made.curriculum.load_state_dict(latest[1]["curriculum"])
-            made.curriculum.begin()
-        finished = _finished(folder.path, config)
-        if finished is not None:
-            tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {folder.path}")
-            value = _value(finished, config)
-        else:
-            value = run(build(config, made, folder, signals, scope, status), config)
-        before = folder
-    return value
+    folder = RunFolder(path)
+    # What `auto` has become, so that a run goes on in the same precision elsewhere.
+    precision: Any = made.task.precision
+    check_same_run(folder, replace(config, precision=precision))
+    finished = _finished(path, config)
+    if finished is None:
+        return run(build(config, made, folder, signals, status), config)
+    tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
+    return _value(finished, config)
 
 
 def run(experiment: Experiment, config: RunConfig) -> float:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
 from proposer_rl.runs.folder import RunFolder
 
-# What may differ: where it is computed and shown, and, of one lifetime, a longer schedule: the next
-# lifetime has begun with what the curriculum had learnt at the end of the shorter one.
+# What may differ: where it is computed and shown, and a longer schedule.
 FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
@@ -27,9 +27,8 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
         ConfigError: naming the settings that differ, or what the folder holds instead of a run.
         StorageError: if the file cannot be read or written.
     """
-    now = config.model_dump(mode="json", exclude=FREE)
-    free = FREE_SCHEDULE if config.lifetimes == 1 else FREE_SCHEDULE - {"updates"}
-    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in free}
+    now = {key: value for key, value in asdict(config).items() if key not in FREE}
+    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
     file = folder.path / "config.json"
     if not file.exists():
         # Tables here are no run's of ours, and a run begins by removing what is left of one.
@@ -64,11 +63,10 @@ def as_begun(config: RunConfig, path: Path) -> RunConfig:
     """
     if config.precision != "auto":
         return config
-    files = (path / "config.json", path / "lifetime_0" / "config.json")
-    begun = next((stored_config(file) for file in files if file.is_file()), None)
-    precision = begun.get("precision") if isinstance(begun, dict) else None
-    known = precision in ("fp32", "bf16")
-    return config.model_copy(update={"precision": precision}) if known else config
+    file = path / "config.json"
+    begun = stored_config(file) if file.is_file() else None
+    precision: Any = begun.get("precision") if isinstance(begun, dict) else None
+    return replace(config, precision=precision) if precision in ("fp32", "bf16") else config
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:

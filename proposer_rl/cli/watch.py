@@ -1,4 +1,4 @@
-"""``bin/watch`` and ``proposer-watch``: look at running experiments; nothing is written."""
+"""``bin/watch`` and ``proposer-watch``: shows running experiments; nothing is written."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def draw(folder: Path) -> RenderableType:
     """The folder's run as a screen, or its runs as a table.
 
     Raises:
-        UnreadableRun: if there is nothing to look at.
+        UnreadableRun: if there is nothing to show.
     """
     found = find_progress(folder)
     shown = screen(found[0]) if len(found) == 1 else overview(found)
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         "--seconds",
         type=number(float, 0.1, 3600),
         default=2.0,
-        help="between two looks (default: 2)",
+        help="between two refreshes (default: 2)",
     )
     return parser
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,8 +21,10 @@ from proposer_rl.task import LocatedTarget, Task
 NOTHING = 1e-6  # a share that is rounding of the solver's
 
 
-class TargetTask(Task, LocatedTarget, Protocol):
-    """A task whose target lies in its space."""
+class TargetTask(Task):
+    """A task whose target lies in its space; see :class:`~proposer_rl.task.LocatedTarget`."""
+
+    target_shares: Tensor
 
 
 class TransportCurriculum(BinCurriculum):

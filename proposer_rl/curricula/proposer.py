@@ -248,7 +248,7 @@ def explained_share(action: Tensor, rewards: Tensor) -> float | None:
 
     A hint, for nothing, of how much of the reward a Proposer can learn from: with adjustment for
     the number of coefficients it is 0 on average where the actions do not matter, and at most 1.
-    :mod:`proposer_rl.meta.signal` measures the same without supposing linearity.
+    ``research/signal.py`` measures the same without supposing linearity.
 
     Args:
         action: [K, T, D]; the mean over the T steps counts.

@@ -1,4 +1,4 @@
-"""PPO of one agent, or of K copies of it at once."""
+"""PPO of one agent, or of K replicas of it at once."""
 
 from proposer_rl.learning.advantages import LeaveOneOutBaseline
 from proposer_rl.learning.divergence import DivergedError, located

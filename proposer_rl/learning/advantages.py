@@ -1,4 +1,4 @@
-"""Advantages: by a critic, or by the other copies."""
+"""Advantages: by a critic, or by the other replicas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
-    """The return to come, minus what the other copies had to come at the same step.
+    """The return to come, minus what the other replicas had to come at the same step.
 
     Where all K episodes start from one state, the others' mean return is an unbiased estimate of
     that state's value, and a far better one than a critic that has seen a few episodes
@@ -31,10 +31,10 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
         gamma: discount.
 
     Raises:
-        ValueError: when called on fewer than two copies.
+        ValueError: when called on fewer than two replicas.
 
     Example:
-        Three copies, one step each:
+        Three replicas, one step each:
 
         >>> reward = torch.tensor([1.0, 2.0, 6.0]).view(3, 1, 1)
         >>> from tensordict import TensorDict

@@ -1,4 +1,4 @@
-"""Numbers that went wrong: found in the update in which they arise, and named."""
+"""Numbers that are not finite: recognised in the update in which they arise, and named."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 
 class DivergedError(ArithmeticError):
-    """A number is not finite; the message is one line that says which, and in which copy."""
+    """A number is not finite; the message is one line that says which, and in which replica."""
 
     exit_code = 3
 
@@ -27,15 +27,15 @@ def require_finite(
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.
-        steps: of S gradient steps, [S], the losses ``loss_...`` and the ``grad_norm`` of each copy,
-            [S, K], or without copies [S].
-        weights: after the update, by name, [K, ...] with copies.
+        steps: of S gradient steps, [S], the losses ``loss_...`` and the ``grad_norm`` of each
+            replica, [S, K], or without replicas [S].
+        weights: after the update, by name, [K, ...] with replicas.
         copies: K, or None for a single network.
-        first: number of the first copy, by which copies are named.
+        first: number of the first replica, by which replicas are named.
 
     Raises:
-        DivergedError: naming what was not finite first, and the copies that it happened in. The
-            others are as they would be without it: nothing is shared between copies.
+        DivergedError: naming what was not finite first, and the replicas that it happened in. The
+            others are as they would be without it: nothing is shared between replicas.
     """
     # What a gradient step leaves behind, in the order in which it arises.
     names = [*(key for key in steps.keys() if key.startswith("loss_")), "grad_norm"]

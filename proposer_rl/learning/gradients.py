@@ -1,4 +1,4 @@
-"""Clipping the gradients of K copies, each by its own norm."""
+"""Clipping the gradients of K replicas, each by its own norm."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from torch import Tensor, nn
 
 
 def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
-    """Scale gradients (in place) so that no copy's norm exceeds ``max_norm``.
+    """Scale gradients (in place) so that no replica's norm exceeds ``max_norm``.
 
     Args:
-        parameters: with copies, each [K, ...].
-        max_norm: largest norm over all parameters of one copy.
+        parameters: with replicas, each [K, ...].
+        max_norm: largest norm over all parameters of one replica.
         copies: K, or None if the parameters belong to a single network.
 
     Returns:

@@ -1,4 +1,4 @@
-"""PPO's loss of K copies at once: TorchRL's, without what would mix them or wait for a device."""
+"""PPO's loss of K replicas at once: TorchRL's, without what would mix them or wait for a device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
     """The loss of an agent's actor and critic, reading the entries that the agent writes.
 
     Raises:
-        ValueError: if it reduces what belongs to different copies.
+        ValueError: if it reduces what belongs to different replicas.
     """
     loss = make(*agent.readout())
     if loss.reduction != "none":
@@ -34,10 +34,10 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
 
 
 class CopiesClipLoss(ClipPPOLoss):
-    """The clipped loss of every transition, with advantages standardised over each copy's batch.
+    """The clipped loss of every transition, with advantages standardised over each replica's batch.
 
     ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
-    are means over all copies.
+    are means over all replicas.
 
     Args:
         actor, critic: as :meth:`~proposer_rl.models.ActorCritic.readout` makes them.
@@ -78,7 +78,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return log_weight, distribution, kl_approx, correction
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
-        # TorchRL's looks whether an entropy is finite, and waits: for discrete actions it is.
+        # TorchRL's checks that an entropy is finite, and waits: for discrete actions it is.
         if isinstance(dist, Categorical | Independent):
             entropy = dist.entropy().unsqueeze(-1)
         else:
@@ -88,14 +88,14 @@ class CopiesClipLoss(ClipPPOLoss):
 
 
 def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
-    """Means over each copy's own batch, [K], without copies []; a scalar counts for every copy."""
+    """Means over each replica's own batch, [K], without replicas []; a scalar is everybody's."""
     if copies is not None and not numbers.ndim:
         return numbers.expand(copies)
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
 def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
-    """Share of the targets' variance that the values explain: [K], without copies []."""
+    """Share of the targets' variance that the values explain: [K], without replicas []."""
     value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))

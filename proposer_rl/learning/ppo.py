@@ -1,4 +1,4 @@
-"""Proximal policy optimisation of one agent, or of K independent copies of it at once.
+"""Proximal policy optimisation of one agent, or of K independent replicas of it at once.
 
 An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps on
 
@@ -6,8 +6,8 @@ An update, from top to bottom: act for T steps, estimate advantages A, then make
 
 with r the new over the old probability of an action, V the critic's value, R its target and H the
 policy's entropy (Schulman et al. 2017, eq. 7 and 9). TorchRL computes all of it. What is added: the
-level's context is computed once per rollout and once per gradient step, and K copies train in one
-leading dimension as if each were alone. Nothing in an update looks at a number on the device.
+level's context is computed once per rollout and once per gradient step, and K replicas train in one
+leading dimension as if each were alone. Nothing in an update reads a number from the device.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 
-TOLD = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, as far as a loss does
+DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
 
 class Update(NamedTuple):
-    """One PPO update: the rollout [*B, T] and its training's metrics, of K copies [K], else []."""
+    """One PPO update: the rollout [*B, T] and its metrics, of K replicas [K], else []."""
 
     rollout: TensorDictBase
     metrics: TensorDict
@@ -50,10 +50,10 @@ class PPO:
     """An agent, the environment it acts in, and its optimiser.
 
     Args:
-        env: batch [*B]; with copies, B = [K, ...]. Entries that the agent's encoder reads must
+        env: batch [*B]; with replicas, B = [K, ...]. Entries that the agent's encoder reads must
             stay the same until the environment is reset.
         agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
-            independent copies, which decides over what losses, advantages and norms are taken.
+            independent replicas, which decides over what losses, advantages and norms are taken.
         settings: PPO's numbers.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
             TorchRL's :class:`~torchrl.objectives.value.GAE`.
@@ -62,8 +62,8 @@ class PPO:
             None for :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if the environment's first dimension is not the agent's number of copies, or
-            the loss reduces what belongs to different copies.
+        ValueError: if the environment's first dimension is not the agent's number of replicas, or
+            the loss reduces what belongs to different replicas.
 
     Example:
         A linear policy and value for one environment of Gymnasium's:
@@ -135,10 +135,10 @@ class PPO:
         Writes ``advantage`` and ``value_target`` into the rollout.
 
         Returns:
-            Of each copy [K], without copies [], means over its batch and the gradient steps: the
-            loss's weighted terms, for PPO ``loss_objective``, ``loss_entropy`` and ``loss_critic``;
-            ``entropy``, ``kl_approx`` and ``clip_fraction``, as far as the loss tells them;
-            ``explained_variance``, ``grad_norm``.
+            Of each replica [K], without replicas [], means over its batch and the gradient steps:
+            the loss's weighted terms, for PPO ``loss_objective``, ``loss_entropy`` and
+            ``loss_critic``; ``entropy``, ``kl_approx`` and ``clip_fraction``, where the loss has
+            them; ``explained_variance``, ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
         steps = rollout.exclude(*self.agent.level_keys)
@@ -170,11 +170,11 @@ class PPO:
         metrics = {
             key: of_copies(losses[key], copies)
             for key in losses.keys()
-            if key.startswith("loss_") or key in TOLD
+            if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
         self._adam.zero_grad()
-        torch.stack(terms).sum().backward()  # each copy's gradient is its own
+        torch.stack(terms).sum().backward()  # each replica's gradient is its own
         norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, copies)
         self._adam.step()
         return TensorDict(
@@ -202,21 +202,21 @@ class PPO:
         """Check what was trained on last; this waits for the device, training does not.
 
         Args:
-            first: number of the first copy, by which copies are named.
+            first: number of the first replica, by which replicas are named.
 
         Raises:
-            DivergedError: if a reward, loss, gradient or weight is not finite, naming the copy.
+            DivergedError: if a reward, loss, gradient or weight is not finite, naming the replica.
         """
         weights = dict(self.agent.named_parameters())
         require_finite(*self._last_training, weights, self.agent.copies, first)
 
     def snapshot(self) -> TensorDict:
-        """A copy of weights and Adam's state, batch [K] with copies and [] without.
+        """A copy of weights and Adam's state, batch [K] with replicas and [] without.
 
-        ``snapshot[k]`` is copy ``k``; ``snapshot[[k] * 16]`` is 16 copies of it.
+        ``snapshot[k]`` is replica ``k``; ``snapshot[[k] * 16]`` is 16 replicas of it.
         """
         return take_snapshot(self.agent, self._adam)
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Put a snapshot of as many copies back; a ValueError says why one does not fit."""
+        """Put a snapshot of as many replicas back; a ValueError says why one does not fit."""
         restore_snapshot(self.agent, self._adam, snapshot)

@@ -177,7 +177,7 @@ def first_episode_return(rollout: TensorDictBase) -> Tensor:
 def succeeded(rollout: TensorDictBase) -> Tensor:
     """Whether each step of a rollout [*B, T] ended an episode that is a success, bool [*B, T].
 
-    ``("next", "success")`` [*B, T, 1] tells it; without such an entry, success is termination.
+    ``("next", "success")`` [*B, T, 1] says so; without such an entry, success is termination.
     """
     after = rollout["next"]
     return after.get("success", after["terminated"]).squeeze(-1)

@@ -25,7 +25,7 @@ def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps:
 
 
 def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
-    """A copy of weights and Adam's state, batch [K] with copies and [] without."""
+    """A copy of weights and Adam's state, batch [K] with replicas and [] without."""
     batch = _batch(agent)
     entries: dict[str, TensorDict] = {}
     for name, parameter in agent.named_parameters():
@@ -43,7 +43,7 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
 
 
 def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> None:
-    """Put a snapshot of as many copies back (in place).
+    """Put a snapshot of as many replicas back (in place).
 
     Raises:
         ValueError: if its batch, a parameter's name or shape, or Adam's steps do not fit.

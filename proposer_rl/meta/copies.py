@@ -1,4 +1,4 @@
-"""The K copies of a cycle: rolled out, and one of them taken out again, wherever they are."""
+"""The K replicas of a cycle: rolled out, and one of them taken out again, wherever they are."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from proposer_rl.streams import Streams
 
 
 class Trained(NamedTuple):
-    """One copy at the end of its episode.
+    """One replica at the end of its episode.
 
     Attributes:
         solver: its snapshot, batch [1].
@@ -39,10 +39,10 @@ def taken_out(env: SolverTrainingEnv, index: int) -> Trained:
 
 
 class Copies(Protocol):
-    """Where the copies of the Solver are trained while the Proposer acts on them."""
+    """Where the replicas of the Solver are trained while the Proposer acts on them."""
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
-        """One episode of K copies of a Solver.
+        """One episode of K replicas of a Solver.
 
         Args:
             solver: a snapshot of one Solver, batch [].
@@ -54,14 +54,14 @@ class Copies(Protocol):
         """
 
     def trained(self, copy: int) -> Trained:
-        """A copy as the last episode has left it."""
+        """One replica, by its number, as the last episode has left it."""
 
     def close(self) -> None:
         """Let go of all that is held outside of this process; a further episode starts anew."""
 
 
 class CopiesHere:
-    """All copies in this process, as the Proposer's environment.
+    """All replicas in this process, as the Proposer's environment.
 
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv`.

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
+    InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -14,6 +15,8 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
 
 
 class ActorCritic(TensorDictModuleBase):
@@ -30,7 +33,7 @@ class ActorCritic(TensorDictModuleBase):
             batch ones, [*B, *T, ...], and the outputs then carry them too.
         encoder: reads what is constant within a level; None where nothing is.
         distribution_class: builds the action's distribution from ``logits=``.
-        copies: K if parameters and data carry independent copies as their first dimension
+        copies: K if parameters and data carry independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
         action_key, log_prob_key, logits_key, value_key: the entries' names.
         memory: of a head that remembers, the widths of its memory by the entries' names: it reads
@@ -107,19 +110,44 @@ class ActorCritic(TensorDictModuleBase):
         """The action's distribution, given a tensordict with logits."""
         return self.distribution_class(logits=tensordict.get(self.logits_key))
 
-    def sampler(self) -> ProbabilisticTensorDictModule:
-        """The module that turns logits into an action and its log-probability."""
+    def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
+        """The module that turns logits into an action and its log-probability.
+
+        Args:
+            sample: see :meth:`actor`.
+        """
         return ProbabilisticTensorDictModule(
             in_keys={"logits": self.logits_key},
             out_keys=[self.action_key],
             distribution_class=self.distribution_class,
             return_log_prob=True,
             log_prob_key=self.log_prob_key,
+            default_interaction_type=getattr(
+                InteractionType, "RANDOM" if sample else "DETERMINISTIC"
+            ),
         )
 
-    def actor(self) -> ProbabilisticTensorDictSequential:
-        """This actor-critic as a TorchRL policy, for collectors and losses of other code."""
-        return ProbabilisticTensorDictSequential(self, self.sampler())
+    def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
+        """This actor-critic as a TorchRL policy, for collectors and losses of other code.
+
+        An environment around which an agent with memory acts needs its :meth:`primer`.
+
+        Args:
+            sample: whether actions are drawn where nothing else is said, as in ``env.rollout``;
+                otherwise they are the most probable ones there, which explore nothing. TorchRL's
+                collectors and ``set_exploration_type`` say for themselves which it is to be.
+        """
+        return ProbabilisticTensorDictSequential(self, self.sampler(sample=sample))
+
+    def primer(self) -> TensorDictPrimer:
+        """TorchRL's transform by which an environment begins its episodes without a memory.
+
+        ``TransformedEnv(env, agent.primer())`` hands the memory on from step to step, for rollouts
+        and collectors of other code; an agent without memory needs none.
+        """
+        device = next(self.parameters()).device
+        specs = {key: Unbounded((width,), device=device) for key, width in self.memory.items()}
+        return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
 
     def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
         """Actor and critic that take logits and values as they stand in a tensordict.
@@ -152,7 +180,7 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
     """Sample by inverting the cumulative distribution function at ``uniform``.
 
     Torch's distributions take no generator. This way the random numbers are data, which can be
-    drawn for a whole rollout at once and from one generator per copy.
+    drawn for a whole rollout at once and from one generator per replica.
 
     Args:
         distribution: categorical, or any other with ``icdf``; possibly ``Independent``.

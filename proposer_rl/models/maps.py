@@ -75,7 +75,7 @@ def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) 
 
     Args:
         agent: from :func:`map_actor_critic`.
-        planes: the levels without the agent, float [*B, C, H, W], with copies [K, *B, C, H, W].
+        planes: the levels without the agent, float [*B, C, H, W], with replicas [K, *B, C, H, W].
         gradients: whether they flow to the agent's parameters.
 
     Returns:

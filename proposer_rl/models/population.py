@@ -1,4 +1,4 @@
-"""K copies of one network as a single module, their parameters stacked along a first dimension."""
+"""K replicas of one network as a single module, whose parameters are stacked, [K, ...]."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from proposer_rl.models.stacked import Call, apply_alone, apply_batched, apply_o
 
 
 class Population(nn.Module):
-    """K independent copies of a network, called and trained as one module.
+    """K independent replicas of a network, called and trained as one module.
 
-    Inputs and outputs carry the copies as their first dimension, [K, ...], and copy ``k`` sees only
-    slice ``k``. The sum over copies of each copy's loss therefore gives every copy exactly the
-    gradient that it would have alone.
+    Inputs and outputs carry the replicas as their first dimension, [K, ...], and replica ``k`` sees
+    only slice ``k``. The sum over replicas of each one's loss therefore gives every replica exactly
+    the gradient that it would have alone.
 
     Args:
         make: builds one network, without buffers, that maps tensors to one tensor or a tuple of
-            them; called once per copy, in order.
-        copies: number of copies K.
+            them; called once per replica, in order.
+        copies: number of replicas K.
         precision: ``"fp32"``, or ``"bf16"`` for autocast of the networks' arithmetic (parameters,
             gradients and outputs stay float32).
-        cores: copies that are computed at once on a CPU, each by one thread; None for as many as
+        cores: replicas that are computed at once on a CPU, each by one thread; None for as many as
             the process may use. The numbers are those of one thread whatever the cores.
-        batched: whether all copies are computed at once, in each operation; None for doing so on a
-            GPU but not on a CPU, where only very small networks are faster that way.
+        batched: whether all replicas are computed at once, in each operation; None for doing so on
+            a GPU but not on a CPU, where only very small networks are faster that way.
 
     Raises:
-        ValueError: for fewer than one copy or core, another precision, or a network with buffers.
+        ValueError: for fewer than one replica or core, another precision, or a network with
+            buffers.
 
     Example:
         >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
@@ -69,7 +70,7 @@ class Population(nn.Module):
         self._template = (members[0].to("meta"),)
 
     def forward(self, *inputs: Tensor) -> Any:
-        """Apply copy ``k`` to slice ``k`` of each input [K, ...]; outputs are stacked, [K, ...]."""
+        """Apply replica ``k`` to slice ``k`` of each input [K, ...]; outputs are [K, ...], too."""
         call = Call(self._template[0], self.names, self.precision)
         stacked = list(self.stacked)
         batched = stacked[0].device.type != "cpu" if self.batched is None else self.batched

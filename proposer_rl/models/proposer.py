@@ -159,7 +159,7 @@ def fourier_encoding(problems: int, bands: int) -> Tensor:
     """Sines and cosines of the problem index at ``bands`` frequencies, float32 [P, 2 * bands].
 
     The frequencies run geometrically from half a cycle over all problems to the highest that P
-    samples can tell apart, P / 2 cycles.
+    samples can distinguish, P / 2 cycles.
     """
     position = (torch.arange(problems, dtype=torch.float64) + 0.5) / problems
     cycles = torch.logspace(

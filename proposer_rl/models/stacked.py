@@ -17,14 +17,14 @@ from torch.func import functional_call, vmap
 
 
 class Call(NamedTuple):
-    """The network with the parameters of one copy: what the ways below have in common."""
+    """The network with the parameters of one replica: what the ways below have in common."""
 
     network: nn.Module
     names: Sequence[str]
     precision: str
 
     def __call__(self, member: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Apply the network with one copy's parameters to its inputs."""
+        """Apply the network with one replica's parameters to its inputs."""
         parameters = dict(zip(self.names, member, strict=True))
         low, device = self.precision == "bf16", member[0].device.type
         with torch.autocast(device, torch.bfloat16) if low else nullcontext():
@@ -37,7 +37,7 @@ class Call(NamedTuple):
 def apply_alone(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
-    """The only copy, as the network that it is."""
+    """The only replica, as the network that it is."""
     outputs = call([p.squeeze(0) for p in stacked], [x[0] for x in inputs])
     return tuple(output.unsqueeze(0) for output in outputs)
 
@@ -45,20 +45,20 @@ def apply_alone(
 def apply_batched(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
-    """All copies in each kernel (convolutions become grouped ones): few launches, for a GPU."""
-    return vmap(lambda *copy: call(*copy))(tuple(stacked), tuple(inputs))
+    """All replicas in each kernel (convolutions become grouped ones): few launches, for a GPU."""
+    return vmap(lambda *member: call(*member))(tuple(stacked), tuple(inputs))
 
 
 def apply_on_cores(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor], cores: int
 ) -> tuple[Tensor, ...]:
-    """Each copy on one core: small maps keep a core busy, but not several at once."""
+    """Each replica on one core: small maps keep a core busy, but not several at once."""
     with_graph = torch.is_grad_enabled()  # unknown inside, where gradients are always off
     return _OnCores.apply(call, _pool(cores), with_graph, len(inputs), *inputs, *stacked)
 
 
 class _OnCores(torch.autograd.Function):
-    """Forward and backward of the copies in threads, each through a graph of its own."""
+    """Forward and backward of the replicas in threads, each through a graph of its own."""
 
     @staticmethod
     def forward(
@@ -107,7 +107,7 @@ class _OnCores(torch.autograd.Function):
 @cache
 def _pool(cores: int) -> ThreadPoolExecutor:
     """Threads that each compute on one core."""
-    return ThreadPoolExecutor(cores, "copy", initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(cores, "replica", initializer=torch.set_num_threads, initargs=(1,))
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

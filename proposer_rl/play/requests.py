@@ -50,7 +50,7 @@ class Drawn(Question):
 
 
 class OfSet(Question):
-    """The levels of a set that comes along."""
+    """The levels of a shipped set."""
 
     source: Literal["set"]
     name: Name

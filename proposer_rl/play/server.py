@@ -30,7 +30,7 @@ from proposer_rl.play.session import Session
 from proposer_rl.report.records import printable
 
 HOSTS = ["127.0.0.1", "localhost"]
-CONNECTIONS = 256  # at once; more are told to come back later
+CONNECTIONS = 256  # at once; more are refused for now
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 # Scripts, styles and connections of this server alone; pictures also as data, as records have them.
@@ -52,7 +52,7 @@ def application(session: Session, token: str) -> Starlette:
     """The page and what it asks, all below ``/TOKEN/``.
 
     Args:
-        session: the run that is looked at.
+        session: the run that is shown.
         token: the secret part of the address.
     """
     asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {

@@ -1,4 +1,4 @@
-"""What there is to see of one run: its levels, and its Solvers on levels."""
+"""One run as the page shows it: its levels, and its Solvers on levels."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from proposer_rl.learning import PPO
+from proposer_rl.play.board import Board, PlayableTask
 from proposer_rl.play.requests import (
     LARGEST_SIDE,
     MOST_STEPS,
@@ -25,7 +26,7 @@ from proposer_rl.report.records import SampleRecord, checked
 from proposer_rl.runs.checkpoint import checkpoint_files
 from proposer_rl.runs.folder import read_jsonl
 from proposer_rl.streams import Streams
-from proposer_rl.task import Board, Levels, PlayableTask, Task
+from proposer_rl.task import Levels, Task
 
 SHOWN = 12  # levels of a draw
 MOST_LEVELS = 200  # of a file
@@ -35,7 +36,7 @@ Load = Callable[[Path], tuple[int, PPO]]
 
 
 class Session:
-    """A run that is looked at; nothing in its folder is changed.
+    """A run that is shown; nothing in its folder is changed.
 
     One thread at a time computes; the others wait.
 
@@ -82,7 +83,7 @@ class Session:
         }
 
     def examine(self, question: Examine) -> dict[str, Any]:
-        """What a Solver does on a drawing; see :meth:`~proposer_rl.task.Board.examine`.
+        """What a Solver does on a drawing; see :meth:`~proposer_rl.play.board.Board.examine`.
 
         Raises:
             ValueError: if there is no such Solver, or the drawing is no level.
@@ -92,8 +93,8 @@ class Session:
         level = board.read(question.rows)
         with self._lock, torch.no_grad():
             updates, learner = self._learner(question.checkpoint, question.solver)
-            found = board.examine(learner.agent, question.solver, level, question.max_steps)
-        return {"updates": updates, **found}
+            result = board.examine(learner.agent, question.solver, level, question.max_steps)
+        return {"updates": updates, **result}
 
     def levels(self, question: Drawn | OfSet | OfCurriculum | OfFile) -> dict[str, Any]:
         """Levels to choose from: pictures, with drawings where the task has a board.
@@ -138,9 +139,9 @@ class Session:
     def _learner(self, checkpoint: int, solver: int) -> tuple[int, PPO]:
         files = self._checkpoints()
         if checkpoint not in files:
-            raise ValueError(f"there is no checkpoint {checkpoint}; there are {list(files)}")
+            raise ValueError(f"no checkpoint {checkpoint}; available: {list(files)}")
         if solver >= len(self._seeds):
-            raise ValueError(f"there is no Solver {solver}; there are {len(self._seeds)}")
+            raise ValueError(f"no Solver {solver}; there are {len(self._seeds)}")
         file = files[checkpoint]
         return self._load(file, file.stat().st_mtime_ns)
 

@@ -1,4 +1,4 @@
-"""What a reader is told first: what came out, in two sentences, and what the words mean."""
+"""What a reader needs first: the results in two sentences, and what the words mean."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LISTED = 6  # methods that a sentence names
 
 
 def answer(study: Study) -> tuple[str, str]:
-    """Which method is best and how that is known, then how the others stand to the baseline."""
+    """Which method is best and how that is known, then the others against the baseline."""
     outcome, baseline = primary(study), study.baseline
     ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
     best, *others = ranked
@@ -28,7 +28,7 @@ def answer(study: Study) -> tuple[str, str]:
     if not others:
         return (
             f"{best.label} is the only method here ({reached}).",
-            "Nothing is compared, so whether that is good cannot be told from this page.",
+            "Nothing is compared, so this page does not show whether that is good.",
         )
     found = decisions(study)
     first = (
@@ -41,9 +41,9 @@ def answer(study: Study) -> tuple[str, str]:
 def glossary(study: Study) -> list[tuple[str, str]]:
     """The words that a reader needs, for those who have not seen any of this before."""
     levels, measured = study.example.task.levels, study.headline
-    told = f"what is measured of the Solver on the distribution {measured.rpartition('_')[0]!r}"
+    text = f"what is measured of the Solver on the distribution {measured.rpartition('_')[0]!r}"
     if is_rate(measured):
-        told += f": the share of its {levels} that the Solver solves, from 0 to 1"
+        text += f": the share of its {levels} that the Solver solves, from 0 to 1"
     return [
         (
             "Solver",
@@ -65,7 +65,7 @@ def glossary(study: Study) -> list[tuple[str, str]]:
             "one independent run of a method. [a, b] is a 95 % interval over seeds, given from "
             f"{FEWEST} seeds on.",
         ),
-        (words(measured), f"{told}. Methods are compared by its mean along training."),
+        (words(measured), f"{text}. Methods are compared by its mean along training."),
     ]
 
 
@@ -89,18 +89,18 @@ def meaning(group: Group, meanings: Meanings) -> str:
 
 
 def _shown(best: Group, pairs: Sequence[tuple[Group, Decision]]) -> str:
-    """Whether the best is shown to be better, and than how many."""
+    """Whether the best is significantly better, and than how many."""
     beaten = [decision.winner == best.label for _, decision in pairs]
     if all(decision.verdict == TOO_FEW for _, decision in pairs):
         return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
     if all(beaten):
-        return f"it is shown to be better than {'all others' if len(pairs) > 1 else 'the other'}"
+        return f"it is significantly better than {'all others' if len(pairs) > 1 else 'the other'}"
     if not any(beaten):
-        return "but it is not shown to be better than any of the others"
+        return "but there is no significant difference to any of the others"
     left = [group.label for group, decision in pairs if decision.winner != best.label]
     return (
-        f"it is shown to be better than {sum(beaten)} of the {len(pairs)} others, and undecided "
-        f"against {_listed(left)}"
+        f"it is significantly better than {sum(beaten)} of the {len(pairs)} others, with no "
+        f"significant difference to {_listed(left)}"
     )
 
 
@@ -110,14 +110,14 @@ def _against(
     """How the others stand to the baseline."""
     pairs = [between(found, baseline, other) for other in others]
     if all(decision.verdict == TOO_FEW for _, decision in pairs):
-        return f"How they stand to the baseline, {baseline.label}, is not decided."
+        return f"Too few seeds for a comparison with the baseline, {baseline.label}."
     better = [group.label for group, decision in pairs if decision.winner == group.label]
     worse = [group.label for group, decision in pairs if decision.winner == baseline.label]
     rest = len(pairs) - len(better) - len(worse)
     first = f"{_listed(better) or 'No method'} {_is(better)}"
-    parts = [f"{first} shown to be better than the baseline, {baseline.label}"]
-    parts += [f"{_listed(worse)} {_is(worse)} shown to be worse"] if worse else []
-    parts += [f"{rest} {'are' if rest > 1 else 'is'} undecided"] if rest else []
+    parts = [f"{first} significantly better than the baseline, {baseline.label}"]
+    parts += [f"{_listed(worse)} {_is(worse)} significantly worse"] if worse else []
+    parts += [f"no significant difference for {rest}"] if rest else []
     return f"{'; '.join(parts)}."
 
 

@@ -10,16 +10,22 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import curves, levels, outcomes, page, proposals, single_levels
+from proposer_rl.report import (
+    curves,
+    levels,
+    markdown,
+    outcomes,
+    page,
+    proposals,
+    tidy,
+)
 from proposer_rl.report.answer import Meanings, answer, glossary
 from proposer_rl.report.charts import charts
-from proposer_rl.report.findings import finding_table, findings
-from proposer_rl.report.reading import find_runs
+from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.records import words
 from proposer_rl.report.stages import stages
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
-from proposer_rl.report.tables import Cell, escape_markdown, to_csv
 from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import write_atomically
 
@@ -31,35 +37,21 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.learning_curves,
     curves.cost_curves,
     curves.worst_levels,
-    single_levels.worst_curves,
-    single_levels.level_by_level,
+    curves.worst_curves,
+    curves.level_by_level,
     curves.difficulty,
     proposals.gains,
     proposals.heat_maps,
     levels.along_training,
     levels.side_by_side,
-    levels.told_by_curricula,
-    proposals.diagnostics,
+    levels.recorded_by_curricula,
+    curves.diagnostics,
 )
 
 # Of these the page has pictures alone, and of others charts only where levels of several stages
 # can be shown.
-STILL = {levels.side_by_side, levels.told_by_curricula}
+STILL = {levels.side_by_side, levels.recorded_by_curricula}
 STAGED = {proposals.heat_maps, levels.along_training}
-
-# Numbers behind the figures, as CSV alone.
-TIDY: Mapping[str, Callable[[Study], tuple[list[str], list[list[Cell]]]]] = {
-    "metrics": outcomes.tidy_metrics,
-    "cycles": outcomes.tidy_cycles,
-    "worst_share": single_levels.worst_table,
-    "levels": single_levels.level_table,
-}
-
-
-class OutputError(ValueError):
-    """What was asked for cannot be written; the message is one line."""
-
-    exit_code = 2
 
 
 def read_checked(
@@ -113,6 +105,7 @@ def write_report(
     studies, notes = read_checked(folders, threshold, baseline)
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
+    prefixes: list[str] = []
     with tqdm(
         total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
     ) as bar:
@@ -120,15 +113,20 @@ def write_report(
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
             if f"{TABLES}/{prefix}runs.csv" in files:  # of one title, but measured otherwise
                 prefix += f"{len(sections) + 1}_"
+            prefixes.append(f"{FIGURES}/{prefix}")
             sections.append(_section(study, prefix, files, bar, meanings or {}))
     title = "Curricula: what the runs show"
-    command = page.report_command(folders, threshold, baseline)
+    command = page.report_command("bin/report", folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
     if len(html) > page.LARGEST:  # the figures that are charts there, too, are files anyway
         for section in sections:
             section["figures"] = [one for one in section["figures"] if not one["charted"]]
         html = page.render(title=title, command=command, sections=sections, notes=notes)
-    files["report.md"] = _markdown(title, command, sections, notes).encode()
+    parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
+    parts += [
+        markdown.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)
+    ]
+    files["report.md"] = markdown.document(parts, command, notes).encode()
     write_files(output, files, (FIGURES, TABLES))
     write_atomically(output / PAGE, html.encode())
     return output / PAGE
@@ -154,16 +152,14 @@ def _section(
     study: Study, prefix: str, files: dict[str, bytes], bar: tqdm, meanings: Meanings
 ) -> page.Section:
     """What the page shows of a study; its files are added to the others."""
-    found = findings(study)
-    claims, methods = finding_table(study, found), outcomes.group_table(study)
+    methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
-    for table in (methods, *tables, claims):
+    for table in (methods, *tables):
         files[f"{TABLES}/{prefix}{table.name}.csv"] = table.to_csv().encode()
         files[f"{TABLES}/{prefix}{table.name}.md"] = table.to_markdown().encode()
-    for name, tidy in TIDY.items():
-        header, rows = tidy(study)
-        if rows:
-            files[f"{TABLES}/{prefix}{name}.csv"] = to_csv(header, rows).encode()
+    named = [(group.label, run) for group in study.groups for run in group.runs]
+    rows = tidy.tables(named, "method")
+    files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}
     staged = stages(study)
     still = STILL if staged else STILL | STAGED
     figures = []
@@ -192,10 +188,7 @@ def _section(
         "staged": staged is not None,
         "single": bool(data["levels"]),
         "methods": methods,
-        "claims": claims,
-        "findings": found,
         "figures": figures,
-        "picture": f"{FIGURES}/{prefix}learning_curves.png",
         "tables": tables,
         "commands": page.commands(study),
         "configs": page.configs(study),
@@ -211,28 +204,6 @@ def write_files(output: Path, files: Mapping[str, bytes], folders: Sequence[str]
         path.mkdir(parents=True)
     for name, content in files.items():
         write_atomically(output / name, content)
-
-
-def _markdown(
-    title: str, command: str, sections: Sequence[page.Section], notes: Sequence[str]
-) -> str:
-    """The report in short, for where HTML is not shown."""
-    parts = [f"# {title}\n", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
-    parts += ["It is written by\n", f"```bash\n{command}\n```\n"]
-    parts += [f"- Left out: {escape_markdown(note)}" for note in notes]
-    for section in sections:
-        parts += [f"## {escape_markdown(section['study'].title)}\n"]
-        parts += [f"{escape_markdown(' '.join(section['answer']))}\n"]
-        facts = section["facts"] + section["origin"]
-        if section["incomplete"]:
-            told = f"Not finished, or shorter than {section['study'].horizon} updates"
-            facts = [*facts, (told, ", ".join(section["incomplete"]))]
-        parts += [f"- {escape_markdown(f'{name}: {text}')}" for name, text in facts]
-        parts.append(f"\n![Learning curves and updates to the threshold]({section['picture']})\n")
-        for table in filter(lambda table: table.rows, (section["claims"], section["methods"])):
-            parts += [f"### {table.title}\n", f"{table.note}\n", table.to_markdown()]
-        parts += ["### Commands\n", "```bash", *section["commands"], "```\n"]
-    return "\n".join(parts)
 
 
 def _slug(text: str) -> str:

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from proposer_rl.report.comparisons import Outcome, outcomes, updates_needed, waiting_outcome
-from proposer_rl.report.curves import axis_text
-from proposer_rl.report.proposals import gain_numbers, own_numbers
+from proposer_rl.report.measures import (
+    COSTS,
+    UPDATES,
+    Measure,
+    Series,
+    axis_text,
+    band,
+    gains,
+    level_means,
+    measured,
+    of_levels,
+    own_numbers,
+    trained,
+    worst,
+)
 from proposer_rl.report.records import Column
-from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.series import COSTS, Series, band, over_cost, over_cycles
-from proposer_rl.report.series import over_updates as against_updates
-from proposer_rl.report.single_levels import level_means, told, worst_series
+from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import UPDATES
 from proposer_rl.runs.columns import is_rate
 
 Json = Any
 DIGITS = 5
-MOST_MEASURES = 30  # of a kind
 DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
 
 
@@ -34,7 +42,7 @@ def charts(study: Study) -> dict[str, Json]:
         by axis with mean and interval of every method, and with ``rows`` of its runs, at their
         places or, where they are another table's, at the means' own; null where there is none.
         ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
-        that two methods tell of single levels what each reaches there, null where it does not tell.
+        that two methods have for single levels what each reaches there, null without records.
         ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
     """
     return {
@@ -49,7 +57,16 @@ def charts(study: Study) -> dict[str, Json]:
         ],
         "axes": [UPDATES, *COSTS],
         "places": [[_places(run) for run in group.runs] for group in study.groups],
-        "measures": [*_measured(study), *_trained(study), *_recorded(study), *_single(study)],
+        "measures": [
+            _measure(study, each)
+            for each in (
+                *measured(study).values(),
+                *trained(study),
+                *gains(study),
+                *own_numbers(study),
+                *worst(study),
+            )
+        ],
         "outcomes": _outcomes(study),
         "levels": _levels(study),
         "baseline": [group.label for group in study.groups].index(study.baseline.label),
@@ -67,74 +84,36 @@ def _places(run: Run) -> Json:
     return {UPDATES: plain(run.metrics["updates"]), **costs}
 
 
-def _measured(study: Study) -> list[Json]:
-    """The measurements, against updates and every cost."""
-    first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]
-    every = dict.fromkeys([*first, *(name for run in study.runs for name in run.metrics)])
-    measures = []
-    for name in [n for n in every if n not in COST and _has(study, n)][:MOST_MEASURES]:
-        axes = {UPDATES: [against_updates(group, name) for group in study.groups]}
-        for axis, cost in COSTS.items():
-            axes[axis] = [over_cost(group, name, cost) for group in study.groups]
-        rows = [[_row(run.metrics.get(name)) for run in group.runs] for group in study.groups]
-        measures.append(_measure("Measured", axis_text(name), axes, rows, rate=is_rate(name)))
-    return measures
+def _measure(study: Study, measure: Measure) -> Json:
+    """Means and intervals by axis, and the rows of single runs.
 
-
-def _trained(study: Study) -> list[Json]:
-    """The task's statistics of the batches."""
-    names = dict.fromkeys(name for run in study.runs for name in run.statistics)
-    kind = "What the Solver trained on"
-    return [
-        _on_one_axis(
-            kind,
-            name.replace("_", " "),
-            UPDATES,
-            [against_updates(group, name, "training") for group in study.groups],
-            study,
-            rate=is_rate(name),
-        )
-        for name in list(names)[:MOST_MEASURES]
-    ]
-
-
-def _recorded(study: Study) -> list[Json]:
-    """The curricula's own numbers, and the gains of the copies."""
-    values = {**gain_numbers(study), **own_numbers(study)}
-    kind = "The curricula's own numbers"
-    return [
-        _on_one_axis(
-            kind,
-            name,
-            UPDATES,
-            [over_cycles(group, value) if group.logs else None for group in study.groups],
-            study,
-        )
-        for name, value in list(values.items())[:MOST_MEASURES]
-    ]
-
-
-def _single(study: Study) -> list[Json]:
-    """The mean over the worst levels against their share."""
-    levels = study.example.task.levels
-    return [
-        _on_one_axis(
-            f"Single {levels} at the end",
-            f"{axis_text(name)} on the worst share",
-            f"worst share of the {levels}",
-            [worst_series(study, group, name) for group in study.groups],
-            study,
-            rate=is_rate(name),
-            log=True,
-        )
-        for name in told(study)
-    ]
+    Those of a column of ``metrics`` stand at the runs' own places, others at the means'.
+    """
+    found = {axis: [of(group) for group in study.groups] for axis, of in measure.axes.items()}
+    first = next(iter(found.values()))
+    if measure.column:
+        rows = [[_row(r.metrics.get(measure.column)) for r in g.runs] for g in study.groups]
+    else:
+        rows = [
+            [_row(_of_run(series, run)) for run in group.runs]
+            for group, series in zip(study.groups, first, strict=True)
+        ]
+    return {
+        "kind": measure.kind,
+        "name": measure.name,
+        "axes": {axis: [_means(one) for one in series] for axis, series in found.items()},
+        "rows": rows,
+        "own": not measure.column,
+        "rate": measure.rate,
+        "log": measure.log,
+    }
 
 
 def _levels(study: Study) -> list[Json]:
     """What the methods reach on every single level at the end, mean over seeds."""
     every = {
-        name: [level_means(study, group, name) for group in study.groups] for name in told(study)
+        name: [level_means(study, group, name) for group in study.groups]
+        for name in of_levels(study)
     }
     return [
         {
@@ -145,32 +124,6 @@ def _levels(study: Study) -> list[Json]:
         for name, means in every.items()
         if sum(one is not None for one in means) > 1
     ]
-
-
-def _on_one_axis(
-    kind: str,
-    name: str,
-    axis: str,
-    series: Sequence[Series | None],
-    study: Study,
-    **limits: bool,
-) -> Json:
-    rows = [
-        [_row(_of_run(found, run)) for run in group.runs]
-        for group, found in zip(study.groups, series, strict=True)
-    ]
-    return _measure(kind, name, {axis: series}, rows, own=True, **limits)
-
-
-def _measure(
-    kind: str,
-    name: str,
-    axes: Mapping[str, Sequence[Series | None]],
-    rows: Json,
-    **limits: bool,
-) -> Json:
-    drawn = {axis: [_means(one) for one in series] for axis, series in axes.items()}
-    return {"kind": kind, "name": name, "axes": drawn, "rows": rows, **limits}
 
 
 def _means(series: Series | None) -> Json:
@@ -193,10 +146,6 @@ def _of_run(series: Series | None, run: Run) -> Column | None:
 
 def _row(values: Column | None) -> Json:
     return None if values is None else plain(values)
-
-
-def _has(study: Study, name: str) -> bool:
-    return any(name in run.metrics for run in study.runs)
 
 
 def _outcomes(study: Study) -> list[Json]:

@@ -29,7 +29,7 @@ from proposer_rl.runs.columns import is_rate
 
 ALIKE = 0.1  # of a rate: differences below it are small, and who gained less learnt nothing
 
-TOO_FEW, UNDECIDED, NOT_LEARNT = "too few seeds", "undecided", "nothing learnt"
+TOO_FEW, UNDECIDED, NOT_LEARNT = "too few seeds", "no significant difference", "nothing learnt"
 
 
 class Outcome(NamedTuple):

@@ -1,29 +1,54 @@
-"""Curves over training: what was measured against updates, frames and seconds, over seeds."""
+"""Figures of curves over training, and of single levels at its end."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import partial
 from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
+from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
 from proposer_rl.report.comparisons import updates_needed, waiting_outcome
-from proposer_rl.report.records import Column, level_text, words
-from proposer_rl.report.series import COSTS, Series, band, over_cost, over_updates
+from proposer_rl.report.measures import (
+    TRAINED,
+    Measure,
+    Series,
+    band,
+    level_means,
+    measured,
+    of_levels,
+    own_numbers,
+    trained,
+    worst,
+)
+from proposer_rl.report.records import level_text, words
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import UPDATES, Drawing, Look, Panel, axes_of, finish, style
+from proposer_rl.report.style import Drawing, Look, Panel, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
 
 MOST_PANELS = 12
+MOST_SCATTERS = 8
+TICKS = (0.01, 0.03, 0.1, 0.3, 1.0)
+SIDE = 3.3  # inches of a scatter
+SMALL = (3.6, 2.7)
+SELECTION = {
+    True: "The measurements are exact, so that no second evaluation is needed: to sort the levels "
+    "by what is averaged selects no luck.",
+    False: "The measurements are sampled, and the levels are sorted by what is averaged: selection "
+    "bias makes the curves too low, the more the smaller the share.",
+    None: "The runs do not say whether their measurements are exact. If they are sampled, "
+    "selection bias makes the curves too low, the more the smaller the share.",
+}
 
 
 def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
-    panels = [_curve_panel(study, name) for name in study.measurements[:MOST_PANELS]]
+    every = measured(study)
+    panels = [_panel(study, every[name]) for name in study.measurements[:MOST_PANELS]]
     bars = Panel(
         f"Updates until {words(study.headline)} reached "
         f"{level_text(study.headline, study.threshold)}, by method, the soonest first.",
@@ -45,25 +70,22 @@ def learning_curves(study: Study) -> Drawing:
 
 def worst_levels(study: Study) -> Drawing | None:
     """The tenth of the levels where the Solver is worst; None where that was not measured."""
+    levels, every = study.example.task.levels, measured(study)
     names = [f"{name}_worst10" for name in study.measurements[:MOST_PANELS]]
-    panels = [
-        _curve_panel(study, name) for name in names if any(name in r.metrics for r in study.runs)
-    ]
-    if not panels:
-        return None
-    return Drawing(
+    return _drawing(
+        study,
         "worst_levels",
-        f"The worst tenth of the {study.example.task.levels} (CVaR)",
-        f"Mean over the 10 % of the {study.example.task.levels} where the Solver is worst at that "
+        f"The worst tenth of the {levels} (CVaR)",
+        f"Mean over the 10 % of the {levels} where the Solver is worst at that "
         "moment: a policy that gives up on hard ones shows here first.",
-        panels,
-        legend=study.legend,
+        [every[name] for name in names if name in every],
+        2,
     )
 
 
 def cost_curves(study: Study) -> Drawing:
-    """The headline against updates, and against what was paid for it with the curriculum's part."""
-    name = words(study.headline)
+    """The headline against updates and every cost, the curriculum's part included."""
+    measure = measured(study)[study.headline]
     seconds = (
         "Seconds: of the whole process, evaluation included; where seeds were trained together, "
         "an even share. Seconds can be compared only between runs on equal machines."
@@ -75,19 +97,10 @@ def cost_curves(study: Study) -> Drawing:
         )
     return Drawing(
         "cost",
-        f"The same {name} against updates and against its whole cost",
-        "Frames: the Solver's own plus those that the curriculum spent, on copies or on scoring. "
+        f"The same {words(study.headline)} against updates and against its whole cost",
+        "Frames: the Solver's own plus those that the curriculum spent, on replicas or on scoring. "
         + seconds,
-        [
-            _curve_panel(study, study.headline),
-            *(
-                Panel(
-                    f"{name} against {axis}, the curriculum's counted, by method.",
-                    partial(_draw_against_cost, study=study, axis=axis),
-                )
-                for axis in COSTS
-            ),
-        ],
+        [_panel(study, measure, axis) for axis in measure.axes],
         3,
         study.legend,
     )
@@ -95,33 +108,87 @@ def cost_curves(study: Study) -> Drawing:
 
 def difficulty(study: Study) -> Drawing | None:
     """What the Solver trained on, by the task's own statistics."""
-    names = list(dict.fromkeys(name for run in study.runs for name in run.statistics))
-    if not names:
-        return None
-    told = [group for group in study.groups if any(run.statistics for run in group.runs)]
-    return Drawing(
+    return _drawing(
+        study,
         "difficulty",
         "What the Solver trained on",
         "Statistics of the task over the batch of each evaluated update: means, or where a name "
         "says so standard deviations (sd). Lines and bands as above.",
-        [_curve_panel(study, name, "training") for name in names[:MOST_PANELS]],
-        3,
-        {group.label: group.look for group in told},
+        trained(study)[:MOST_PANELS],
     )
 
 
-def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
-    """Mean and interval of runs over x, or all of them where they are too few for an interval.
+def diagnostics(study: Study) -> Drawing | None:
+    """How the curricula's own training goes: whatever numbers they recorded."""
+    return _drawing(
+        study,
+        "diagnostics",
+        "The curricula's own numbers",
+        "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, "
+        "mean over standard deviation between the replicas: where it is large, all replicas gain "
+        "alike whatever they are proposed, and there is little to learn from.",
+        own_numbers(study),
+        size=SMALL,
+    )
 
-    Args:
-        axes: where to draw.
-        x: float [n].
-        rows: float [runs, n], NaN where a run has no value.
-        look: of the method.
+
+def worst_curves(study: Study) -> Drawing | None:
+    """Mean over the worst levels against their share, of each distribution; None without any."""
+    levels = study.example.task.levels
+    return _drawing(
+        study,
+        "worst_share",
+        f"The worst share of the {levels} at the end (CVaR)",
+        f"Mean over the share of the {levels} where a Solver is worst, after {study.horizon} "
+        "updates: at 100 % the mean over all. Each seed has worst levels of its own. Lines: mean "
+        f"over seeds, with bands as above. {SELECTION[study.example.task.exact]}",
+        worst(study),
+        2,
+    )
+
+
+def level_by_level(study: Study) -> Drawing | None:
+    """Every method against the baseline on each level; None where there are no two."""
+    names = of_levels(study)
+    name = study.headline if study.headline in names else next(iter(names), None)
+    if name is None or level_means(study, study.baseline, name) is None:
+        return None
+    known = [
+        (float(means.mean()), group)
+        for group in study.groups
+        if group.label != study.baseline.label
+        and (means := level_means(study, group, name)) is not None
+    ]
+    if not known:
+        return None
+    best = sorted(known, key=lambda pair: -pair[0])[:MOST_SCATTERS]
+    task, label = study.example.task, study.baseline.label
+    more = f" The {MOST_SCATTERS} best methods; levels.csv has all." * (len(known) > MOST_SCATTERS)
+    return Drawing(
+        "level_by_level",
+        f"{words(name)} on each of the {task.levels}, against {label}",
+        f"Dots: {task.levels}, each the mean over seeds after {study.horizon} updates. Above the "
+        f"line the method is better there, below it {label} is.{more}",
+        [
+            Panel(
+                f"{words(name)} of {group.label} against that of {label}, on each level.",
+                partial(_draw_scatter, study=study, group=group, name=name),
+                (SIDE, SIDE),
+            )
+            for _, group in best
+        ],
+        4,
+    )
+
+
+def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
+    """Mean and interval of runs, or all of them where they are too few for an interval.
 
     Returns:
         The mean, float [n].
     """
+    seen = ~np.isnan(series.rows).all(0)
+    x, rows = series.x[seen], series.rows[:, seen]
     mean, whole, low, high = band(rows)
     if len(rows) < FEWEST:
         axes.plot(x, rows.T, alpha=0.5, linewidth=0.6, color=look.colour, linestyle=look.dash)
@@ -131,39 +198,65 @@ def draw_curve(axes: Axes, x: Column, rows: Column, look: Look) -> Column:
     return mean
 
 
-def _curve_panel(study: Study, name: str, table: str = "metrics") -> Panel:
-    trained = table == "training"
-    text = name.replace("_", " ") if trained else words(name)
-    draw = partial(_draw_curves, groups=study.groups, name=name, table=table)
-    return Panel(f"{text} against Solver updates, by method.", draw)
+def _drawing(
+    study: Study,
+    name: str,
+    title: str,
+    caption: str,
+    measures: Iterable[Measure],
+    columns: int = 3,
+    size: tuple[float, float] | None = None,
+) -> Drawing | None:
+    """A panel for each measure, with the methods that have any in the legend; None without any."""
+    panels, shown = [], set()
+    for measure in measures:
+        (series,) = [of for axis, of in measure.axes.items() if axis == next(iter(measure.axes))]
+        having = {group.label for group in study.groups if series(group) is not None}
+        if having:
+            panels.append(_panel(study, measure, size=size))
+            shown |= having
+    if not panels:
+        return None
+    legend = {label: look for label, look in study.legend.items() if label in shown}
+    return Drawing(name, title, caption, panels, columns, legend)
 
 
-def _draw_curves(figure: FigureBase, groups: Sequence[Group], name: str, table: str) -> None:
-    trained = table == "training"
-    found = [(group, over_updates(group, name, table)) for group in groups]
-    text = name.replace("_", " ") if trained else axis_text(name)
-    _draw_series(figure, found, UPDATES, text, rate=is_rate(name), zero=trained)
+def _panel(
+    study: Study,
+    measure: Measure,
+    axis: str | None = None,
+    size: tuple[float, float] | None = None,
+) -> Panel:
+    axis = axis or next(iter(measure.axes))
+    panel = Panel(
+        f"{measure.name} against {axis}, by method.",
+        partial(_draw_curves, study=study, measure=measure, axis=axis),
+    )
+    return panel if size is None else panel._replace(size=size)
 
 
-def _draw_against_cost(figure: FigureBase, study: Study, axis: str) -> None:
-    name = study.headline
-    found = [(group, over_cost(group, name, COSTS[axis])) for group in study.groups]
-    _draw_series(figure, found, axis, axis_text(name), rate=is_rate(name))
-
-
-def _draw_series(
-    figure: FigureBase, found: Sequence[tuple[Group, Series | None]], x: str, y: str, **limits: bool
-) -> None:
+def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str) -> None:
     axes = axes_of(figure)
-    drawn = [(group.look, series) for group, series in found if series is not None]
-    means = [draw_curve(axes, series.x, series.rows, look) for look, series in drawn]
-    finish(axes, x, y, means, **limits)
+    found = [(group.look, measure.axes[axis](group)) for group in study.groups]
+    means = [draw_series(axes, series, look) for look, series in found if series is not None]
+    finish(axes, axis, measure.name, means, rate=measure.rate, zero=measure.kind == TRAINED)
+    if measure.log:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(FixedLocator(TICKS))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(PercentFormatter(1, 0))
 
 
-def axis_text(name: str) -> str:
-    """A measurement as an axis is named."""
-    rate = " rate" if is_rate(name) else ""
-    return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
+def _draw_scatter(figure: FigureBase, study: Study, group: Group, name: str) -> None:
+    axes: Axes = axes_of(figure)
+    x, y = (level_means(study, each, name) for each in (study.baseline, group))
+    assert x is not None and y is not None  # or there would be no panel
+    ends = (0.0, 1.0) if is_rate(name) else (min(x.min(), y.min()), max(x.max(), y.max()))
+    axes.plot(ends, ends, color="0.4", linewidth=0.8)
+    # As pixels also in SVG, where thousands of dots would make the page heavy.
+    axes.plot(x, y, "o", color=group.look.colour, ms=3.5, alpha=0.35, mew=0, rasterized=True)
+    axes.set(xlabel=study.baseline.label, ylabel=group.label, aspect="equal")
+    axes.set_title(f"better on {np.mean(y > x):.0%}, worse on {np.mean(y < x):.0%}", fontsize=9)
 
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:

@@ -10,6 +10,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from proposer_rl.report.measures import UPDATES
 from proposer_rl.report.reading import read_run
 from proposer_rl.report.records import LevelRecord, SampleRecord, picture, words
 from proposer_rl.report.runs import Run
@@ -17,7 +18,6 @@ from proposer_rl.report.studies import Study
 from proposer_rl.report.style import (
     SETTINGS,
     SKY,
-    UPDATES,
     VERMILLION,
     Drawing,
     Panel,
@@ -85,12 +85,12 @@ def side_by_side(study: Study) -> Drawing | None:
     )
 
 
-def told_by_curricula(study: Study) -> Drawing | None:
-    """Levels that curricula tell of: the last time, of each method's first seed."""
+def recorded_by_curricula(study: Study) -> Drawing | None:
+    """Levels that curricula recorded: the last time, of each method's first seed."""
     panels = [
         Panel(
-            f"{study.example.task.levels.capitalize()} that the curriculum of {group.label} tells "
-            f"of: {caption}.",
+            f"{study.example.task.levels.capitalize()} that the curriculum of {group.label} "
+            f"recorded: {caption}.",
             partial(_draw_row, levels=levels, title=f"{group.label}: {caption}"),
             (SIDE * SAMPLES, SIDE + 0.35),
         )
@@ -101,8 +101,8 @@ def told_by_curricula(study: Study) -> Drawing | None:
     if not panels:
         return None
     return Drawing(
-        "told",
-        f"{study.example.task.levels.capitalize()} that the curricula tell of",
+        "recorded",
+        f"{study.example.task.levels.capitalize()} that the curricula recorded",
         "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
         f"{study.example.task.key}",
         panels,

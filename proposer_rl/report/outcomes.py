@@ -1,4 +1,4 @@
-"""What came out, in tables: a row per group, per pair of groups, per run and per measurement."""
+"""The results in tables: a row per group, per pair of groups and per run."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from proposer_rl.report import records
 from proposer_rl.report.comparisons import (
+    between,
     decisions,
     difference,
     outcomes,
@@ -19,7 +18,7 @@ from proposer_rl.report.comparisons import (
     updates_needed,
     waiting_outcome,
 )
-from proposer_rl.report.records import LONGEST_TEXT, level_text, words
+from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
@@ -71,6 +70,28 @@ def comparison_table(study: Study) -> Table:
     return Table("comparisons", "Pairwise comparisons", note, rows)
 
 
+def against_baseline(study: Study) -> Table:
+    """Every group against the baseline, by the primary outcome."""
+    outcome, baseline, decided = primary(study), study.baseline, decisions(study)
+    rows: list[dict[str, Cell]] = []
+    for group in study.compared:
+        if group.label != baseline.label:
+            _, decision = between(decided, baseline, group)
+            rows.append(
+                {
+                    "method": group.label,
+                    "difference": difference(outcome, group, baseline).interval(),
+                    "verdict": decision.verdict,
+                    "p (Holm)": decision.p,
+                }
+            )
+    note = (
+        f"{outcome.name}: method minus {baseline.label}, with a 95 % interval, not corrected; "
+        "p-values are corrected for all pairs of methods (Holm)."
+    )
+    return Table("baseline", f"Against {baseline.label}", note, rows)
+
+
 def group_table(study: Study) -> Table:
     """One row per group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
@@ -99,8 +120,8 @@ def group_table(study: Study) -> Table:
             "seconds per run": lambda run: run.own_seconds[-1],
         }
         row |= {
-            name: float(np.mean([paid(run) for run in runs or group.runs]))
-            for name, paid in cost.items()
+            name: float(np.mean([spent(run) for run in runs or group.runs]))
+            for name, spent in cost.items()
         }
         rows.append(row)
     note = (
@@ -108,7 +129,7 @@ def group_table(study: Study) -> Table:
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
         "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
         "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
-        "success; both where the runs tell of single levels. P(better): that a run of the method "
+        "success; both where the runs have single levels. P(better): that a run of the method "
         f"has the higher {primary(study).name}. Brackets: 95 % interval, from {FEWEST} seeds on, "
         "where they differ."
     )
@@ -116,7 +137,7 @@ def group_table(study: Study) -> Table:
 
 
 def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
-    """What is told of single levels, and of the baseline; empty cells where it is not known."""
+    """Statistics of single levels, and against the baseline; empty where it is not known."""
     name, outcome, baseline = study.headline, primary(study), study.baseline
     scores = study.scores(group, name)
     row: dict[str, Cell] = {}
@@ -162,40 +183,6 @@ def run_table(study: Study) -> Table:
                 }
             )
     return Table("runs", "Runs", "Measurements are the run's last.", rows)
-
-
-def tidy_metrics(study: Study) -> tuple[list[str], list[list[Cell]]]:
-    """Every evaluation of every run: the numbers behind the figures, for other tools."""
-    names = list(dict.fromkeys(name for run in study.runs for name in run.metrics))
-    rows: list[list[Cell]] = []
-    for group in study.groups:
-        for run in group.runs:
-            none = np.full(len(run.metrics["updates"]), math.nan)
-            columns = [run.metrics.get(name, none) for name in names]
-            rows += [[group.label, run.seed, *map(float, row)] for row in np.transpose(columns)]
-    return ["method", "seed", *names], rows
-
-
-def tidy_cycles(study: Study) -> tuple[list[str], list[list[Cell]]]:
-    """Every cycle of every curriculum: whatever it recorded, lists as numbers with spaces."""
-    found = [(group.label, run) for group in study.groups for run in group.logs]
-    names = list(dict.fromkeys(name for _, run in found for cycle in run.cycles for name in cycle))
-    names = names[:MOST_COLUMNS]
-    rows: list[list[Cell]] = [
-        [label, run.seed, *(_cell(cycle.get(name)) for name in names)]
-        for label, run in found
-        for cycle in run.cycles
-    ]
-    return ["method", "seed", *names], rows
-
-
-def _cell(value: Any, depth: int = 0) -> Cell:
-    if isinstance(value, str):
-        return value[:LONGEST_TEXT]
-    if isinstance(value, list) and depth < DEEPEST:
-        cells = [_cell(item, depth + 1) for item in value]
-        return " ".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in cells)
-    return records.number(value)
 
 
 def _known(runs: Sequence[Run], name: str, updates: float) -> list[float]:

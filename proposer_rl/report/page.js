@@ -102,7 +102,7 @@
     const share = (won) => x.filter((value, i) => won(y[i], value)).length / x.length;
     const percent = (value) => `${Math.round(100 * value)} %`;
     shares.textContent = x.length && y.length
-      ? `better on ${percent(share((a, b) => a > b))}, worse on ${percent(share((a, b) => a < b))}` : "not told of single levels";
+      ? `better on ${percent(share((a, b) => a > b))}, worse on ${percent(share((a, b) => a < b))}` : "no records of single levels";
     const every = x.concat(y).filter((value) => value !== null), ends = measure.rate ? [0, 1] : [Math.min(...every), Math.max(...every)];
     return draw(place, [
       { type: "scatter", mode: "lines", x: ends, y: ends, line: { color: "#8c959f", width: 1 }, hoverinfo: "skip" },

@@ -164,12 +164,16 @@ def _digest(script: str) -> str:
 
 
 def report_command(
-    folders: Sequence[Path], threshold: float | None, baseline: str | None, *more: str
+    program: str,
+    folders: Sequence[Path],
+    threshold: float | None,
+    baseline: str | None,
+    *more: str,
 ) -> str:
     """What writes this report again, without the places of this machine."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [] if baseline is None else [f"--baseline={baseline}"]
-    return anywhere(shlex.join(["bin/report", *map(str, folders), *asked, *more]))
+    return anywhere(f"{program} {shlex.join([*map(str, folders), *asked, *more])}")
 
 
 def _commands(group: Group) -> list[str]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,56 +17,45 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
-from proposer_rl.report.curves import draw_curve
+from proposer_rl.report.measures import (
+    OF_REPLICAS,
+    UPDATES,
+    lists,
+    of_gains,
+    over_cycles,
+    recorded_gain,
+)
 from proposer_rl.report.reading import read_run
-from proposer_rl.report.records import GAINS, LONGEST_TEXT, PLACE, Column, Record, number, numbers
+from proposer_rl.report.records import GAINS, Column, Record, number
 from proposer_rl.report.runs import Run, share_map
-from proposer_rl.report.series import over_cycles
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import SETTINGS, UPDATES, Drawing, Panel, axes_of, finish
-
-Value = Callable[[Record], float]  # of a cycle; NaN where it has none
+from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, finish
 
 STAGES = 5
 STRIP = (7.6, 2.1)  # inches, of a row of heat maps
-SMALL = (3.6, 2.7)
 ANIMATION = (3.6, 3.0)
 FRAME_SECONDS = 0.5
 MOST_TICKS = 10
-MOST_PANELS, MOST_FRAMES = 30, 150
-DIAGNOSTICS = {
-    "entropy": "entropy (nats)",
-    "kl_approx": "KL divergence per epoch (nats)",
-    "clip_fraction": "share of clipped ratios",
-    "explained_variance": "explained variance of the value",
-    "reward_sd": "sd of total reward over the copies",
-    "reward_explained": "share of rewards explained by actions",
-}
-OF_COPIES: Mapping[str, Callable[[Column], float]] = {"maximum": np.max, "mean": np.mean}
-
-
-def recorded_gain(group: Group) -> str | None:
-    """Which gain of the copies a group has on record; None without one."""
-    return next((name for name in GAINS if _lists(group, name)), None)
+MOST_FRAMES = 150
 
 
 def gains(study: Study) -> Drawing | None:
-    """The paper's Figure 4: maximum and mean total gain of a cycle's copies."""
+    """The paper's Figure 4: maximum and mean total gain of a cycle's replicas."""
     shown = [(group, name) for group in study.groups if (name := recorded_gain(group))]
     every = {name: np.zeros(1) for _, name in shown}  # of all groups, so that axes are alike
     for group, name in shown:
-        every[name] = np.concatenate([every[name], *(c for _, c in _lists(group, name))])
+        every[name] = np.concatenate([every[name], *(c for _, c in lists(group, name))])
     if not shown:
         return None
     return Drawing(
         "gains",
-        f"Total gain in {' or '.join(map(GAINS.__getitem__, every))} of the copies in each cycle "
+        f"Total gain in {' or '.join(map(GAINS.__getitem__, every))} of the replicas in each cycle "
         "(the paper's Figure 4)",
-        "Dots: the total gain on the target of every copy of every seed over one "
-        "meta-episode. Lines: maximum and mean over a cycle's copies, averaged over the seeds.",
+        "Dots: the total gain on the target of every replica of every seed over one "
+        "meta-episode. Lines: maximum and mean over a cycle's replicas, averaged over the seeds.",
         [
             Panel(
-                f"Total {GAINS[name]} gains of the copies against Solver updates, {group.label}.",
+                f"Total {GAINS[name]} gains of the replicas against Solver updates, {group.label}.",
                 partial(_draw_gains, group=group, name=name, every=every[name]),
             )
             for group, name in shown
@@ -83,8 +71,8 @@ def heat_maps(study: Study) -> Drawing | None:
     return Drawing(
         "proposals",
         f"Proposals over {' and '.join(list(found[0][0].runs[0].task.space)[:2])}, along training",
-        "Share of a cycle's proposals, averaged over the seeds. White is what even draws would "
-        "give, orange is more, purple less: a map that stays "
+        "Share of a cycle's proposals, averaged over the seeds. White is the share "
+        "under domain randomization, orange is more, purple less: a map that stays "
         "white is a Proposer that has not learnt, or seeds that went different ways.",
         [
             Panel(
@@ -97,57 +85,6 @@ def heat_maps(study: Study) -> Drawing | None:
         ],
         1,
     )
-
-
-def diagnostics(study: Study) -> Drawing | None:
-    """How the curricula's own training goes: whatever numbers they recorded."""
-    groups = [group for group in study.groups if group.logs]
-    values = own_numbers(study)
-    if not values:
-        return None
-    return Drawing(
-        "diagnostics",
-        "The curricula's own numbers",
-        "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, "
-        "mean over standard deviation between the copies: where it is large, all copies gain alike "
-        "whatever they are proposed, and there is little to learn from.",
-        [
-            Panel(
-                f"The curricula's {text} against Solver updates.",
-                partial(_draw_over_cycles, groups=groups, value=value, axis=text),
-                SMALL,
-            )
-            for text, value in values.items()
-        ],
-        3,
-        {group.label: group.look for group in groups},
-    )
-
-
-def own_numbers(study: Study) -> dict[str, Value]:
-    """The numbers of their own that curricula recorded in cycles, by what they are called."""
-    groups = [group for group in study.groups if group.logs]
-    names = _scalars(groups)
-    chosen = {name: text for name, text in DIAGNOSTICS.items() if name in names}
-    chosen |= {name: name.replace("_", " ") for name in sorted(names - chosen.keys())}
-    values: dict[str, Value] = {
-        text: partial(_value, name=name) for name, text in list(chosen.items())[:MOST_PANELS]
-    }
-    if any(map(recorded_gain, groups)):
-        values["total gain: mean / sd of copies"] = partial(_of_gains, names=GAINS, reduce=_ratio)
-    return values
-
-
-def gain_numbers(study: Study) -> dict[str, Value]:
-    """Maximum and mean of the gains of a cycle's copies, by what they are called."""
-    names = dict.fromkeys(filter(None, map(recorded_gain, study.groups)))
-    return {
-        f"total gain in {GAINS[name]}, {text} of the copies": partial(
-            _of_gains, names=[name], reduce=reduce
-        )
-        for name in names
-        for text, reduce in OF_COPIES.items()
-    }
 
 
 def axis_means(run: Run, cycle: Record) -> list[float] | None:
@@ -186,13 +123,14 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
 def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> None:
     axes = axes_of(figure)
     colour = group.look.colour
-    points = np.array([(updates, gain) for updates, c in _lists(group, name) for gain in c])
+    points = np.array([(updates, gain) for updates, c in lists(group, name) for gain in c])
     # As pixels also in SVG, where thousands of dots would make the page heavy.
     axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
-    for (text, reduce), dash in zip(OF_COPIES.items(), ("-", "--"), strict=True):
-        x, rows, _ = over_cycles(group, partial(_of_gains, names=[name], reduce=reduce))
-        mean = np.ma.masked_invalid(rows).mean(0)
-        axes.plot(x, mean, dash, color=colour, label=f"{text} of the copies")
+    for (text, reduce), dash in zip(OF_REPLICAS.items(), ("-", "--"), strict=True):
+        series = over_cycles(group, partial(of_gains, names=[name], reduce=reduce))
+        assert series is not None  # or there would be no panel
+        mean = np.ma.masked_invalid(series.rows).mean(0)
+        axes.plot(series.x, mean, dash, color=colour, label=f"{text} of the replicas")
     axes.axhline(0, color="0.2", linewidth=0.8)
     finish(axes, UPDATES, f"total gain in target {GAINS[name]}", [every])
     axes.set_title(group.label)
@@ -261,38 +199,6 @@ def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:
     return np.arange(0.5, len(values), step), [f"{value:g}" for value in values[::step]]
 
 
-def _draw_over_cycles(figure: FigureBase, groups: Sequence[Group], value: Value, axis: str) -> None:
-    axes = axes_of(figure)
-    means = []
-    for group in groups:
-        x, rows, _ = over_cycles(group, value)
-        seen = ~np.isnan(rows).all(0)
-        means.append(draw_curve(axes, x[seen], rows[:, seen], group.look))
-    finish(axes, UPDATES, axis, means)
-
-
-def _lists(group: Group, name: str) -> list[tuple[float, Column]]:
-    """A list of numbers of every cycle that has it, with the Solver's updates."""
-    cycles = [cycle for run in group.logs for cycle in run.cycles]
-    found = [(number(cycle["updates"]), numbers(cycle.get(name))) for cycle in cycles]
-    return [(updates, values) for updates, values in found if values is not None]
-
-
-def _value(cycle: Record, name: str) -> float:
-    return number(cycle.get(name))
-
-
-def _of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], float]) -> float:
-    """A number of a cycle's gains, of the first that it has; NaN where it has none."""
-    found = [values for name in names if (values := numbers(cycle.get(name))) is not None]
-    return float(reduce(found[0])) if found else np.nan
-
-
-def _ratio(gains: Column) -> float:
-    spread = float(gains.std(ddof=1)) if len(gains) > 1 else 0.0
-    return float(gains.mean()) / spread if spread else np.nan
-
-
 def _histograms(group: Group) -> tuple[Column, Column] | None:
     """Shares of proposals by cycle, [cycles, rows, columns], mean over the runs."""
     by_updates: dict[float, list[Column]] = {}
@@ -305,10 +211,3 @@ def _histograms(group: Group) -> tuple[Column, Column] | None:
         return None
     updates = sorted(by_updates)
     return np.array(updates), np.array([np.mean(by_updates[u], 0) for u in updates])
-
-
-def _scalars(groups: Sequence[Group]) -> set[str]:
-    """Names of the numbers that were recorded and are not drawn elsewhere."""
-    cycles = [cycle for group in groups for run in group.logs for cycle in run.cycles]
-    found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
-    return {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}

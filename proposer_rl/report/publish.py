@@ -1,125 +1,132 @@
-"""Runs without what no table or curve needs: small enough to publish, and read as any run is."""
+"""Finished runs as a study, without checkpoints, pictures and this machine's folders."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.report.build import OutputError
-from proposer_rl.report.reading import begun, find_runs, read_run
+from PIL import Image
+
+from proposer_rl.report.markdown import document, section
+from proposer_rl.report.page import report_command
+from proposer_rl.report.reading import OutputError, find_runs, read_run
 from proposer_rl.report.records import anywhere
-from proposer_rl.runs.folder import PROPOSER, read_jsonl, storage, write_atomically
+from proposer_rl.report.runs import Run
+from proposer_rl.report.studies import read_studies
+from proposer_rl.report.tidy import STUDY, write_study
+from proposer_rl.runs.folder import write_atomically
 
-BULK = ("checkpoints", "curriculum.jsonl")  # what no copy has
-UNCHANGED = ("metrics.csv", "training.csv")
+MARK = "<!-- All below is written by bin/report --publish. -->"
+DATA = (
+    "`runs.csv.gz` has a row for each run, with its settings and facts as JSON; `metrics.csv.gz`, "
+    "`training.csv.gz`, `cycles.csv.gz` and `levels.csv.gz` what was recorded at each evaluation, "
+    "of the batches, by the curricula and on every single level at the end: "
+    '`pandas.read_csv("metrics.csv.gz")`.'
+)
 
 
-def publish(folders: Sequence[Path], output: Path) -> tuple[list[Path], list[str]]:
-    """Copy finished runs, without checkpoints, pictures of levels and this machine's folders.
-
-    Of a Proposer that has had several lifetimes what it has learnt comes along. Tables, and
-    figures without levels in them, come out of the copies as they do of the runs.
+def publish(folders: Sequence[Path], output: Path) -> tuple[int, list[str]]:
+    """Write finished runs as a study. Tables come out of it as they do of the runs.
 
     Args:
-        folders: of runs, or with runs in them.
-        output: folder to write to, laid out as they are below the folders named; of the runs in it
-            those in the same places are replaced.
+        folders: of runs or studies, or with some in them.
+        output: folder to write to; of a study that is there, runs of the same names are replaced
+            and the others stay.
 
     Returns:
-        The folders that were written, and a line for each run that was left out.
+        How many runs were written, and a line for each that was left out.
 
     Raises:
         UnreadableRun: if a folder has no run, or one cannot be read.
-        OutputError: if the output folder holds something else, or two runs have one place.
+        OutputError: if the output folder holds something else, or two runs have one name.
     """
-    found = _places(folders)
-    _check(output)
-    light, notes = {}, []
-    for place, folder in found.items():
-        if all(run.finished for run in read_run(folder)):
-            light[place] = _light(folder)
+    occupied = output.is_dir() and any(output.iterdir()) and not (output / STUDY).is_file()
+    if (output.exists() and not output.is_dir()) or occupied:
+        raise OutputError(f"--publish: {output} is no study; give a new folder")
+    found, notes = {}, []
+    for name, runs in _named(folders).items():
+        if all(run.finished for run in runs):
+            found[name] = [_light(run) for run in runs]
         else:
-            notes.append(f"left out: {place}: not finished")
-    for place in light:
-        for name in BULK:
-            if (output / place / name).exists():
-                raise OutputError(f"--publish: {output / place} has {name}, so it is no copy")
-    for place, files in light.items():
-        _replace(output / place, files)
-    return [output / place for place in light], notes
+            notes.append(f"left out: {name}: not finished")
+    before = _named([output]) if (output / STUDY).exists() else {}
+    every = {**before, **found}
+    if found:
+        output.mkdir(parents=True, exist_ok=True)
+        write_study(output, [(name, run) for name in sorted(every) for run in every[name]])
+        write_page(output)
+    return len(found), notes
 
 
-def _places(folders: Sequence[Path]) -> dict[Path, Path]:
-    """The runs by where they are to lie: as they do below the folder that was named."""
-    found: dict[Path, Path] = {}
+def write_page(folder: Path) -> None:
+    """Write a study's ``README.md`` and its figures from its tables.
+
+    What the page says above :data:`MARK` is its authors' and stays.
+    """
+    from proposer_rl.report.curves import learning_curves
+    from proposer_rl.report.proposals import heat_maps
+    from proposer_rl.report.style import in_few_colours, render
+
+    studies, _ = read_studies([folder], None)
+    file, parts = folder / "README.md", []
+    title = f"# {folder.name.replace('_', ' ').capitalize()}"
+    above = file.read_text(encoding="utf-8").partition(MARK)[0] if file.is_file() else ""
+    for number, study in enumerate(studies):
+        prefix = f"figures/{f'{number + 1}_' if number else ''}"
+        (folder / "figures").mkdir(exist_ok=True)
+        drawings = [each for each in (learning_curves(study), heat_maps(study)) if each]
+        for drawing in drawings:
+            with Image.open(io.BytesIO(render(drawing).png)) as image:
+                picture = in_few_colours(image)
+            write_atomically(folder / f"{prefix}{drawing.name}.png", picture)
+        parts.append(section(study, prefix))
+        parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
+    command = report_command("bin/report", [folder], None, None)
+    said = above.strip() or f"{title}\n\n{DATA}"
+    text = document([said, MARK, *parts], command, [])
+    write_atomically(
+        file, text.replace("It is written by", "The whole report is drawn by").encode()
+    )
+
+
+def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
+    """The seeds of every run by its name: where it lies below the folder that was given."""
+    found: dict[str, list[Run]] = {}
     for folder in map(Path.resolve, folders):
-        for run in find_runs([folder]):
-            place = Path(folder.name) if run == folder else run.relative_to(folder)
-            other = found.setdefault(place, run)
-            if other != run:
-                raise OutputError(f"--publish: two runs are called {place}: {other}, {run}")
+        for path in find_runs([folder]):
+            own: dict[str, list[Run]] = {}
+            for run in read_run(path):
+                lies = run.folder.relative_to(path if (path / STUDY).exists() else folder)
+                own.setdefault(lies.as_posix() if lies.parts else folder.name, []).append(run)
+            for name, runs in own.items():
+                if name in found:
+                    places = f"{found[name][0].folder}, {runs[0].folder}"
+                    raise OutputError(f"--publish: two runs are called {name}: {places}")
+                found[name] = runs
     return found
 
 
-def _check(output: Path) -> None:
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output}: is a file; give a folder for the runs")
-    for path in sorted(output.glob("[!.]*")):
-        if not path.is_dir() or not any(begun(path)):
-            raise OutputError(f"{output}: has {path.name} in it, which is no run; give another")
+def _light(run: Run) -> Run:
+    """A run without pictures, and without this machine's folders in what it says of itself."""
+    facts = {name: value for name, value in run.facts.items() if name != "final"}
+    facts["task"] = {name: value for name, value in facts["task"].items() if name != "samples"}
+    reused = str(run.config.get("checkpoint") or "")
+    config, facts = (_anywhere(value, reused) for value in (run.config, facts))
+    return replace(run, config=config, facts=facts, samples=(), sheets={})
 
 
-def _light(folder: Path) -> dict[str, bytes]:
-    """Contents of the files, by name."""
-    run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    run["task"].pop("samples", None)
-    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    reused = str(config.get("checkpoint") or "")
-    # A Proposer that has learnt on several Solvers is meant for others.
-    names = (*UNCHANGED, PROPOSER) if config.get("lifetimes", 1) != 1 else UNCHANGED
-    files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
-    summary = (folder / "summary.json").read_text(encoding="utf-8")  # repeats the run's command
-    texts = {"run.json": _json(run), "config.json": _json(config), "summary.json": summary}
-    files |= {name: _anywhere(text, reused).encode() for name, text in texts.items()}
-    for name in ("cycles.jsonl", "levels.jsonl"):
-        if (folder / name).exists():
-            rows = map(_without_bulk, read_jsonl(folder / name))
-            files[name] = "".join(f"{json.dumps(row)}\n" for row in rows).encode()
-    return files
+def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
+    """A mapping without this machine's folders; of a checkpoint begun with its last two parts.
 
-
-def _without_bulk(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without pictures of levels; without returns where success is what is shown."""
-    dropped = {"levels", "return"} if "success" in row else {"levels"}
-    return {key: value for key, value in row.items() if key not in dropped}
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, indent=1) + "\n"
-
-
-def _anywhere(text: str, reused: str) -> str:
-    """JSON without this machine's folders; of a checkpoint begun with the path's last two parts.
-
-    Seeds of Proposers are called by the folders above their last lifetimes.
+    Seeds of Proposers are called by the folders above those of their last Solvers.
     """
+    text = json.dumps(dict(value))
     if os.path.isabs(reused):
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
-    return anywhere(text)
-
-
-def _replace(folder: Path, files: Mapping[str, bytes]) -> None:
-    """All of it or nothing: a crash leaves a folder whose name begins with a dot."""
-    temporary = folder.with_name(f".{folder.name}.tmp")
-    with storage(folder):
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        for name, content in files.items():
-            write_atomically(temporary / name, content)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(temporary, folder)
+    found: dict[str, Any] = json.loads(anywhere(text))
+    return found

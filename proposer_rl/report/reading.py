@@ -1,10 +1,11 @@
-"""Runs are read from their folders, which may come from anybody: nothing in one is trusted."""
+"""Runs are read from their folders, or from a study's tables: nothing in either is trusted."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,18 @@ from proposer_rl.report.records import (
     SampleRecord,
     Sheets,
     TaskFacts,
+    Text,
     checked,
     number,
     printable,
 )
 from proposer_rl.report.runs import COST, Run, headline_of, measurements_of
+from proposer_rl.report.tidy import LARGEST_FILE, STUDY, read_table
 from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
-LARGEST_FILE = 64 * 2**20  # bytes; a run at the paper's scale writes a few MiB
 MOST_FOLDERS = 20_000
+RECORDED = ("metrics", "training", "cycles")  # tables of a study, a row for each moment
 FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
@@ -40,84 +43,157 @@ class UnreadableRun(ValueError):
     exit_code = 2
 
 
+class OutputError(ValueError):
+    """What was asked for cannot be written; the message is one line."""
+
+    exit_code = 2
+
+
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of runs: those given, or else those found within them.
+    """Folders of runs and of studies: those given, or else those found within them.
 
     Raises:
         UnreadableRun: if a folder is none, or there is no run in it.
     """
     found: list[Path] = []
     for folder in folders:
-        inside = [path for path, files in begun(folder) if {"config.json", "metrics.csv"} <= files]
+        inside = [
+            path
+            for path, files in _walk(folder)
+            if STUDY in files or {"config.json", "metrics.csv"} <= files
+        ]
         if not inside:
             raise UnreadableRun(
                 f"{folder}: no run in it: a run's folder has config.json and metrics.csv, as "
-                "bin/train writes them"
+                f"bin/train writes them, a study's {STUDY}"
             )
         found += inside
     return sorted({path.resolve(): path for path in found}.values())
 
 
 def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Folders of runs in a folder, or itself, with names of their files.
+    """Folders of runs in a folder, or itself, with names of their files; studies are left out.
 
     Links are not followed, hidden folders not looked into.
 
     Raises:
         UnreadableRun: if there is no such folder, or there are too many in it.
     """
+    return ((path, files) for path, files in _walk(folder) if STUDY not in files)
+
+
+def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
     if not folder.is_dir():
         raise UnreadableRun(f"{folder}: there is no such folder")
     for seen, (root, names, files) in enumerate(os.walk(folder)):
         if seen > MOST_FOLDERS:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
-        path = Path(root)
-        # Hidden are those of a run that is being published.
+        # Hidden are those of a study that is being published.
         names[:] = sorted(name for name in names if not name.startswith("."))
-        if "config.json" in files:
+        if {"config.json", STUDY} & set(files):
             names.clear()
-        if {"config.json", FAILURE} & set(files):
-            yield path, set(files)
+        if {"config.json", FAILURE, STUDY} & set(files):
+            yield Path(root), set(files)
 
 
 def read_run(folder: Path) -> list[Run]:
-    """All seeds of a run's folder.
+    """All seeds of a run's folder, or all runs of a study.
 
     Raises:
         UnreadableRun: naming the file that is missing, too large, or not what it should be.
     """
     try:
-        return _read_run(folder)
+        if (folder / STUDY).exists():
+            return _read_study(folder)
+        return _read_folder(folder)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
         raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
 
 
-def _read_run(folder: Path) -> list[Run]:
-    config = _read_config(folder)
+def _read_folder(folder: Path) -> list[Run]:
     summary = _read_json(folder, "summary.json") or {}
-    facts = {**(_read_json(folder, "run.json") or {}), **summary}
+    recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
+    reached = _optional(folder, "levels.jsonl", read_jsonl)
+    return _runs(
+        folder,
+        _read_json(folder, "config.json"),
+        {**(_read_json(folder, "run.json") or {}), **summary},
+        summary.get("updates"),
+        read_csv(_checked(folder, "metrics.csv")),
+        _optional(folder, "training.csv", read_csv),
+        _optional(folder, "cycles.jsonl", read_jsonl),
+        samples=checked(list[SampleRecord], recorded, "curriculum.jsonl"),
+        levels=checked(list[LevelResults], reached, "levels.jsonl"),
+    )
+
+
+def _read_study(folder: Path) -> list[Run]:
+    """Runs as :func:`~proposer_rl.report.tidy.write_study` wrote them; they lie in the folder."""
+    found: dict[str, dict[str, list[Any]]] = {}
+    for name in RECORDED:
+        rows: dict[str, list[Any]] = defaultdict(list)
+        if (folder / f"{name}.csv.gz").exists():
+            read = json.loads if name == "cycles" else float
+            for row in read_table(folder / f"{name}.csv.gz"):
+                rows[row.pop("run")].append({key: read(cell) for key, cell in row.items()})
+        found[name] = rows
+    levels = _study_levels(folder)
+    runs = []
+    for row in read_table(folder / STUDY):
+        name, facts = row["run"], json.loads(row["facts"])
+        if ".." in Path(checked(Text, name, f"{STUDY}: run")).parts or Path(name).is_absolute():
+            raise ValueError(f"{STUDY}: {name} leads out of the study")
+        ended, own = facts.get("updates"), [found[table][name] for table in RECORDED]
+        config = json.loads(row["config"])
+        runs += _runs(folder / name, config, facts, ended, *own, samples=[], levels=levels[name])
+    return runs
+
+
+def _study_levels(folder: Path) -> Mapping[str, list[LevelResults]]:
+    values: dict[tuple[str, ...], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    if (folder / "levels.csv.gz").exists():
+        for row in read_table(folder / "levels.csv.gz"):
+            place = (row["run"], row["seed"], row["updates"], row["distribution"])
+            for kind in ("success", "return"):
+                if kind in row:
+                    values[place][kind].append(float(row[kind]))
+    found: dict[str, list[LevelResults]] = defaultdict(list)
+    for (run, seed, updates, distribution), kinds in values.items():
+        about = {"seed": int(seed), "updates": int(updates), "distribution": distribution}
+        found[run].append(checked(LevelResults, {**about, **kinds}, "levels.csv.gz"))
+    return found
+
+
+def _runs(
+    folder: Path,
+    config: dict[str, Any] | None,
+    facts: dict[str, Any],
+    ended: Any,
+    rows: Sequence[Mapping[str, float]],
+    training: Sequence[Mapping[str, float]],
+    cycles: Sequence[Any],
+    *,
+    samples: Sequence[SampleRecord],
+    levels: Sequence[LevelResults],
+) -> list[Run]:
+    """A run for each seed, of all that is on record; ``ended`` is its length if it is finished."""
+    config = _check_config(config)
     task = checked(TaskFacts, facts["task"], "run.json: task")
-    rows = read_csv(_checked(folder, "metrics.csv"))
     seeds = sorted({int(row["seed"]) for row in rows})
     if not seeds:
         raise ValueError("metrics.csv has no rows yet")
-    training = _optional(folder, "training.csv", read_csv)
     if training and "updates" not in training[0]:
         raise ValueError("training.csv has no column 'updates'")
-    cycles = _optional(folder, "cycles.jsonl", read_jsonl)
     if any(math.isnan(number(row["updates"])) for row in cycles):
         raise ValueError("cycles.jsonl: updates is no number")
     sheets = [checked(Sheets, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
-    recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
-    samples = checked(list[SampleRecord], recorded, "curriculum.jsonl")
-    reached = _optional(folder, "levels.jsonl", read_jsonl)
-    levels = checked(list[LevelResults], reached, "levels.jsonl")
     runs = []
     for seed in seeds:
         metrics = _columns(rows, seed)
         _check_metrics(metrics, {*COST, *measurements_of(task, metrics), headline_of(config)})
+        updates = int(metrics["updates"][-1])
         runs.append(
             Run(
                 folder=folder,
@@ -126,12 +202,12 @@ def _read_run(folder: Path) -> list[Run]:
                 config=config,
                 facts=facts,
                 task=task,
-                finished=summary.get("updates") == int(metrics["updates"][-1]),
+                finished=ended == updates,
                 metrics=metrics,
                 training=_columns(training, seed),
                 cycles=cycles,
                 samples=[sample for sample in samples if sample.seed == seed],
-                levels=_levels(levels, seed, int(metrics["updates"][-1])),
+                levels=_levels(levels, seed, updates),
                 sheets=_last_sheets(cycles, sheets, seed),
             )
         )
@@ -160,8 +236,7 @@ def _read_json(folder: Path, name: str) -> dict[str, Any] | None:
     return value
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
-    config = _read_json(folder, "config.json")
+def _check_config(config: dict[str, Any] | None) -> dict[str, Any]:
     if config is None:
         raise ValueError("there is no config.json")
     checked(Name, config["method"], "config.json: method")
@@ -200,8 +275,8 @@ def _rounded(name: str, values: Column) -> Column:
 def _columns(rows: Sequence[Mapping[str, float]], seed: int) -> dict[str, Column]:
     own = [row for row in rows if row["seed"] == seed]
     columns = {}
-    for name in own[0] if own else ():
-        values = _rounded(name, np.array([row[name] for row in own], dtype=float))
+    for name in dict.fromkeys(name for row in own for name in row):
+        values = _rounded(name, np.array([row.get(name, math.nan) for row in own], dtype=float))
         checked(Name, name, "the name of a column")
         columns[name] = np.where(np.abs(values) < LARGEST, values, np.nan)
     columns.pop("seed", None)

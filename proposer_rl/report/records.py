@@ -25,7 +25,7 @@ PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
 LONGEST_TEXT = 400
 
-# Total gains of copies, by their name in the records of cycles; the first that is there is shown.
+# Total gains of replicas, by their name in the records of cycles; the first that is there is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
 # What of a cycle's record is not a number of the curriculum's own.
 PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}

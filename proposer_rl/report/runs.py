@@ -23,7 +23,7 @@ from proposer_rl.report.records import (
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
-_LIFETIME = re.compile(r"lifetime_(\d{1,9})")
+_STUDENT = re.compile(r"lifetime_(\d{1,9})")
 
 
 class Waiting(NamedTuple):
@@ -54,7 +54,7 @@ class Run:
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
         levels: what was reached on every level at the end, [levels], by the measurement's column.
-        sheets: pictures of levels by their captions, as the curriculum told of them last.
+        sheets: pictures of levels by their captions, as the curriculum recorded them last.
     """
 
     folder: Path
@@ -82,11 +82,9 @@ class Run:
         return str(self.config.get("ablation", "none"))
 
     @property
-    def lifetime(self) -> int | None:
-        """Which Solver of several lifetimes this was, from 0; None for a run of one."""
-        found = (
-            _LIFETIME.fullmatch(self.folder.name) if self.config.get("lifetimes", 1) != 1 else None
-        )
+    def student(self) -> int | None:
+        """Which of several Solvers of one Proposer this was, from 0; None for a lone one."""
+        found = _STUDENT.fullmatch(self.folder.name)
         return int(found[1]) if found else None
 
     @property

@@ -1,7 +1,7 @@
 """Means, differences and shares over few runs, with intervals that hold for five of them.
 
-Nothing here knows what a run is. How often the intervals cover, and how often equal laws are told
-apart, is measured in ``tests/report/test_coverage.py``.
+Nothing here knows what a run is. How often the intervals cover, and how often equal laws differ
+significantly, is measured in ``tests/report/test_coverage.py``.
 """
 
 from __future__ import annotations

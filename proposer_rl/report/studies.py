@@ -20,6 +20,11 @@ from proposer_rl.report.style import Look, looks
 
 USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label
+# What of a command does not make its runs another variant.
+ASIDE = (
+    "method=", "ablation=", "scale=", "seed=", "seeds=", "sweep=", "schedule.", "checkpoint=",
+    "compute.", "logger", "hydra.",
+)  # fmt: skip
 
 # A folder's seed, alone or at the end of its name as in those of sweeps.
 _SEED_OF_A_FOLDER = re.compile(r"(?:(?<=seed_)|(?<![^/]))[0-9]+(?![^/])")
@@ -224,7 +229,7 @@ def _variant(run: Run) -> dict[str, Any]:
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
     kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
     kept["cycle_length"] = run.config["schedule"].get("cycle_length")
-    kept["lifetime"] = run.lifetime
+    kept["student"] = run.student
     return kept
 
 
@@ -283,28 +288,49 @@ def _groups(runs: Sequence[Run]) -> tuple[Group, ...]:
 
 def _plain_label(run: Run) -> str:
     named = run.method if run.ablation == "none" else f"{run.method}, {run.ablation}"
-    return named if run.lifetime is None else f"{named}, lifetime {run.lifetime}"
+    return named if run.student is None else f"{named}, student {run.student}"
 
 
 def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:
     """Labels of variants of one name, each with the settings in which it differs from the others.
 
-    Where these are few they are the label, else the variants are numbered.
+    As they were written on the command line, or else as they stand in the configurations. Where
+    these are few they are the label, else the variants are numbered.
     """
     if len(alike) == 1:
         return [(plain, "")]
-    leaves = [dict(_leaves(_variant(members[0]))) for members in alike]
-    keys = sorted({key for leaf in leaves for key in leaf})
-    differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
-    names = _short_names(differing)
-    settings = [
-        ", ".join(f"{names[key]}={leaf.get(key, 'absent')}" for key in differing) for leaf in leaves
-    ]
+    words = [_overrides(members[0]) for members in alike]
+    if None not in words and len({frozenset(own or ()) for own in words}) == len(alike):
+        common = frozenset.intersection(*(frozenset(own or ()) for own in words))
+        settings = [", ".join(w for w in own or () if w not in common) for own in words]
+        texts = [f"{plain}, {setting}" if setting else plain for setting in settings]
+    else:
+        settings = _differing([dict(_leaves(_variant(members[0]))) for members in alike])
+        texts = [f"{plain} ({setting})" for setting in settings]
     order = sorted(range(len(alike)), key=settings.__getitem__)
     short = max(map(len, settings)) <= LONGEST_LABEL
     return [
-        (f"{plain} ({setting})" if short else f"{plain} #{order.index(i) + 1}", setting)
+        (texts[i] if short else f"{plain} #{order.index(i) + 1}", setting)
         for i, setting in enumerate(settings)
+    ]
+
+
+def _overrides(run: Run) -> list[str] | None:
+    """What a run was started with, but for its method and what does not change its outcome."""
+    given = run.facts.get("overrides")
+    if not isinstance(given, list) or not all(isinstance(word, str) for word in given):
+        return None
+    words = [word.lstrip("+") for word in given if not word.lstrip("+").startswith(ASIDE)]
+    return [word for word in words if word.isprintable()]
+
+
+def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
+    """Of each configuration the values that are not the same in all."""
+    keys = sorted({key for leaf in leaves for key in leaf})
+    differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
+    names = _short_names(differing)
+    return [
+        ", ".join(f"{names[key]}={leaf.get(key, 'absent')}" for key in differing) for leaf in leaves
     ]
 
 

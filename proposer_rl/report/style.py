@@ -34,7 +34,6 @@ DASHES = ("-", "--", "-.", ":")
 TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
-UPDATES = "Solver updates"  # the abscissa of most figures
 DPI = 130  # of a figure's PNG
 COLOURS = 256  # of a picture in few colours
 

@@ -82,7 +82,7 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
     going: list[tuple[frozenset[str], float]] = []
     for path, files in begun(folder):
         if SUMMARY in files:
-            said = _told(path / SUMMARY)
+            said = _mapping(path / SUMMARY)
             settings = _settings(said.get("overrides"), aside)
             finished.add(settings)
             if math.isfinite(took := number(said.get("seconds"))):
@@ -93,17 +93,17 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
             activity = recorded_activity(path)
             seconds = activity.seconds_left if activity else None
             rest = math.nan if seconds is None else seconds
-            going.append((_settings(_told(path / "run.json").get("overrides"), aside), rest))
+            going.append((_settings(_mapping(path / "run.json").get("overrides"), aside), rest))
     every = [took for alike in spent.values() for took in alike]
     runs, unlike, total = 0, 0, 0.0
     for own in asked:
         if own in finished:
             continue
         runs += 1
-        told = [rest for settings, rest in going if own == settings and math.isfinite(rest)]
+        own_guess = [rest for settings, rest in going if own == settings and math.isfinite(rest)]
         like = spent.get(_but_for_the_seed(own), [])
-        unlike += not told and not like
-        known = told[:1] or like or every
+        unlike += not own_guess and not like
+        known = own_guess[:1] or like or every
         total += float(np.mean(known)) if known else math.nan
     at_once = max(len(going), 1)
     seconds = None if math.isnan(total) else total / at_once
@@ -155,6 +155,6 @@ def _but_for_the_seed(settings: Iterable[str]) -> frozenset[str]:
     return frozenset(word for word in settings if not word.startswith(SEEDS))
 
 
-def _told(path: Path) -> dict[str, object]:
+def _mapping(path: Path) -> dict[str, object]:
     found = small_json(path)
     return found if isinstance(found, dict) else {}

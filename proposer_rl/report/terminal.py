@@ -129,7 +129,7 @@ def _curves(runs: Sequence[Run]) -> RenderableType:
 
 
 def _cycles(run: Run) -> list[RenderableType]:
-    """The gains of the copies or, where there are none, the curriculum's numbers; its proposals."""
+    """The gains of the replicas or else the curriculum's numbers, and its proposals."""
     cycle, grid = run.cycles[-1], Table.grid(padding=(0, 1))
     for name, text in GAINS.items():
         gains = [found for c in run.cycles if (found := numbers(c.get(name))) is not None]

@@ -1,1 +1,1 @@
-"""The environments that come along, each in a folder that nothing else knows."""
+"""The shipped environments, each in a folder that nothing else knows."""

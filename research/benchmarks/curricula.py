@@ -81,7 +81,7 @@ def _made(group: Group, options: Options) -> Made:
     config = saved_config(run.folder)
     schedule = replace(config.schedule, updates=run.updates)
     compute = replace(config.compute, threads=None, device=options.device)  # as this process has
-    whole = config.model_copy(update={"schedule": schedule, "compute": compute})
+    whole = replace(config, schedule=schedule, compute=compute)
     return parts(whole, StopSignals())
 
 

@@ -11,6 +11,7 @@ from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.scales import Scale, Solvers, paper, precisions
 from research.benchmarks.timing import interleave, synchronise, time_once
 
+REPLAYED = "compute.graphs=true"
 NOTHING = "There is no GPU here: none of its targets is measured."
 
 
@@ -28,9 +29,9 @@ def gpu_targets(options: Options) -> Result:
 def _update(scale: Scale, options: Options) -> list[Row]:
     """One Solver: replayed in both precisions, and as it is; and how long the host is busy."""
     ways = {
-        f"{options.precision}, replayed": [],
-        "fp32 (TF32), replayed": ["precision=fp32"],
-        f"{options.precision}, not replayed": ["compute.graphs=false"],
+        f"{options.precision}, replayed": [REPLAYED],
+        "fp32 (TF32), replayed": ["precision=fp32", REPLAYED],
+        f"{options.precision}, not replayed": [],
     }
     updates = {name: Solvers(scale.task(options, *way)).update for name, way in ways.items()}
     seconds = interleave(updates, options.repeats, options.device)
@@ -45,7 +46,7 @@ def _update(scale: Scale, options: Options) -> list[Row]:
 
 def _meta_step(scale: Scale, options: Options) -> Result:
     """K Solvers: a step and its parts."""
-    env = trainer_of(scale.made(options, EVERY_UPDATE)).env
+    env = trainer_of(scale.made(options, EVERY_UPDATE, REPLAYED)).env
     seconds = step_and_parts(env, options.repeats, options.device)
     size = f"K = {scale.config.proposer.rollouts}, {options.precision}"
     row = _row("a meta-environment step", size, seconds["step"], 50e-3)
@@ -57,7 +58,7 @@ def _runs(scale: Scale, options: Options) -> list[Row]:
     schedule = scale.config.schedule
     cycles = schedule.updates // schedule.cycle_length
     target = Scale(scale.name, "target")
-    plain, made = target.made(options), scale.made(options)
+    plain, made = (each.made(options, REPLAYED) for each in (target, scale))
     start = made.learner.snapshot()
 
     def one_cycle() -> None:

@@ -8,10 +8,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
 from proposer_rl.models.memory import MEMORY
+from proposer_rl.streams import Streams
+from tests.tiny import tiny_view_task
 
 K, N, T, F, M, A = 3, 4, 9, 5, 6, 2
 
@@ -121,3 +125,20 @@ def test_memory_begins_at_zero() -> None:
     memory = agent().no_memory(steps()[:, :, 0])
     assert list(memory.keys()) == list(MEMORY) and memory.batch_size == (K, N)
     assert all(not memory[key].any() and memory[key].shape == (K, N, M) for key in MEMORY)
+
+
+@torch.no_grad()
+def test_with_its_primer_it_remembers_in_rollouts_and_collectors_of_torchrl() -> None:
+    solvers = tiny_view_task().learner([Streams(0, k) for k in range(2)])
+    env, actor = TransformedEnv(solvers.env, solvers.agent.primer()), solvers.agent.actor
+    rollout = env.rollout(20, actor(sample=True), break_when_any_done=False)
+    frames = env.batch_size.numel() * 20
+    collector = Collector(env, actor(), frames_per_batch=frames, total_frames=frames)
+    for steps in (rollout, *collector):
+        assert steps["is_init"][:, :, 1:].any() and steps["recurrent_state_h"].any()
+        again = through_time(solvers.agent, steps.select(*solvers.agent.in_keys))
+        torch.testing.assert_close(steps["logits"], again["logits"])
+    # Where nothing says how actions are drawn, only an actor that samples explores.
+    assert (rollout["action"] != rollout["logits"].argmax(-1)).any()
+    greedy = env.rollout(3, actor(), break_when_any_done=False)
+    assert (greedy["action"] == greedy["logits"].argmax(-1)).all()

@@ -123,7 +123,7 @@ def test_every_checkpoint_is_examined_as_the_command_does(
         told = asked(page, "examine", {**EXAMINE, "checkpoint": number, "solver": solver})
         found = evaluate(load(file), str(tmp_path / "drawn.txt"))
         assert told["updates"] == found.updates == 2 * number
-        results = found.scores[solver].results
+        results = found.results[solver].results
         for name in ("success", "return"):
             assert told["results"][name] == pytest.approx(results[name], abs=1e-5)
         successes.add(told["results"]["success"])
@@ -139,7 +139,7 @@ def test_a_solver_with_memory_is_examined_as_the_command_does(
         question = {"checkpoint": number, "solver": 0, "rows": rows}
         told = asked(view_page, "examine", question)
         assert told == asked(view_page, "examine", question)
-        (score,) = evaluate(load(file), str(tmp_path / "drawn.txt")).scores
+        (score,) = evaluate(load(file), str(tmp_path / "drawn.txt")).results
         for name in ("success", "return"):
             assert told["results"][name] == pytest.approx(score.results[name], abs=1e-5)
         paths = told["paths"]
@@ -237,7 +237,7 @@ def test_checkpoints_come_go_and_break(run: Path, tmp_path: Path) -> None:
     with served(tmp_path / "run") as page:
         assert CLIENT.get(f"{page.address}api/run").json()["checkpoints"] == [2, 3]
         line = refused(post(page, "examine", {**EXAMINE, "checkpoint": 1}))
-        assert line == "there is no checkpoint 1; there are [2, 3]"
+        assert line == "no checkpoint 1; available: [2, 3]"
         line = refused(post(page, "examine", {**EXAMINE, "checkpoint": 2}))
         assert "is damaged" in line and second.name in line
         assert asked(page, "examine", EXAMINE)["updates"] == 6
@@ -330,8 +330,8 @@ WRONG = [
     ("examine", {**EXAMINE, "checkpoint": True}, "checkpoint: Input should be a valid integer"),
     ("examine", {**EXAMINE, "checkpoint": -1}, "checkpoint: Input should be greater"),
     ("examine", {**EXAMINE, "checkpoint": 10**30}, "checkpoint: "),
-    ("examine", {**EXAMINE, "checkpoint": 9}, "there is no checkpoint 9; there are [1, 2, 3]"),
-    ("examine", {**EXAMINE, "solver": 2}, "there is no Solver 2; there are 2"),
+    ("examine", {**EXAMINE, "checkpoint": 9}, "no checkpoint 9; available: [1, 2, 3]"),
+    ("examine", {**EXAMINE, "solver": 2}, "no Solver 2; there are 2"),
     ("examine", {**EXAMINE, "max_steps": 0}, "max_steps: Input should be greater"),
     ("examine", {**EXAMINE, "max_steps": 10**9}, "max_steps: Input should be less"),
     ("examine", {**EXAMINE, "rows": []}, "rows: List should have at least 1 item"),

@@ -36,28 +36,29 @@ def test_the_best_is_named_with_how_sure_that_is(tmp_path: Path) -> None:
     assert first.startswith(
         "Of 3 methods, ours has the highest ID success, mean over 20 updates: 0.4"
     )
-    assert first.endswith("it is shown to be better than all others.")
+    assert first.endswith("it is significantly better than all others.")
     assert second == (
-        "ours is shown to be better than the baseline, domain_randomization; "
-        "worse is shown to be worse."
+        "ours is significantly better than the baseline, domain_randomization; "
+        "worse is significantly worse."
     )
     first, second = told(tmp_path / "some", {"twin": 0.9, **ends})
-    assert "better than 2 of the 3 others, and undecided against " in first
-    assert second.startswith("twin and ours are shown") or second.startswith("ours and twin are")
+    assert "better than 2 of the 3 others, with no significant difference to " in first
+    assert second.startswith(("twin and ours are signif", "ours and twin are signif"))
 
 
 def test_what_is_undecided_is_said_to_be(tmp_path: Path) -> None:
     first, second = told(tmp_path, {"ours": 0.5, "domain_randomization": 0.5})
-    assert first.endswith("but it is not shown to be better than any of the others.")
+    assert first.endswith("but there is no significant difference to any of the others.")
     assert second == (
-        "No method is shown to be better than the baseline, domain_randomization; 1 is undecided."
+        "No method is significantly better than the baseline, domain_randomization; "
+        "no significant difference for 1."
     )
 
 
 def test_few_seeds_decide_nothing(tmp_path: Path) -> None:
     first, second = told(tmp_path, {"ours": 0.9, "domain_randomization": 0.1}, seeds=4)
-    assert "shown" not in first and "it takes 5 seeds" in first
-    assert "not decided" in second
+    assert "significant" not in first and "it takes 5 seeds" in first
+    assert "Too few seeds" in second
 
 
 def test_a_method_alone_is_compared_with_nothing(tmp_path: Path) -> None:

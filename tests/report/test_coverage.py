@@ -13,7 +13,6 @@ import pytest
 from scipy import stats
 
 from proposer_rl.report.comparisons import decisions, updates_needed
-from proposer_rl.report.findings import findings
 from proposer_rl.report.records import TaskFacts
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
@@ -142,7 +141,7 @@ def learning(rng: np.random.Generator, seeds: int, skewed: bool) -> np.ndarray:
 
 @pytest.mark.parametrize("skewed", [False, True])
 @pytest.mark.parametrize("seeds", [5, 10])
-def test_equal_methods_are_rarely_told_apart(seeds: int, skewed: bool) -> None:
+def test_equal_methods_are_rarely_different(seeds: int, skewed: bool) -> None:
     rng = np.random.default_rng(0)
     wrong = 0
     for _ in range(REPLICATIONS):
@@ -151,17 +150,7 @@ def test_equal_methods_are_rarely_told_apart(seeds: int, skewed: bool) -> None:
     assert wrong / REPLICATIONS <= 0.06
 
 
-def test_findings_of_equal_methods_are_rarely_decided() -> None:
-    rng = np.random.default_rng(1)
-    wrong = 0
-    for _ in range(400):
-        study = study_of({name: learning(rng, 10, False) for name in ("a", "b")}, proposer="a")
-        (found,) = [finding for finding in findings(study) if finding.source == "ours"]
-        wrong += found.verdict in ("supported", "contradicted")
-    assert wrong / 400 <= 0.075  # a share of 400 has a standard error of 0.011
-
-
-def test_of_many_equal_methods_none_is_told_apart_more_often() -> None:
+def test_of_many_equal_methods_none_is_better_more_often() -> None:
     rng = np.random.default_rng(0)
     wrong = 0
     for _ in range(300):

@@ -1,7 +1,10 @@
-"""Published runs: small, of no machine, and read as the runs that they were copied from."""
+"""Published runs: a few tables, of no machine, and read as the runs that they were made from."""
 
 from __future__ import annotations
 
+import csv
+import gzip
+import io
 import json
 import shutil
 from pathlib import Path
@@ -9,13 +12,19 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.cli.report import main
+from proposer_rl.report import publish
 from proposer_rl.report.curves import learning_curves
-from proposer_rl.report.reading import begun, find_runs
+from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.studies import read_studies
-from proposer_rl.runs.folder import write_atomically
-from tests.report.folders import LEVEL, cycle, write_run
+from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 SECRET = "/home/somebody/code"
+
+
+@pytest.fixture(autouse=True)
+def without_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "pictures" not in request.keywords:
+        monkeypatch.setattr(publish, "write_page", lambda folder: None)
 
 
 @pytest.fixture
@@ -50,10 +59,16 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_tables_of_the_copies_are_those_of_the_runs(
+def rows(study: Path, table: str) -> list[dict[str, str]]:
+    text = gzip.decompress((study / f"{table}.csv.gz").read_bytes()).decode()
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_tables_of_the_study_are_those_of_the_runs(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [learning_curves])
+    write_run(runs / "together", "plr", [3, 4], levels=[0.5], copies=2)
     light = published(runs, tmp_path / "light")
     tables = {}
     for name, folder in {"before": runs, "after": light}.items():
@@ -63,20 +78,37 @@ def test_tables_of_the_copies_are_those_of_the_runs(
     assert tables["after"] == tables["before"]
 
 
-def test_a_copy_has_no_pictures_and_names_no_folder_of_the_machine(
+@pytest.mark.pictures
+def test_a_study_has_a_page_with_its_figures(runs: Path, tmp_path: Path) -> None:
+    """What its authors wrote above the mark stays."""
+    light = published(runs, tmp_path / "light")
+    assert {path.name for path in light.iterdir()} == {
+        "README.md", "figures", *(f"{name}.csv.gz" for name in ("runs", "metrics", "training",
+                                                                "cycles", "levels")),
+    }  # fmt: skip
+    page = (light / "README.md").read_text(encoding="utf-8")
+    assert "| perf\\_gain | 5 |" in page and "perf\\_gain is better" in page
+    for name in ("learning_curves", "proposals"):
+        assert f"(figures/{name}.png)" in page and (light / f"figures/{name}.png").is_file()
+    above, mark, below = page.partition(publish.MARK)
+    (light / "README.md").write_text(f"# Mine\n{mark}old", encoding="utf-8")
+    publish.write_page(light)
+    again = (light / "README.md").read_text(encoding="utf-8")
+    assert again == f"# Mine\n\n{mark}{below}" and "pandas.read_csv" in above
+
+
+def test_a_study_has_no_pictures_and_names_no_folder_of_the_machine(
     runs: Path, tmp_path: Path
 ) -> None:
-    found = contents(published(runs, tmp_path / "light"))
-    everything = b"".join(found.values()).decode()
+    light = published(runs, tmp_path / "light")
+    everything = b"".join(gzip.decompress(file.read_bytes()) for file in light.iterdir()).decode()
     assert SECRET not in everything and "somebody" not in everything
     assert str(LEVEL["picture"]) not in everything
-    assert not any("curriculum.jsonl" in name or "checkpoint" in name for name in found)
-    config = json.loads(found["target_0/config.json"])
-    assert config["checkpoint"] == "5/checkpoints"
-    for name in ("run.json", "summary.json"):
-        facts = json.loads(found[f"target_0/{name}"])
-        assert facts["overrides"] == ["checkpoint=5/checkpoints"]
-        assert facts["arguments"] == {"config_dir": "conf", "pythonpath": "code"}
+    first = rows(light, "runs")[0]
+    assert json.loads(first["config"])["checkpoint"] == "5/checkpoints"
+    facts = json.loads(first["facts"])
+    assert facts["overrides"] == ["checkpoint=5/checkpoints"]
+    assert facts["arguments"] == {"config_dir": "conf", "pythonpath": "code"}
 
 
 def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
@@ -87,82 +119,41 @@ def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
     for folder in (tmp_path / "runs", published(tmp_path / "runs", tmp_path / "light")):
         (study,), notes = read_studies(find_runs([folder]), None)
         assert len(study.groups) == 1 and len(study.runs) == 3 and not notes
-    config = json.loads((tmp_path / "light" / "1" / "config.json").read_text())
+    config = study.runs[1].config
     assert config["checkpoint"] == config["curriculum"]["checkpoint"] == "1/lifetime_2"
 
 
-def test_proposers_of_several_lifetimes_come_along(tmp_path: Path) -> None:
-    for name, lifetimes in {"alone": 1, "0/lifetime_1": 2}.items():
-        folder = write_run(tmp_path / "runs" / name, lifetimes=lifetimes)
-        (folder / "proposer.pt").write_bytes(name.encode())
-    light = published(tmp_path / "runs", tmp_path / "light")
-    found = {name: content for name, content in contents(light).items() if "proposer" in name}
-    assert found == {"0/lifetime_1/proposer.pt": b"0/lifetime_1"}
-    assert contents(published(light, light)) == contents(light)
-
-
 def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: Path) -> None:
-    rows = {"a": {"success": [0.5], "return": [0.4]}, "b": {"return": [0.4]}}
-    for name, row in rows.items():
+    written = {"a": {"success": [0.5], "return": [0.4]}, "b": {"return": [0.4]}}
+    for name, row in written.items():
         folder = write_run(tmp_path / "runs" / name)
         head = {"seed": 0, "updates": 20, "distribution": "id"}
         (folder / "levels.jsonl").write_text(json.dumps({**head, **row}) + "\n")
-    found = contents(published(tmp_path / "runs", tmp_path / "light"))
-    kept = [json.loads(found[f"{name}/levels.jsonl"]) for name in rows]
-    assert [set(row) - {"seed", "updates", "distribution"} for row in kept] == [
-        {"success"},
-        {"return"},
-    ]
+    light = published(tmp_path / "runs", tmp_path / "light")
+    found = [(row["run"], row["success"], row["return"]) for row in rows(light, "levels")]
+    assert found == [("a", "0.5", ""), ("b", "", "0.4")]
 
 
-def test_published_runs_are_added_to_and_replaced(runs: Path, tmp_path: Path) -> None:
+def test_a_study_is_added_to_and_its_runs_are_replaced(runs: Path, tmp_path: Path) -> None:
     light = published(runs, tmp_path / "light")
-    before = contents(light)
-    assert contents(published(light, light)) == before  # of themselves nothing changes
+    before = {(run.folder.name, run.updates) for run in read_run(light)}
     shutil.rmtree(runs)
     write_run(runs / "target_0", "target", [0], [0.0, 0.1])
     write_run(runs / "new", "plr", [0])
-    after = contents(published(runs, light))
-    assert {name.partition("/")[0] for name in after} == {
-        *(name.partition("/")[0] for name in before),
-        "new",
-    }
-    changed = {name.partition("/")[0] for name in before if after.get(name) != before[name]}
-    assert changed == {"target_0"}
-    assert "target_0/levels.jsonl" not in after  # nothing of the former run is left
+    after = {(run.folder.name, run.updates) for run in read_run(published(runs, light))}
+    assert after - before == {("target_0", 10), ("new", 20)}
+    assert before - after == {("target_0", 20)}
+    assert not [row for row in rows(light, "levels") if row["run"] == "target_0"]
 
 
-@pytest.mark.parametrize("done", [1, 5])
-def test_a_copy_that_was_broken_off_is_no_run_and_made_again(
-    done: int, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written = []
-
-    def interrupted(path: Path, content: bytes) -> None:
-        if len(written) == done:
-            raise KeyboardInterrupt
-        written.append(path)
-        write_atomically(path, content)
-
-    light = tmp_path / "light"
-    with monkeypatch.context() as patch:
-        patch.setattr("proposer_rl.report.publish.write_atomically", interrupted)
-        with pytest.raises(SystemExit):
-            main([str(runs), "--publish", str(light)])
-    assert written[0].parent.is_dir() and not list(begun(light))
-    published(runs, light)
-    assert len(find_runs([light])) == 10 and not list(light.glob(".*"))
-
-
-def test_runs_lie_as_they_did_below_the_folder_that_was_named(tmp_path: Path) -> None:
+def test_runs_are_called_as_they_lie_below_the_folder_that_was_named(tmp_path: Path) -> None:
     """Solvers of several lifetimes have folders of the same names; a lone run keeps its own."""
     for seed in range(2):
         write_run(tmp_path / "lives" / str(seed) / "lifetime_0", seeds=[seed])
     light = published(tmp_path / "lives", tmp_path / "light")
     published(write_run(tmp_path / "alone"), light)
-    places = {str(path.parent.relative_to(light)) for path in light.rglob("config.json")}
-    assert places == {"0/lifetime_0", "1/lifetime_0", "alone"}
-    assert contents(published(light, light)) == contents(light)
+    names = {str(run.folder.relative_to(light)) for run in read_run(light)}
+    assert names == {"0/lifetime_0", "1/lifetime_0", "alone"}
 
 
 def test_a_run_that_goes_on_is_left_out_and_named(
@@ -171,35 +162,52 @@ def test_a_run_that_goes_on_is_left_out_and_named(
     write_run(runs / "short", "plr", [0], finished=False)
     light = published(runs, tmp_path / "light")
     assert "left out: short: not finished" in capsys.readouterr().out
-    assert not (light / "short").exists() and (light / "target_0").is_dir()
+    assert {row["method"] for row in rows(light, "runs")} == {"perf_gain", "target"}
 
 
 def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = tmp_path / "other"
-    write_run(other / "target_0", "target", [7])
+    write_run(tmp_path / "other" / "target_0", "target", [7])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     (tmp_path / "file").write_text("mine")
     with pytest.raises(SystemExit) as end:
         main([str(runs), "--publish", "new", "--threshold", "0.5"])
-    assert end.value.code == 2 and "--publish: copies runs" in capsys.readouterr().err
-    deep = tmp_path / "deep"
-    write_run(deep / "target_0", "target", [7])
-    (deep / "target_0" / "checkpoints").mkdir()
+    assert end.value.code == 2 and "--publish: writes runs" in capsys.readouterr().err
     wrong = {
-        "has curriculum.jsonl, so it is no copy": [str(runs), str(runs)],
-        "has checkpoints, so it is no copy": [str(runs), str(deep)],
-        "--publish: two runs are called target_0: ": [str(runs), str(other), "new"],
-        "has thesis.tex in it, which is no run": [str(runs), str(tmp_path / "mine")],
-        "is a file; give a folder": [str(runs), str(tmp_path / "file")],
+        "runs is no study; give a new folder": [runs, runs],
+        "--publish: two runs are called target_0: ": [runs, tmp_path / "other", "new"],
+        "mine is no study": [runs, tmp_path / "mine"],
+        "file is no study": [runs, tmp_path / "file"],
     }
     for message, (*folders, output) in wrong.items():
         before = contents(tmp_path)
         with pytest.raises(SystemExit) as end:
-            main([*folders, "--publish", str(output)])
+            main([*map(str, folders), "--publish", str(output)])
         assert end.value.code == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
         assert contents(tmp_path) == before and not Path("new").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "message"),
+    [
+        ("runs", "run,config,facts\n../a,{},{}\n", "leads out of the study"),
+        ("runs", "run,config\na,{}\n", "an entry 'facts' is missing"),
+        ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
+        ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
+        ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),
+        ("levels", None, "levels.csv.gz is cut off"),
+    ],
+)
+def test_a_broken_study_is_named_in_one_line(
+    table: str, text: str | None, message: str, tmp_path: Path
+) -> None:
+    light = published(write_run(tmp_path / "target_0", levels=[0.5]), tmp_path / "light")
+    packed = b"" if text is None else gzip.compress(text.encode())
+    (light / f"{table}.csv.gz").write_bytes(packed)
+    with pytest.raises(UnreadableRun, match=message) as refused:
+        read_run(light)
+    assert len(str(refused.value).splitlines()) == 1 and TASK["title"] not in str(refused.value)

@@ -12,15 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.report.charts import charts
-from proposer_rl.report.curves import difficulty
+from proposer_rl.report.curves import difficulty, level_by_level, worst_curves
+from proposer_rl.report.measures import band, worst, worst_means
 from proposer_rl.report.outcomes import group_table
-from proposer_rl.report.single_levels import (
-    level_by_level,
-    level_table,
-    worst_curves,
-    worst_means,
-    worst_table,
-)
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import TASK, write_run
@@ -59,23 +53,14 @@ def study_of(folder: Path, exact: bool | None = True, **options: Any) -> Study:
     return read_studies(sorted(folder.iterdir()), None)[0][0]
 
 
-def test_tables_have_every_share_and_every_level(tmp_path: Path) -> None:
+def test_the_worst_share_is_a_mean_with_its_interval(tmp_path: Path) -> None:
     study = study_of(tmp_path)
-    header, rows = worst_table(study)
-    found = [dict(zip(header, row, strict=True)) for row in rows]
-    assert {row["method"] for row in found} == set(LEVELS)  # the older folder is left out
-    (whole,) = (
-        row
-        for row in found
-        if (row["measurement"], row["method"]) == ("ood_success", "target") and row["share"] == 1
-    )
+    (of,) = worst(study)[1].axes.values()
+    series = [of(group) for group in study.groups]
+    assert [one is None for one in series] == [False, True, False]  # the older folder has none
+    means = band(series[2].rows)  # type: ignore[union-attr]
     known = mean_interval([0.4 + 0.01 * seed for seed in range(5)])
-    assert (whole["mean"], whole["mean, low"], whole["mean, high"]) == pytest.approx(known)
-    assert min(row["share"] for row in found) == pytest.approx(0.01)
-    header, rows = level_table(study)
-    assert header[2:] == ["domain_randomization", "hand_designed", "target"]
-    assert len(rows) == 2 * 3 and rows[1][:2] == ["id_success", 1]
-    assert rows[1][2:] == pytest.approx([0.92, np.nan, 0.42], nan_ok=True)
+    assert (means.mean[-1], means.low[-1], means.high[-1]) == pytest.approx(known)
 
 
 def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
@@ -115,7 +100,7 @@ def test_the_page_has_what_every_method_reaches_on_each_level(tmp_path: Path) ->
         "OOD success rate",
     ]
     means = dict(zip(labels, drawn["levels"][0]["methods"], strict=True))
-    assert means["hand_designed"] is None  # the older folder tells of none
+    assert means["hand_designed"] is None  # the older folder has none
     for method, levels in LEVELS.items():
         assert means[method] == pytest.approx([value + 0.02 for value in levels])
 
@@ -135,7 +120,7 @@ def test_without_single_levels_there_is_no_figure(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target")
     study = read_studies([tmp_path / "a"], None)[0][0]
     assert worst_curves(study) is None and level_by_level(study) is None
-    assert worst_table(study)[1] == [] and level_table(study)[1] == []
+    assert not worst(study)
     assert not any("IQM" in name for name in group_table(study).columns)
 
 

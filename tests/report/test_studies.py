@@ -9,12 +9,12 @@ import pytest
 
 from proposer_rl.report.charts import charts
 from proposer_rl.report.comparisons import primary
-from proposer_rl.report.decision import ranking, spread
+from proposer_rl.report.measures import COSTS
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.page import commands, incomplete
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.series import COSTS
 from proposer_rl.report.studies import Study, read_studies
+from research.ranking import ranking, spread
 from tests.report.folders import TASK, cycle, write_run
 
 CYCLES = [cycle(0, [0.1, 0.2], [[1, 1, 1], [1, 1, 1]])]
@@ -205,6 +205,23 @@ def test_the_threshold_can_be_chosen(tmp_path: Path) -> None:
     write_run(tmp_path / "a")
     assert read_studies([tmp_path / "a"], 0.5)[0][0].threshold == 0.5
     assert read_studies([tmp_path / "a"], None)[0][0].threshold == 0.8
+
+
+def test_variants_are_called_by_what_differs_on_their_command_lines(tmp_path: Path) -> None:
+    """Not by what is no part of a run's outcome, nor by what all have in common."""
+    common = ["+method=mine", "+scale=tiny", "solver.batch_size=8"]
+    for name, words, target in (("a", [], "x"), ("b", ["+filter=learnability"], "y")):
+        for seed in range(2):
+            overrides = [*common, *words, f"seed={seed}", "hydra.run.dir=x", "compute.cores=1"]
+            write_run(
+                tmp_path / f"{name}{seed}",
+                "mine",
+                [seed],
+                facts={"overrides": overrides},
+                curriculum={"_target_": target},
+            )
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert labels(study) == {"mine": [0, 1], "mine, filter=learnability": [0, 1]}
 
 
 def test_a_label_is_one_line_whatever_settings_are_called(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""The K copies of a cycle in several processes, on one machine or many, with TorchRL's collectors.
+"""The K replicas of a cycle in several processes, on one machine or many, by TorchRL's collectors.
 
-A worker holds and trains its own copies. Every random number belongs to a copy's number, so that a
-copy's results are the same wherever it is computed, but for rounding.
+A worker holds and trains its own replicas. Every random number belongs to a replica's number, so
+that its results are the same wherever it is computed, but for rounding.
 """
 
 from proposer_rl.meta.workers.copies import CopiesInWorkers, shares

@@ -32,7 +32,7 @@ from proposer_rl.meta.workers.remote import MakeEnv, WorkerPolicy, make_worker_e
 from proposer_rl.streams import Streams
 
 ATTEMPTS = 3
-EVERY = 0.5  # seconds between two looks at how far the workers are
+EVERY = 0.5  # seconds between two readings of how far the workers are
 
 
 class CopiesInWorkers:
@@ -42,14 +42,14 @@ class CopiesInWorkers:
 
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` of all
-            copies; it is used for all but the copies' training.
+            replicas; it is used for all but the replicas' training.
         make_env: makes a worker's environment.
         settings: how many workers there are, and where.
-        tell: called now and then, in another thread, with the number of updates that all copies
+        tell: called now and then, in another thread, with the number of updates that all replicas
             have had of the present episode; not of Ray's workers, which share no memory.
 
     Raises:
-        ValueError: for more workers than copies.
+        ValueError: for more workers than replicas.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class CopiesInWorkers:
         self._settings = settings
         self._tell = tell
         self._shares = shares(self._env.batch_size[0], settings.workers)
-        # Of each copy its place, [K], among those of all workers: in the first that has it.
+        # Of each replica its place, [K], among those of all workers: in the first that has it.
         every = [copy for share in self._shares for copy in share]
         self._first = [every.index(copy) for copy in range(self._env.batch_size[0])]
         self._collector: BaseCollector | None = None
@@ -74,7 +74,7 @@ class CopiesInWorkers:
         """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`.
 
         Raises:
-            DivergedError: if a copy diverges, as in one process.
+            DivergedError: if a replica diverges, as in one process.
             WorkersError: if workers are lost again and again.
         """
         self._env.view.draw_levels(streams)
@@ -107,8 +107,8 @@ class CopiesInWorkers:
         """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
         assert self._collector is not None, "there has been no episode"
         orders = [(copy,)] * len(self._shares)
-        found: list[Trained | None] = self._collector.map_fn("env.trained", orders)
-        return next(filter(None, found)).to(self._env.device)
+        results: list[Trained | None] = self._collector.map_fn("env.trained", orders)
+        return next(filter(None, results)).to(self._env.device)
 
     def close(self) -> None:
         """End the workers; the next episode starts others."""
@@ -131,7 +131,7 @@ class CopiesInWorkers:
         orders = [(origin, streams, count) for count in counts]
         collector.map_fn("env.fork", orders)
         collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
-        with _told(counts, self._tell):
+        with _reported(counts, self._tell):
             rollouts = collect(collector)
         return rollouts, collector.get_distant_attr("env.diverged")
 
@@ -150,7 +150,7 @@ class CopiesInWorkers:
         )
 
     def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
-        """The rollout [K, T] of all copies, each from the first worker that has it."""
+        """The rollout [K, T] of all replicas, each from the first worker that has it."""
         rollout: Any = rollouts.flatten(0, 1)[self._first]
         rollout = rollout.exclude("collector").to(self._env.device)
         rollout.names = [None, "time"]
@@ -158,13 +158,13 @@ class CopiesInWorkers:
 
 
 def shares(copies: int, workers: int) -> list[range]:
-    """The numbers of K copies in as many ranges as there are workers, all of the same length.
+    """The numbers of K replicas in as many ranges as there are workers, all of the same length.
 
     Where K is no multiple of the workers, the last ranges overlap: what one process has to do
     takes no longer for it, and TorchRL's collectors want batches of one shape.
 
     Raises:
-        ValueError: for more workers than copies, or none.
+        ValueError: for more workers than replicas, or none.
     """
     if not 1 <= workers <= copies:
         raise ValueError(
@@ -177,18 +177,18 @@ def shares(copies: int, workers: int) -> list[range]:
 
 
 @contextmanager
-def _told(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
-    """While workers count their updates, [W]: tell what the slowest has counted."""
+def _reported(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
+    """While workers count their updates, [W], report what the slowest has counted."""
     over = Event()
 
     def watch() -> None:
-        told, last = 0, False
+        reported, last = 0, False
         while not last:
             last = over.wait(EVERY)
             done = int(counts.min())
-            if done > told:
+            if done > reported:
                 tell(done)
-                told = done
+                reported = done
 
     with ThreadPoolExecutor(1) as pool:
         watched = pool.submit(watch)
@@ -196,7 +196,7 @@ def _told(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
             yield
         finally:
             over.set()
-        watched.result()  # raises what telling has raised
+        watched.result()  # raises what the report has raised
 
 
 def _last_line(error: Exception) -> str:

@@ -28,7 +28,7 @@ class WorkersError(RuntimeError):
 
 
 class WorkerSettings(NamedTuple):
-    """Where the copies of the Solver are trained.
+    """Where the replicas of the Solver are trained.
 
     Attributes:
         engine: ``"multiprocess"``: processes of this machine, by TorchRL's
@@ -48,7 +48,7 @@ class WorkerSettings(NamedTuple):
 
 
 def start(
-    chosen: WorkerSettings,
+    settings: WorkerSettings,
     environments: list[Callable[[], Any]],
     policies: list[Callable[[], Any]],
     frames: int,
@@ -57,7 +57,7 @@ def start(
     """Start the workers.
 
     Args:
-        chosen: where and how many they are.
+        settings: where and how many they are.
         environments: a factory for each worker, which can be pickled.
         policies: the same.
         frames: that each worker collects in a batch.
@@ -68,7 +68,7 @@ def start(
     """
     common = {
         "policy_factory": policies,
-        "frames_per_batch": frames * chosen.workers,
+        "frames_per_batch": frames * settings.workers,
         "reset_at_each_iter": True,
         "storing_device": "cpu",
         "trust_policy": True,
@@ -77,8 +77,8 @@ def start(
     with _kept(), warnings.catch_warnings():
         # TorchRL's, of a policy that it will not update: the weights come with every order.
         warnings.filterwarnings("ignore", message="The policy is not an nn.Module")
-        if chosen.engine == "ray":
-            return _ray(chosen, environments, unused, common)
+        if settings.engine == "ray":
+            return _ray(settings, environments, unused, common)
         return MultiSyncCollector(
             environments,
             cat_results="stack",
@@ -90,9 +90,9 @@ def start(
         )
 
 
-def lost(chosen: WorkerSettings) -> tuple[type[Exception], ...]:
+def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
     """What is raised where a worker is lost."""
-    if chosen.engine != "ray":
+    if settings.engine != "ray":
         return LOST
     from ray.exceptions import RayError
 
@@ -100,11 +100,14 @@ def lost(chosen: WorkerSettings) -> tuple[type[Exception], ...]:
 
 
 def stop(collector: BaseCollector) -> None:
-    """End the workers, whatever state they are in."""
+    """End the workers, whatever state they are in, and with Ray's the connection to its cluster."""
     with _kept():
         with suppress(Exception):  # of a collector whose workers are gone
             collector.shutdown(timeout=SECONDS_TO_CLOSE)
-        for process in getattr(collector, "procs", ()):
+        if not isinstance(collector, MultiSyncCollector):
+            sys.modules["ray"].shutdown()
+            return
+        for process in collector.procs:
             with suppress(ValueError):  # closed already
                 process.kill()
                 process.join()
@@ -120,7 +123,7 @@ def collect(collector: BaseCollector) -> Any:
 
 
 def _ray(
-    chosen: WorkerSettings,
+    settings: WorkerSettings,
     environments: list[Callable[[], Any]],
     unused: dict[str, Any],
     common: dict[str, Any],
@@ -128,11 +131,11 @@ def _ray(
     import ray
     from torchrl.collectors.distributed import RayCollector
 
-    workers, address = chosen.workers, chosen.ray_address
-    on_gpus = any(torch.device(device).type == "cuda" for device in chosen.devices)
+    workers, address = settings.workers, settings.ray_address
+    on_gpus = any(torch.device(device).type == "cuda" for device in settings.devices)
     visible = torch.cuda.device_count() if address is None else workers
     share = {  # which Ray reserves for a worker; it is placed on another machine where it can be
-        "num_cpus": chosen.cores,
+        "num_cpus": settings.cores,
         "num_gpus": min(1.0, visible / workers) if on_gpus else 0,
         "scheduling_strategy": "SPREAD",
     }
@@ -141,35 +144,35 @@ def _ray(
         _knock(address)
         cluster["address"] = address
     else:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster of ours tells nobody
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # our own cluster reports to nobody
         # As many as are asked for, or Ray would wait for processors that will never be there.
-        processors = max(os.cpu_count() or 1, chosen.cores * workers)
+        processors = max(os.cpu_count() or 1, settings.cores * workers)
         cluster |= {"address": "local", "num_cpus": processors, "include_dashboard": False}
     try:
-        collector = RayCollector(
-            environments,
-            total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
-            sync=True,
-            # One for each: TorchRL writes a worker's policy factory into them.
-            collector_kwargs=[unused.copy() for _ in range(workers)],
-            remote_configs=[share.copy() for _ in range(workers)],
-            # The weights travel with every order. TorchRL's scheme joins all in one torch process
-            # group, which a worker that replaces another cannot enter.
-            weight_sync_schemes={},
-            ray_init_config=cluster,
-            **common,
-        )
+        ray.init(**cluster, ignore_reinit_error=True)
     except ConnectionError as error:  # Ray's, of an address such as auto
         raise WorkersError(f"compute.ray_address={address}: no cluster answers there") from error
+    # Before the collector, which would wait for ever for what is not there.
     available = ray.cluster_resources()
-    for name, amount in {"CPU": chosen.cores * workers, "GPU": float(on_gpus)}.items():
+    for name, amount in {"CPU": settings.cores * workers, "GPU": float(on_gpus)}.items():
         if available.get(name, 0) < amount:
-            stop(collector)
+            ray.shutdown()
             raise WorkersError(
                 f"compute.workers={workers}: the Ray cluster has "
                 f"{available.get(name, 0):g} {name}, {amount:g} are needed"
             )
-    return collector
+    return RayCollector(
+        environments,
+        total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
+        sync=True,
+        # One for each: TorchRL writes a worker's policy factory into them.
+        collector_kwargs=[unused.copy() for _ in range(workers)],
+        remote_configs=[share.copy() for _ in range(workers)],
+        # The weights travel with every order. TorchRL's scheme joins all in one torch process
+        # group, which a worker that replaces another cannot enter.
+        weight_sync_schemes={},
+        **common,
+    )
 
 
 def _knock(address: str) -> None:

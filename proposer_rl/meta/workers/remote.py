@@ -17,7 +17,7 @@ from proposer_rl.streams import Streams
 
 
 class WorkerEnv(SolverTrainingEnv):
-    """The meta-environment of a worker: it survives a Solver that diverges, to tell of it.
+    """The meta-environment of a worker: it survives a Solver that diverges, and reports it.
 
     An exception in a collector's process would end it, and the worker would be replaced in vain.
 
@@ -38,14 +38,14 @@ class WorkerEnv(SolverTrainingEnv):
         self.diverged = None
         if count is not None:
 
-            def tell(done: int) -> None:
+            def on_update(done: int) -> None:
                 count.fill_(done)
 
-            self.on_update = tell
+            self.on_update = on_update
         super().fork(solver, streams)
 
     def trained(self, copy: int) -> Trained | None:
-        """The copy as its last update has left it, on the CPU; None if another worker has it."""
+        """A replica as its last update has left it, on the CPU; None if another worker has it."""
         if copy not in self._copies:
             return None
         own = taken_out(self, copy - self._copies.start).to("cpu")
@@ -66,7 +66,7 @@ class WorkerEnv(SolverTrainingEnv):
 
 
 class MakeEnv(Protocol):
-    """Makes a meta-environment of a share of the copies; can be pickled."""
+    """Makes a meta-environment of a share of the replicas; can be pickled."""
 
     def __call__(
         self, *, share: range, device: str, kind: type[SolverTrainingEnv]
@@ -87,7 +87,7 @@ class WorkerPolicy(RolloutPolicy):
     Args:
         agent: the Proposer on the CPU; its weights do not matter.
         horizon: steps T of a rollout.
-        shape: of one copy's action.
+        shape: of one replica's action.
         device: where it acts.
     """
 
@@ -102,7 +102,7 @@ class WorkerPolicy(RolloutPolicy):
         Args:
             weights: of the Proposer, by name.
             streams: of the cycle.
-            share: the copies whose episodes it acts in.
+            share: the replicas whose episodes it acts in.
         """
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():

@@ -19,11 +19,11 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.tasks.gymnasium.levels import SEED
 from proposer_rl.tasks.gymnasium.networks import checked_spaces
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from proposer_rl.tasks.gymnasium.success import Rule, Steps
+from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
 # A forked process need not import torch again, of which it has no use: TorchRL's choice is spawn.
@@ -38,7 +38,7 @@ class GymnasiumEnv(EnvBase):
     as one. ``reward`` is scaled.
 
     Args:
-        levels: as :class:`~proposer_rl.tasks.gymnasium.levels.ParameterSpace` makes them, [*B].
+        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B].
         make: makes one environment.
         parameters: what differs between levels, by name.
         success: when an episode is one.
@@ -82,9 +82,9 @@ class GymnasiumEnv(EnvBase):
             self._returns[:] = 0
             seen, _ = self._vector.reset()
         else:
-            chosen = mask.reshape(-1).numpy()
-            self._returns[chosen] = 0
-            seen, _ = self._vector.reset(options={"reset_mask": chosen})
+            which = mask.reshape(-1).numpy()
+            self._returns[which] = 0
+            seen, _ = self._vector.reset(options={"reset_mask": which})
         # Of these TorchRL takes over only the entries of the environments that are reset.
         return self._batched(observation=seen, success=np.zeros(len(self._returns), np.bool_))
 
@@ -168,5 +168,5 @@ def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:
 
 def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
     """Actions [n, ...] of a policy as environments of a space take them."""
-    chosen = actions.numpy()
-    return chosen + space.start if isinstance(space, spaces.Discrete) else chosen
+    taken = actions.numpy()
+    return taken + space.start if isinstance(space, spaces.Discrete) else taken

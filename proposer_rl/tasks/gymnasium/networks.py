@@ -17,7 +17,7 @@ Acts = spaces.Discrete | spaces.Box
 
 SMALL_MAP = 8  # pixels along its shorter side at most: no more is halved
 FIRST_LOG_SCALE = -0.5  # of the policy over continuous actions
-POLICY_GAIN = 0.01  # of the policy's last layer: the first policy is nearly even
+POLICY_GAIN = 0.01  # of the policy's last layer: the first policy is nearly uniform
 
 
 class SolverNetwork(nn.Module):

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.runs.pictures import written
 from proposer_rl.tasks.gymnasium.env import as_actions, plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
@@ -53,7 +54,7 @@ class Camera:
             self._player.reset()
             try:
                 self.works = self._player.render() is not None
-            except Exception:  # a package, a display, a driver: there are the numbers instead
+            except Exception:  # a package, a display, a driver: the numbers are shown instead
                 self.works = False
 
     def pictures(
@@ -85,13 +86,6 @@ class Camera:
         image = Image.fromarray(np.asarray(self._player.render(), np.uint8))
         image.thumbnail((LONGER_SIDE, LONGER_SIDE))
         return np.asarray(image)
-
-
-def written(lines: Sequence[str]) -> NDArray[np.uint8]:
-    """Lines of text as a picture, uint8 [H, W, 3]."""
-    image = Image.new("RGB", (LONGER_SIDE, 8 + 14 * len(lines)), (250, 250, 250))
-    ImageDraw.Draw(image).multiline_text((4, 4), "\n".join(lines), (45, 45, 45))
-    return np.asarray(image)
 
 
 def _first_actions(rollout: TensorDictBase) -> Tensor:

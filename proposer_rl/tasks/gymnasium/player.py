@@ -172,7 +172,7 @@ def set_attribute(environment: Any, path: str, value: float) -> None:
         value: for it.
 
     Raises:
-        RefusedLevelError: if there is no such attribute, with those that there are.
+        RefusedLevelError: if there is no such attribute, listing the available ones.
     """
     *parts, last = path.split(".")
     place = environment
@@ -181,8 +181,8 @@ def set_attribute(environment: Any, path: str, value: float) -> None:
     if not hasattr(place, last):
         there = sorted(
             name
-            for name, found in (*vars(type(environment)).items(), *vars(environment).items())
-            if isinstance(found, Number) and not isinstance(found, bool) and name[0] != "_"
+            for name, value in (*vars(type(environment)).items(), *vars(environment).items())
+            if isinstance(value, Number) and not isinstance(value, bool) and name[0] != "_"
         )
         raise RefusedLevelError(
             f"{type(environment).__name__} has no attribute {path!r}; numbers that it has: "
@@ -201,9 +201,9 @@ def imported(name: str | None) -> Callable[..., Any]:
         raise ValueError("missing: which function, as module.name")
     module, _, last = name.rpartition(".")
     try:
-        found = getattr(import_module(module), last)
+        result = getattr(import_module(module), last)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"{name!r}: cannot be imported: {error}") from error
-    if not callable(found):
+    if not callable(result):
         raise ValueError(f"{name!r}: must be something to call")
-    return found
+    return result

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Len
 
 from proposer_rl.settings import settings
+from proposer_rl.tasks.parameters import Number
 
-Number = int | float
 Widths = list[Annotated[int, Ge(1)]]
 
 
@@ -17,7 +17,7 @@ class ParameterSettings:
     """A number of the environment that differs between levels.
 
     Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
-    parts, within which it is drawn evenly.
+    parts, within which it is drawn uniformly.
 
     Attributes:
         set: how it gets into the environment, before each reset: as an attribute, as an argument
@@ -42,7 +42,7 @@ class ParameterSettings:
 
 @settings
 class SuccessSettings:
-    """When an episode counts as a success, which is told at its end.
+    """When an episode counts as a success, which is known at its end.
 
     Attributes:
         kind: ``return``: it has at least the return ``least``; ``survived``: the time limit ended

@@ -36,7 +36,7 @@ def success_rule(settings: SuccessSettings) -> Rule:
     for name in ("least", "key"):
         given = getattr(settings, name) is not None
         if given != (name == needed):
-            verb = "is of no use" if given else "missing"
+            verb = "has no effect" if given else "missing"
             raise ValueError(f"success.{name}: {verb} with success.kind={settings.kind}")
     least, key = settings.least or 0.0, settings.key or ""
     rules: dict[str, Rule] = {

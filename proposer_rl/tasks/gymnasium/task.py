@@ -1,33 +1,30 @@
-"""An environment of Gymnasium as a task: Solvers, levels and measurements of one configuration."""
+"""Any Gymnasium environment as a task: Solvers, levels and how they are measured."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Annotated, Any
 
 import gymnasium
+import numpy as np
 import torch
 from annotated_types import Ge, Gt
 from gymnasium import spaces
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from proposer_rl.extras import install_command
-from proposer_rl.learning import PPO, first_episode_return, first_episode_success
-from proposer_rl.models import ActorCritic, Population, categorical, normal
-from proposer_rl.runs.pictures import png
 from proposer_rl.settings import SolverSettings
-from proposer_rl.streams import Streams, each_from
-from proposer_rl.task import Place
+from proposer_rl.streams import Streams
+from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization, plays
-from proposer_rl.tasks.gymnasium.evaluation import EpisodeEvaluator, answers
-from proposer_rl.tasks.gymnasium.levels import SEED, ParameterSpace, space_bins, target_bins
-from proposer_rl.tasks.gymnasium.networks import Acts, SolverNetwork, actions, checked_spaces
+from proposer_rl.tasks.gymnasium.levels import space_bins, target_bins
+from proposer_rl.tasks.gymnasium.networks import Acts, SolverNetwork, checked_spaces
 from proposer_rl.tasks.gymnasium.pictures import KEY, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
@@ -43,21 +40,18 @@ from proposer_rl.tasks.gymnasium.settings import (
     SuccessSettings,
 )
 from proposer_rl.tasks.gymnasium.success import success_rule
-
-SAMPLES = 6  # levels of each distribution that a reader is shown
-CPU = torch.device("cpu")
-KINDS = ("success", "return")
+from proposer_rl.tasks.parameters import SEED, ParameterSpace
 
 # Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
 RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 
 
-class GymnasiumTask:
-    """An environment of Gymnasium some of whose numbers make a level; a Task.
+class GymnasiumTask(Task):
+    """An environment of Gymnasium some of whose numbers make a level.
 
-    The contract is :class:`~proposer_rl.task.Task`. Environments are stepped by Gymnasium's vector
-    environments, Solvers are small networks: both are on the CPU, whatever the place says.
+    Environments are stepped by Gymnasium's vector environments, Solvers are small networks: both
+    are on the CPU, whatever the context says.
 
     Args:
         env_id: as :func:`gymnasium.make` takes it; ``module:name`` imports the module first.
@@ -67,22 +61,21 @@ class GymnasiumTask:
         max_steps: after which an episode is truncated; None for the environment's own limit.
         parameters: what differs between levels, by name.
         success: when an episode is one.
-        reward_scale: what rewards are multiplied with in training; returns are told without it.
+        reward_scale: what rewards are multiplied with in training; returns are given without it.
         network: of the Solver.
-        evaluation: measurements.
+        evaluation: how the Solver is measured.
         vectorization: of the environments that Solvers train in: ``"sync"``, or ``"async"`` for a
             process each.
         extra: of this package, that the environment needs; None for none.
         solver: the Solver's training.
-        place: precision and cores.
+        context: precision and cores.
 
     Raises:
         ValueError: naming the key, if there is no such environment or parameter, it refuses a value
             of a parameter, there is no network for what it shows or takes, or a package is missing.
     """
 
-    exact_performance = False
-    device = CPU
+    episodes_at_once = 64
 
     def __init__(
         self,
@@ -99,170 +92,120 @@ class GymnasiumTask:
         vectorization: Vectorization,
         extra: str | None,
         solver: SolverSettings,
-        place: Place,
+        context: ComputeContext,
     ) -> None:
-        self.batch_size = solver.batch_size
-        self.precision = "fp32" if place.precision == "auto" else place.precision
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
         self._success, self._rule = success, success_rule(success)
-        self._reward_scale = reward_scale
+        self.reward_scale = reward_scale
         self._network = network
         self._evaluation = evaluation
         self._vectorization = vectorization
-        self._solver = solver
-        self._cores = place.cores
-        self.space, self.target = _spaces(parameters)
-        self.distributions = {"target": self.target, "all": self.space}
-        self.measurements = [f"{name}_{kind}" for name in self.distributions for kind in KINDS]
-        self._measured_on = {
-            name: distribution.sample(evaluation.levels, self._stream("levels", name))
-            for name, distribution in self.distributions.items()
-        }
-        with _named(env_id, extra):
-            self._seen, self._acts, self._limit = self._tried()
-        self._evaluator = EpisodeEvaluator(
-            lambda levels: self._env(levels, once=True),
+        self._envs: dict[torch.Size, GymnasiumEnv] = {}
+        space, target = _spaces(parameters)
+        super().__init__(
+            distributions={"target": target, "all": space},
+            target="target",
+            space=space,
+            solver=solver,
+            context=context._replace(device=torch.device("cpu")),
+            levels=evaluation.levels,
+            seed=evaluation.seed,
             episodes=evaluation.episodes,
             greedy=evaluation.actions == "most_probable",
-            reward_scale=reward_scale,
         )
+        self.title = env_id
+        with _named(env_id, extra):
+            self._seen, self._acts, self.max_steps = self._tried()
+        # MLPs as small as these are faster all at once.
+        self.batched = True if len(self._seen.shape) == 1 else None
+        self._measured = {
+            "environment": [env_id, arguments, list(wrappers)],
+            "steps": self.max_steps,
+            "parameters": {name: asdict(p) for name, p in parameters.items()},
+            "success": asdict(success),
+            "evaluation": asdict(evaluation),
+        }
 
     @property
     def target_shares(self) -> Tensor:
         """The target as shares of the bins, what lies outside of them in the nearest: float [N]."""
-        return self.space.shares(self.target)
+        shares: Tensor = self.space.shares(self.target)
+        return shares
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """See :class:`~proposer_rl.task.Task`."""
-        env_id, evaluation = self._make.env_id, self._evaluation
-        target = "; ".join(
-            f"{name} {' or '.join(_range(*ends) for ends in zip(*bins, strict=True))}"
-            for name, bins in self.target.bins.items()
-        )
+    def key(self) -> str:  # type: ignore[override]
+        """What is to be seen in a record's picture."""
+        return KEY if self._camera.works else NO_FRAMES
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Texts about the task, by their labels."""
+        evaluation = self._evaluation
         return {
-            "title": env_id,
-            "levels": "levels",
-            "distributions": list(self.distributions),
-            "space": {name: list(values) for name, values in self.space.axes.items()},
-            "about": {
-                "Environment": f"{env_id}, at most {self._limit} steps",
-                "Target": target,
-                "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
-                f"all bins; {evaluation.episodes} episode(s) on each, with "
-                f"{evaluation.actions.replace('_', ' ')} actions",
-            },
-            "key": KEY if self._camera.works else NO_FRAMES,
-            "measured": {
-                "environment": [env_id, self._make.arguments, list(self._make.wrappers)],
-                "steps": self._limit,
-                "parameters": {name: asdict(p) for name, p in self._parameters.items()},
-                "success": asdict(self._success),
-                "evaluation": asdict(evaluation),
-            },
-            "exact": False,
-            "samples": {
-                name: self.record(levels[:SAMPLES], None)
-                for name, levels in self._measured_on.items()
-            },
+            "Environment": f"{self.title}, at most {self.max_steps} steps",
+            "Target": "; ".join(
+                f"{name} {' or '.join(_range(*ends) for ends in zip(*bins, strict=True))}"
+                for name, bins in self.target.bins.items()
+            ),
+            "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
+            f"all bins; {evaluation.episodes} episode(s) on each, with "
+            f"{evaluation.actions.replace('_', ' ')} actions",
         }
 
-    def learner(self, streams: Sequence[Streams]) -> PPO:
-        """PPO of K fresh Solvers, whose weights are drawn from the streams."""
-        copies = len(streams)
-        one = partial(SolverNetwork, self._seen, self._acts, self._network)
-        # MLPs as small as these are faster all at once.
-        batched = True if len(self._seen.shape) == 1 else None
-        network = Population(each_from(streams, one), copies, self.precision, self._cores, batched)
-        agent = ActorCritic(
-            TensorDictModule(network, ["observation"], ["logits", "state_value"]),
-            distribution_class=categorical if isinstance(self._acts, spaces.Discrete) else normal,
-            copies=copies,
-        )
-        # Placeholders of the right shape; every update sets its own levels.
-        level = self._measured_on["target"][:1]
-        return PPO(self._env(level.expand(copies, self.batch_size)), agent, self._solver.ppo)
+    def environment(self, levels: TensorDictBase) -> GymnasiumEnv:
+        """Environments to be trained in."""
+        return self._env(levels, vectorization=self._vectorization)
 
-    def performance(
-        self, agent: ActorCritic, levels: TensorDictBase, generator: torch.Generator
-    ) -> TensorDictBase:
-        """Mean return and success of K Solvers' episodes on levels [E] or [K, E]."""
-        return self._evaluator(agent, _for_copies(agent, levels), generator)
+    def evaluation_environment(self, levels: TensorDictBase) -> GymnasiumEnv:
+        """The same environments for the same number of levels, played once and one by one.
 
-    @torch.no_grad()
-    def probe(self, agent: ActorCritic, levels: TensorDictBase) -> Tensor:
-        """What the Solvers would do at the beginning of levels [C], float [K, C, D].
-
-        Probabilities of n actions, or the means of continuous ones.
+        Of the levels of evaluations a process each would be too many.
         """
-        copies = _for_copies(agent, levels)
-        if not copies.batch_size.numel():
-            return torch.zeros(*copies.batch_size, actions(self._acts))
-        return answers(agent, self._evaluator.first_states(copies))
+        shape = levels.batch_size
+        if shape not in self._envs:
+            self._envs[shape] = self._env(levels, once=True)
+        self._envs[shape].set_levels(levels)
+        return self._envs[shape]
 
-    def probe_encoder(self, features: int) -> nn.Module:
-        """A linear layer that reads probes."""
-        return nn.Linear(actions(self._acts), features)
+    def network(self) -> SolverNetwork:
+        """The network of one Solver, by what the environment shows and takes."""
+        return SolverNetwork(self._seen, self._acts, self._network)
 
-    def measure(self, agent: ActorCritic) -> TensorDict:
-        """Mean ``<name>_success`` and ``<name>_return`` on each distribution's levels, each [K]."""
-        measured = {
-            f"{name}_{kind}": performance[kind].mean(1)
-            for name, performance in self.performances(agent).items()
-            for kind in KINDS
-        }
-        return TensorDict(measured, [agent.copies])
-
-    def performances(self, agent: ActorCritic) -> dict[str, TensorDictBase]:
-        """The same on each of the levels, with the same random numbers every time."""
-        return {
-            name: self.performance(agent, levels, self._stream("actions", name))
-            for name, levels in self._measured_on.items()
-        }
-
-    def statistics(self, levels: TensorDictBase, rollout: TensorDictBase) -> TensorDict:
-        """Mean of each parameter, and of the first episodes' success and return, each [K]."""
-        means = {name: levels[name].double().mean(-1) for name in self._parameters}
-        reached = {
-            "train_success": first_episode_success(rollout).float().mean(-1),
-            "train_return": first_episode_return(rollout).mean(-1) / self._reward_scale,
-        }
-        return TensorDict({**means, **reached}, levels.batch_size[:1])
+    def stream(self, use: str, name: str) -> torch.Generator:
+        """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
+        return Streams(self._evaluation.seed, "evaluation").generator(use, name)
 
     def record(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[dict[str, Any]]:
         """Frames of levels [n], and of the Solver's first episode there [n, T]; the parameters."""
-        pictures = self._camera.pictures(levels, rollout)
+        records = super().record(levels, rollout)
         return [
-            {
-                "picture": png(picture),
-                "text": [f"{name} {value:.4g}" for name, value in play.values.items()],
-                "level": {**play.values, SEED: play.seed},
-            }
-            for picture, play in zip(pictures, plays(levels), strict=True)
+            {**record, "level": {**play.values, SEED: play.seed}}
+            for record, play in zip(records, plays(levels), strict=True)
         ]
+
+    def pictures(
+        self, levels: TensorDictBase, rollout: TensorDictBase | None
+    ) -> list[NDArray[np.uint8]]:
+        """Frames of levels [n], and of the Solver's first episode there [n, T]."""
+        return self._camera.pictures(levels, rollout)
 
     @cached_property
     def _camera(self) -> Camera:
-        first = plays(self._measured_on["target"][:1])[0]
+        first = plays(self.evaluated_on["target"][:1])[0]
         return Camera(self._make, self._parameters, first)
 
-    def _env(self, levels: TensorDictBase, once: bool = False) -> GymnasiumEnv:
+    def _env(self, levels: TensorDictBase, **how: Any) -> GymnasiumEnv:
         return GymnasiumEnv(
             levels,
             self._make,
             self._parameters,
             success=self._rule,
-            reward_scale=self._reward_scale,
-            # Of the levels of evaluations a process each would be too many.
-            vectorization="sync" if once else self._vectorization,
-            once=once,
+            reward_scale=self.reward_scale,
+            **how,
         )
-
-    def _stream(self, *key: str) -> torch.Generator:
-        return Streams(self._evaluation.seed, "evaluation").generator(*key)
 
     def _tried(self) -> tuple[spaces.Box, Acts, int]:
         """What the environment shows and takes, and its time limit.
@@ -278,7 +221,7 @@ class GymnasiumTask:
                 imported(function)
             except ValueError as error:
                 raise ValueError(f"{key}: {error}") from error
-        target = plays(self._measured_on["target"][:1])[0]
+        target = plays(self.evaluated_on["target"][:1])[0]
         try:
             player = LevelPlayer(self._make, self._parameters, target)
         except RefusedLevelError as error:
@@ -311,7 +254,7 @@ def _spaces(
     for name, settings in parameters.items():
         try:
             if name in RESERVED or name.startswith("loss_"):
-                raise ValueError("is a column of what is told of training; choose another name")
+                raise ValueError("is a column of training.csv; choose another name")
             if not re.fullmatch(r"\w[\w .-]*", name):
                 raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = space_bins(settings), target_bins(settings)
@@ -322,7 +265,7 @@ def _spaces(
 
 @contextmanager
 def _named(env_id: str, extra: str | None) -> Iterator[None]:
-    """Tell in one line what is wrong with an environment that cannot be made."""
+    """Say in one line what is wrong with an environment that cannot be made."""
     try:
         yield
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
@@ -333,10 +276,6 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
         raise ValueError(f"env_id={env_id}: {error}") from error
     except RefusedLevelError as error:
         raise ValueError(f"parameters: {error}") from error
-
-
-def _for_copies(agent: ActorCritic, levels: TensorDictBase) -> TensorDictBase:
-    return levels.expand(agent.copies, levels.batch_size[-1])
 
 
 def _range(low: Tensor, high: Tensor) -> str:

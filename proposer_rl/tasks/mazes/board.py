@@ -1,17 +1,18 @@
-"""Mazes drawn by hand, and all that a Solver does there: what ``bin/play`` shows of mazes."""
+"""Mazes that users draw, and all that a Solver does there: what ``bin/play`` shows of mazes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from proposer_rl.models import ActorCritic, cell_maps
-from proposer_rl.task import CellKind
+from proposer_rl.play.board import CellKind
 from proposer_rl.tasks.mazes.dynamics import shortest_way, successors
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, policy_path
+from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.level_files import (
     levels_from_text,
     levels_to_text,
@@ -29,32 +30,32 @@ from proposer_rl.tasks.mazes.levels import (
     planes,
 )
 from proposer_rl.tasks.mazes.occupancy import expected_visits, success_from_cells
-from proposer_rl.tasks.mazes.records import recorded_drawing
-from proposer_rl.tasks.mazes.settings import MazeSettings
+from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 DIGITS = 4  # of the numbers of a map: what can be seen
 
 
 class Drawings:
-    """Mazes as drawings: of a :class:`~proposer_rl.task.Board` all but what a Solver does.
+    """Mazes as drawings: of a :class:`~proposer_rl.play.board.Board` all but what a Solver does.
 
     Args:
-        size: rows and columns of the run's mazes.
+        task: whose levels are drawn.
     """
 
-    level: type[Level] = Level
-
-    def __init__(self, size: tuple[int, int]) -> None:
-        self.size = size
+    def __init__(self, task: GridTask) -> None:
+        self._task = task
+        self.size = task.grid
         self.sets = shipped_sets()
 
-    def read(self, rows: Sequence[str]) -> Level:
-        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+    def read(self, rows: Sequence[str]) -> Any:
+        """The level that is drawn; see :class:`~proposer_rl.play.board.Board`."""
         # The message of a drawing shows it; here it was seen already.
         try:
-            return self.level.from_text("\n".join(rows))
+            level = self._task.level.from_text("\n".join(rows))
         except ValueError as error:
             raise ValueError(str(error).partition(", got")[0]) from error
+        self._task.check_level("drawn", level)
+        return level
 
     def draw(self, level: Level) -> list[str]:
         """The rows of a level's drawing."""
@@ -65,12 +66,12 @@ class Drawings:
         return recorded_drawing(record)
 
     def level_set(self, name: str) -> Mapping[str, Level]:
-        """The levels of a set that comes along."""
-        return shipped_levels(name)
+        """The levels of a shipped set; an agent that turns looks to the right."""
+        return shipped_levels(name, self._task.level)
 
     def read_file(self, text: str) -> Mapping[str, Level]:
         """The levels of a file's text; docs/levels.md has the format."""
-        return levels_from_text(text, kind=self.level)
+        return levels_from_text(text, kind=self._task.level)
 
     def write_file(self, name: str, level: Level) -> str:
         """A file's text; docs/levels.md has the format."""
@@ -78,14 +79,7 @@ class Drawings:
 
 
 class MazeBoard(Drawings):
-    """Mazes that are seen whole; a :class:`~proposer_rl.task.Board`.
-
-    Args:
-        maze: the inner environment.
-        check: refuses a level that the Solver's network cannot see, given its name.
-        max_steps: the step limit of a level, given the length of its shortest path.
-        device: that of the Solvers.
-    """
+    """Mazes that are seen whole; a :class:`~proposer_rl.play.board.Board`."""
 
     kinds = (
         CellKind(FREE, "free"),
@@ -95,46 +89,28 @@ class MazeBoard(Drawings):
     )
     actions = ("up", "down", "left", "right")
 
-    def __init__(
-        self,
-        maze: MazeSettings,
-        check: Callable[[str, Level], None],
-        max_steps: Callable[[int], int],
-        device: torch.device,
-    ) -> None:
-        super().__init__((maze.height, maze.width))
-        self._step_penalty = maze.step_penalty
-        self._check = check
-        self._max_steps = max_steps
-        self._device = device
-
-    def read(self, rows: Sequence[str]) -> Level:
-        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
-        level = super().read(rows)
-        self._check("drawn", level)
-        return level
-
     @torch.no_grad()
     def examine(
         self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
+        """What a Solver does on a level, exactly; see :class:`~proposer_rl.play.board.Board`.
 
         ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
         ``maps``: the critic's values; the probability of success from every cell with the whole
         step limit; how often a step of an episode begins there.
         """
         shortest = shortest_path(level)
-        limit = max_steps or self._max_steps(0 if shortest is None else len(shortest) - 1)
-        level = level.to(self._device)
+        steps, step_penalty = len(shortest or [0]) - 1, self._task.maze.step_penalty
+        limit = max_steps or self._task.step_limit(steps)
+        level = level.to(self._task.device)
         copies = planes(level.expand(agent.copies, 1))
         logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
         logits, values = logits.float(), values[0].float()
         if not (logits.isfinite().all() and values.isfinite().all()):
-            raise ValueError("the Solver of this checkpoint answers with numbers without an end")
+            raise ValueError("the Solver of this checkpoint answers with NaN or infinity")
         policy = logits.softmax(0)
         visits = expected_visits(level, policy, limit)
-        results = ExactEvaluator(limit, self._step_penalty)(level, logits)
+        results = ExactEvaluator(limit, step_penalty)(level, logits)
         goal = cell_plane(level.goal, level.walls.shape).bool()
         maps = {
             "critic's value": (values, level.walls | goal),
@@ -154,8 +130,8 @@ class MazeBoard(Drawings):
             "next": successors(level).tolist(),
             "goal": level.goal.tolist(),
             "max_steps": limit,
-            "step_penalty": self._step_penalty,
-            "missed": -self._step_penalty * limit,
+            "step_penalty": step_penalty,
+            "missed": -step_penalty * limit,
         }
 
 

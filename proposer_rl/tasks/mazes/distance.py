@@ -83,12 +83,12 @@ def cells_at_depth(free: Tensor, source: Tensor, depth: Tensor) -> Tensor:
     """
     frontier, unvisited = _begin(free, source)
     spare = torch.zeros_like(frontier)
-    found = torch.empty_like(free)
+    reached = torch.empty_like(free)
     for first, end in schedule(depth):
         _spread(frontier[..., first:], spare[..., first:], unvisited[..., first:])
         frontier, spare = spare, frontier
-        found[..., first:end] = frontier[1:-1, 1:-1, first:end]
-    return found
+        reached[..., first:end] = frontier[1:-1, 1:-1, first:end]
+    return reached
 
 
 def padded_index(cell: Tensor, width: int) -> Tensor:

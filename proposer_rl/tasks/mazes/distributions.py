@@ -62,14 +62,6 @@ class LevelDistribution:
         """Number of specifications."""
         return len(self.specifications)
 
-    def on_grid(self, height: int, width: int) -> LevelDistribution:
-        """The same specifications on another grid.
-
-        Raises:
-            ValueError: If one cannot be met there.
-        """
-        return LevelDistribution(self.specifications, self.mechanism, height, width, self.device)
-
     def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Obstacle fractions float64 ``[*B]`` and path lengths int64 ``[*B]`` of numbers ``[*B]``.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -10,10 +11,12 @@ from torch import Tensor
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_position
 from proposer_rl.tasks.mazes.randomness import Draws
 
+L = TypeVar("L", bound=Level)
+
 FLIP_WALL, MOVE_GOAL, MOVE_START = range(3)
 
 
-def edit_levels(levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
+def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) -> L:
     """Levels after a number of random edits, one after another.
 
     An edit is one of three operators, each with probability 1/3:
@@ -37,7 +40,8 @@ def edit_levels(levels: Level, count: int, generators: Sequence[torch.Generator]
             ``[k]`` depend on generator k alone.
 
     Returns:
-        Valid levels ``[K, n]`` on the levels' device.
+        Valid levels ``[K, n]`` of the levels' class on their device; what else a level has, such as
+        the direction of a :class:`~proposer_rl.tasks.view_mazes.levels.ViewLevel`, stays.
 
     Raises:
         ValueError: If ``count`` is negative, or the generators are not as many as the levels' first
@@ -53,7 +57,7 @@ def edit_levels(levels: Level, count: int, generators: Sequence[torch.Generator]
         raise ValueError(f"count must be at least 0, got {count}")
     if len(generators) != copies:
         raise ValueError(
-            f"{copies} generators are needed for levels of {copies} copies, got {len(generators)}"
+            f"{copies} generators are needed for levels of {copies} replicas, got {len(generators)}"
         )
     group = torch.arange(copies).repeat_interleave(number)
     draws = Draws(generators, group, torch.device("cpu"))
@@ -65,7 +69,7 @@ def edit_levels(levels: Level, count: int, generators: Sequence[torch.Generator]
     return flat.reshape(copies, number).clone()
 
 
-def _edit(levels: Level, operator: Tensor, place: Tensor) -> Level:
+def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
     """One edit of each of levels [C]: int64 [C] says which, float [C] in [0, 1) where."""
     width = levels.walls.shape[-1]
     walls = levels.walls.flatten(1)  # [C, H*W]
@@ -83,9 +87,9 @@ def _edit(levels: Level, operator: Tensor, place: Tensor) -> Level:
 
     flipped = torch.zeros_like(walls).scatter(1, cell.unsqueeze(1), chosen(FLIP_WALL).unsqueeze(1))
     position = cell_position(cell, width)  # [C, 2]
-    return Level(
+    edited: L = levels.replace(  # of the levels' own class: a direction stays
         walls=(walls ^ flipped).view_as(levels.walls),
         start=position.where(chosen(MOVE_START).unsqueeze(1), levels.start),
         goal=position.where(chosen(MOVE_GOAL).unsqueeze(1), levels.goal),
-        batch_size=levels.batch_size,
     )
+    return edited

@@ -38,7 +38,7 @@ class MazeEnv(LevelEnv):
     Args:
         levels: Levels of any batch shape ``[*B]``, which with their device become the
             environment's. They must be valid; see
-            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-made ones.
+            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-designed ones.
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
         observe_agent: Whether the planes show the agent.

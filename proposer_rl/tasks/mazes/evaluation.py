@@ -119,8 +119,8 @@ class RolloutEvaluator:
     """Mean return and share of successes over episodes played in :class:`MazeEnv`.
 
     Of levels ``[*B, E]`` the random numbers are those of E levels, the same for every index of the
-    dimensions before: copies of a Solver differ by what they do alone, and what one of them gets
-    does not depend on the company that it is evaluated in.
+    dimensions before: replicas of a Solver differ by what they do alone, and what one of them gets
+    does not depend on which others are evaluated with it.
 
     Attributes:
         max_steps: Step limit of an episode.
@@ -209,8 +209,8 @@ def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.0
 
     With d moves on it, T the step limit and c the step's penalty it is 1 - c d if d <= T: the step
     that reaches the goal costs, too, and none of fewer steps does. Otherwise every policy plays to
-    the limit and gets -c T. As d <= T implies 1 - c d > -c T, reaching the goal pays at any
-    penalty.
+    the limit and gets -c T. As d <= T implies 1 - c d > -c T, reaching the goal is optimal at
+    any penalty.
 
     Args:
         levels: Levels ``[*B]``; the goal need not be reachable.
@@ -232,7 +232,7 @@ def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.0
 
 
 def worst_mean(values: Tensor, fraction: float) -> Tensor:
-    """Mean of the lowest values: the conditional value at risk of an even draw from them.
+    """Mean of the lowest values: the conditional value at risk of a uniform draw from them.
 
     With n values and m = fraction · n it is exactly the mean of the m lowest, of which the last
     counts in part where m is no whole number (Rockafellar & Uryasev, Journal of Banking & Finance

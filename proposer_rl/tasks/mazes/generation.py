@@ -189,15 +189,15 @@ class _Task:
                 self.obstacles[spec_of], self.length[spec_of], height, width, draws
             )
             spec_of = spec_of[kept.cpu()]  # [A]
-            found = spec_of.bincount(minlength=len(share))
-            rank = torch.arange(len(spec_of)) - (found.cumsum(0) - found)[spec_of]
+            met = spec_of.bincount(minlength=len(share))
+            rank = torch.arange(len(spec_of)) - (met.cumsum(0) - met)[spec_of]
             slot = filled[spec_of] + rank
             used = slot < self.wanted[spec_of]
             problem = self.order[(self.first[spec_of] + slot)[used]].to(device)
             result[problem] = level[used.to(device)]
             drawn += share
-            accepted += found
-            filled = torch.minimum(filled + found, self.wanted)
+            accepted += met
+            filled = torch.minimum(filled + met, self.wanted)
             self._check_rarity(filled, drawn, accepted)
         return result
 

@@ -28,7 +28,7 @@ class LevelEnv(EnvBase):
     Args:
         levels: Levels of any batch shape ``[*B]``, which with their device become the
             environment's. They must be valid; see
-            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-made ones.
+            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-designed ones.
         max_steps: Step limit of an episode.
 
     Raises:
@@ -43,7 +43,7 @@ class LevelEnv(EnvBase):
         super().__init__(
             device=levels.walls.device,
             batch_size=levels.batch_size,
-            # A start is never a goal. Else TorchRL looks at every reset, and waits for the device.
+            # A start is never a goal. Else TorchRL checks every reset, and waits for the device.
             allow_done_after_reset=True,
         )
         self.max_steps = max_steps

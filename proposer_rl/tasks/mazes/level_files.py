@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from proposer_rl.runs.folder import read_bounded, write_atomically
 from proposer_rl.tasks.mazes import Level, shortest_path_length
-from proposer_rl.tasks.mazes.records import recorded_drawing
+from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 SUFFIXES = (".txt", ".json")
 RECORD = ".jsonl"  # of levels that a run trained on; read, not written
 LARGEST_FILE = 10**7  # bytes; files may come from anybody
 LONGEST_NAME = 80
-
-L = TypeVar("L", bound=Level)
 
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
@@ -76,7 +74,7 @@ def shipped_sets() -> list[str]:
 
 
 def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """The levels of a set that comes with the package; an agent that turns looks to the right.
+    """The levels of a shipped set; an agent that turns looks to the right.
 
     Args:
         name: Of the set.
@@ -86,43 +84,8 @@ def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
         ValueError: If there is no such set.
     """
     if name not in shipped_sets():
-        raise ValueError(f"{name}: there is no such set of levels; there are {shipped_sets()}")
+        raise ValueError(f"{name}: no such set of levels; available: {shipped_sets()}")
     return read_levels(_HERE / f"{name}.txt", kind)
-
-
-def chosen_levels(
-    name: str,
-    distributions: Mapping[str, Callable[[], L]],
-    suffixes: Sequence[str],
-    read: Callable[[str], dict[str, L]],
-    shipped: Callable[[str], dict[str, L]],
-    known: str,
-) -> tuple[dict[str, L], bool]:
-    """The levels that a user names, and whether they are those of a distribution.
-
-    Args:
-        name: Of a file, a distribution or a set that comes along.
-        distributions: What gives the levels of each, by its name.
-        suffixes: Of files.
-        read: Reads a file.
-        shipped: Reads a set that comes along.
-        known: What there is, in words.
-
-    Raises:
-        ValueError: If there is no such thing.
-        StorageError: If a file cannot be read.
-    """
-    if Path(name).suffix in suffixes:
-        if not Path(name).exists():
-            raise ValueError(f"--levels {name}: there is no such file")
-        return read(name), False
-    for distribution, sample in distributions.items():
-        if name.casefold() == distribution.casefold():
-            levels: Any = sample()
-            return {f"{distribution}_{i:03}": levels[i].cpu() for i in range(len(levels))}, True
-    if name in shipped_sets():
-        return shipped(name), False
-    raise ValueError(f"--levels {name}: must be one of: {known}")
 
 
 def levels_from_text(
@@ -193,14 +156,14 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
     Raises:
         ValueError: If a line is not like that, or there is no level.
     """
-    found: dict[tuple[int, str], Level] = {}
+    levels: dict[tuple[int, str], Level] = {}
     for number, line in enumerate(text.split("\n")[:-1], 1):
         try:
             row = json.loads(line)
             seed, updates = int(row["seed"]), int(row["updates"])
             for nth, level in enumerate(row["levels"], 1):
                 drawn = "\n".join(recorded_drawing(level))
-                found[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
+                levels[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
         except (
             KeyError,
             TypeError,
@@ -210,10 +173,10 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
             RecursionError,
         ) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
-    if not found:
+    if not levels:
         raise ValueError("holds no levels")
-    several = len({seed for seed, _ in found}) > 1
-    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in found.items()}
+    several = len({seed for seed, _ in levels}) > 1
+    return {f"seed_{seed}_{name}" if several else name: v for (seed, name), v in levels.items()}
 
 
 def levels_to_text(levels: Mapping[str, Level]) -> str:

@@ -114,7 +114,7 @@ def cell_position(index: Tensor, width: int) -> Tensor:
 
 
 def validate_levels(level: Level) -> None:
-    """Checks levels that were made by hand.
+    """Checks hand-designed levels.
 
     Args:
         level: Levels of any batch shape.

@@ -106,8 +106,8 @@ def episode_law(
         weight += here[step - 1].unsqueeze(-2) * ahead
         share = ahead.sum(-2)
     won = (here * (policy * wins).sum(-2)).sum(-1).movedim(0, -1)  # [*B, T], by each step
-    paid = 1 - step_penalty * torch.arange(1, max_steps + 1, device=won.device).double()
-    outcome = torch.cat([paid, paid[-1:] - 1])
+    gains = 1 - step_penalty * torch.arange(1, max_steps + 1, device=won.device).double()
+    outcome = torch.cat([gains, gains[-1:] - 1])
     value = values.unsqueeze(-2).expand_as(policy)
     return EpisodeLaw(
         outcome=outcome.expand(*won.shape[:-1], -1),

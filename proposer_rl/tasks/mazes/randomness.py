@@ -18,7 +18,7 @@ class Draws:
 
     Args:
         generators: One generator (None for torch's default one), or one for each group.
-        group: int64 ``[C]`` on the CPU, the candidates' groups; of no account with one generator.
+        group: int64 ``[C]`` on the CPU, the candidates' groups; without effect with one generator.
         device: Where to draw, that of the generators.
     """
 

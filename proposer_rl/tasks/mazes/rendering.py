@@ -1,13 +1,18 @@
-"""Pictures of mazes as arrays of colours."""
+"""Mazes for readers: pictures as arrays of colours, and records of what a Solver did."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.runs.pictures import png
+from proposer_rl.tasks.mazes.levels import FREE, Level
+
+EPISODE = "•"  # a free cell that the Solver's episode went through
 
 # Okabe and Ito's palette, which stays distinct under the common forms of colour blindness.
 WALL_COLOUR = (45, 45, 45)
@@ -72,6 +77,34 @@ def draw_level(
         round_one = offset.square().unsqueeze(1) + offset.square() <= (0.3 * cell) ** 2
         _paint(picture, agent, round_one, AGENT_COLOUR)
     return picture
+
+
+def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dict[str, Any]]:
+    """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
+    levels = levels.cpu()
+    for i, text in enumerate(levels.to_text()):
+        path = None if rollout is None else first_path(rollout[i])
+        lines = [list(line) for line in text.splitlines()]
+        for row, column in path or []:
+            if lines[row][column] == FREE:
+                lines[row][column] = EPISODE
+        yield {
+            "picture": png(draw_level(levels[i], path).numpy()),
+            "text": [" ".join(line) for line in lines],
+            **({} if path is None else {"path": path}),
+        }
+
+
+def recorded_drawing(record: Mapping[str, Any]) -> list[str]:
+    """The rows of a level from its record, without what the Solver did there."""
+    return [line.replace(" ", "").replace(EPISODE, FREE) for line in record["text"]]
+
+
+def first_path(steps: TensorDictBase) -> list[list[int]]:
+    """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
+    ended = steps["next", "done"].squeeze(-1).tolist()
+    count = ended.index(True) + 1 if True in ended else len(ended)
+    return steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()
 
 
 def _paint(

@@ -34,7 +34,7 @@ class MazeSettings:
 
 @settings
 class DistributionSettings:
-    """Levels drawn evenly from (obstacle fraction, path length) pairs, by one mechanism."""
+    """Levels drawn uniformly from (obstacle fraction, path length) pairs, by one mechanism."""
 
     specifications: Annotated[list[tuple[Fraction, PathLength]], Len(1)]
     mechanism: Mechanism = "uniform"

@@ -1,1 +1,1 @@
-"""The field's maze: levels with a direction, and an agent that sees 5x5 cells of them."""
+"""The partially observable maze: levels with a direction, an agent that sees 5x5 cells."""

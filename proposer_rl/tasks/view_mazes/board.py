@@ -1,43 +1,38 @@
-"""The field's maze drawn by hand, and what a Solver with memory does there."""
+"""Partially observable mazes that users draw, and what a Solver with memory does there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from proposer_rl.models import ActorCritic
+from proposer_rl.play.board import CellKind
 from proposer_rl.streams import Streams
-from proposer_rl.task import CellKind
 from proposer_rl.tasks.mazes.board import Drawings
 from proposer_rl.tasks.mazes.dynamics import MOVES, shortest_way, successors
-from proposer_rl.tasks.mazes.level_files import shipped_levels
-from proposer_rl.tasks.mazes.level_scores import SLACK
-from proposer_rl.tasks.mazes.levels import FREE, GOAL, WALL, Level, cell_index
+from proposer_rl.tasks.mazes.grid_task import GridTask
+from proposer_rl.tasks.mazes.levels import FREE, GOAL, WALL, cell_index
 from proposer_rl.tasks.view_mazes.distance import fewest_actions
 from proposer_rl.tasks.view_mazes.env import PENALTY
 from proposer_rl.tasks.view_mazes.evaluation import walks
 from proposer_rl.tasks.view_mazes.levels import AGENTS, AHEAD, ViewLevel
-from proposer_rl.tasks.view_mazes.settings import ViewMazeSettings
 
 SHOWN = 20  # sampled episodes that can be watched
 Node = list[int]  # row, column and direction
 
 
 class ViewBoard(Drawings):
-    """Mazes seen through a window; a :class:`~proposer_rl.task.Board` without policy and maps.
+    """Mazes seen through a window; a board (:mod:`proposer_rl.play.board`) without policy and maps.
 
     What a Solver does in a cell depends on what it remembers, so that only episodes can be shown.
 
     Args:
-        maze: the inner environment.
+        task: whose levels are drawn.
         episodes: played on a level to measure a Solver.
         streams: that actions are drawn from, as ``bin/eval`` draws them.
-        device: that of the Solvers.
     """
 
-    level = ViewLevel
     kinds = (
         CellKind(FREE, "free"),
         CellKind(WALL, "wall"),
@@ -46,31 +41,22 @@ class ViewBoard(Drawings):
     )
     actions = ("left", "right", "up")  # two turns, and forward
 
-    def __init__(
-        self, maze: ViewMazeSettings, episodes: int, streams: Streams, device: torch.device
-    ) -> None:
-        super().__init__((maze.height, maze.width))
-        self._max_steps = maze.max_steps
-        self._episodes = episodes
-        self._streams = streams
-        self._device = device
-
-    def level_set(self, name: str) -> Mapping[str, Level]:
-        """The levels of a set that comes along; the agent looks to the right."""
-        return shipped_levels(name, ViewLevel)
+    def __init__(self, task: GridTask, episodes: int, streams: Streams) -> None:
+        super().__init__(task)
+        self._episodes, self._streams = episodes, streams
 
     def examine(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
+        """What a Solver does on a level, by playing; see :class:`~proposer_rl.play.board.Board`.
 
         ``results``: means over sampled episodes, those of ``bin/eval`` on a level named ``drawn``.
         """
-        limit = max_steps or max(self._max_steps, SLACK * int(fewest_actions(level)))
+        limit = max_steps or self._task.step_limit(int(fewest_actions(level)))
         goal, following = level.goal.tolist(), _following(level)
-        placed = level.to(self._device).expand(self._episodes)
+        placed = level.to(self._task.device).expand(self._episodes)
         generator = self._streams.generator("drawn")
-        noise = torch.rand(limit, self._episodes, generator=generator).to(self._device)
+        noise = torch.rand(limit, self._episodes, generator=generator).to(self._task.device)
         went, steps = (each[solver] for each in walks(agent, placed, limit, noise))
         best, number = (each[solver, 0] for each in walks(agent, placed[:1], limit))
         sampled = [one[: n + 1].tolist() for one, n in zip(went, steps.tolist(), strict=True)]

@@ -56,7 +56,7 @@ class ViewSpace:
     """Bins of levels: every number of walls, or each of these with every length of the path.
 
     Without lengths start and goal are anywhere, and may have no path between them: levels drawn
-    evenly from all bins are those of the field's domain randomization. With lengths every level has
+    uniformly from all bins are the field's domain randomization. With lengths every level has
     a shortest path of exactly so many moves.
 
     Args:
@@ -93,14 +93,14 @@ class ViewSpace:
         self.generate(torch.arange(self.size).unsqueeze(0), [torch.Generator().manual_seed(0)])
 
     def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
-        """Draw levels [count] evenly from the bins."""
+        """Draw levels [count] uniformly from the bins."""
         choices = torch.randint(self.size, (1, count), generator=generator)
         return self.generate(choices, [generator])[0]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> ViewLevel:
-        """Levels [K, P] of bins, int64 [K, P]; copy k's are drawn from generator k."""
+        """Levels [K, P] of bins, int64 [K, P]; replica k's are drawn from generator k."""
         pairs = zip(choices.cpu(), generators, strict=True)
-        levels = [self._generate(self._values[chosen], draw) for chosen, draw in pairs]
+        levels = [self._generate(self._values[index], draw) for index, draw in pairs]
         return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
 
     def shares(self, levels: ViewLevel) -> Tensor:
@@ -108,10 +108,10 @@ class ViewSpace:
 
         Without lengths all of the levels count.
         """
-        found = [levels.walls.flatten(1).sum(1).cpu()]
+        counts = [levels.walls.flatten(1).sum(1).cpu()]
         if "path length" in self.axes:
-            found.append(shortest_path_length(levels).cpu())
-        values = torch.stack(found, 1)
+            counts.append(shortest_path_length(levels).cpu())
+        values = torch.stack(counts, 1)
         distance = torch.cdist(self._scaled(values), self.coordinates)
         nearest = distance.argmin(1)[values[:, -1] >= 0]
         return nearest.bincount(minlength=self.size) / len(nearest)

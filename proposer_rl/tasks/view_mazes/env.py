@@ -1,4 +1,4 @@
-"""The field's maze as a TorchRL environment: an agent that turns, moves and sees 5x5 cells."""
+"""The partially observable maze in TorchRL: an agent that turns, moves and sees 5x5 cells."""
 
 from __future__ import annotations
 

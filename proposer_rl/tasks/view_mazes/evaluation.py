@@ -1,72 +1,35 @@
-"""How well Solvers with memory do on fixed levels: they play on them."""
+"""How well Solvers with memory do on fixed levels: they play there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
-
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.learning.episodes import mean_performance, play
+from proposer_rl.models import ActorCritic
 from proposer_rl.tasks.mazes.levels import cell_plane
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 
-SWEEP = 16  # steps between two looks at who is still playing
 
-
-class Played(NamedTuple):
-    """A step of the levels on which some Solver still played a few steps before.
-
-    Attributes:
-        place: of these m levels among all, int64 [m].
-        state: after the step, [K, m].
-        counts: whether the step belonged to the Solver's first episode there, bool [K, m].
-    """
-
-    place: Tensor
-    state: TensorDictBase
-    counts: Tensor
-
-
-@torch.no_grad()
-def play(
+def played_performance(
     agent: ActorCritic,
     levels: ViewLevel,
     max_steps: int,
     episodes: int,
     generator: torch.Generator,
 ) -> TensorDict:
-    """Mean return and share of successes of K Solvers over episodes on levels.
-
-    The random numbers are those of the levels, the same for every Solver: they differ by what they
-    do alone, and what one gets does not depend on the company that it is evaluated in.
-
-    Args:
-        agent: K Solvers.
-        levels: Levels ``[E]``, or ``[K, E]``, each Solver's own.
-        max_steps: Step limit of an episode.
-        episodes: Played on each level.
-        generator: Source of randomness, on the CPU.
-
-    Returns:
-        ``"return"`` and ``"success"``, float32 ``[K, E]``.
-    """
-    count, device = levels.batch_size[-1], levels.walls.device
-    each = levels.expand(agent.copies, count)
-    every: ViewLevel = torch.cat([each] * episodes, 1)  # type: ignore[assignment]
-    noise = torch.rand(max_steps, every.batch_size[1], generator=generator).to(device)
-    returns, success = torch.zeros(2, *every.batch_size, device=device)
-    for place, state, counts in _episodes(agent, every, max_steps, noise):
-        returns[:, place] += state["reward"].squeeze(-1) * counts
-        success[:, place] += (state["terminated"].squeeze(-1) & counts).float()
-    means = {
-        name: total.unflatten(1, (episodes, count)).mean(1)
-        for name, total in (("return", returns), ("success", success))
-    }
-    return TensorDict(means, each.batch_size)
+    """Mean return and share of successes of K Solvers over episodes on levels [K, E]: [K, E]."""
+    return mean_performance(
+        agent,
+        lambda some: ViewMazeEnv(some, max_steps=max_steps),
+        levels,
+        generator,
+        max_steps=max_steps,
+        episodes=episodes,
+        drop_finished=True,
+    )
 
 
 @torch.no_grad()
@@ -83,20 +46,25 @@ def walks(
 
     Returns:
         Row, column and direction before every step and at the end, int64 ``[K, N, T + 1, 3]``, and
-        the number of steps, int64 ``[K, N]``; what comes after them means nothing.
+        the number of steps, int64 ``[K, N]``; what comes after them has no meaning.
     """
     every = levels.expand(agent.copies, *levels.batch_size)
     first = torch.cat([every.start, every.direction.unsqueeze(-1)], -1)  # [K, N, 3]
     went = first.unsqueeze(2).repeat(1, 1, max_steps + 1, 1)
     steps = torch.zeros(every.batch_size, dtype=torch.int64, device=first.device)
-    for step, (place, state, counts) in enumerate(_episodes(agent, every, max_steps, noise), 1):
-        now = torch.cat([state["agent"], state["direction"].unsqueeze(-1)], -1)
-        went[:, place, step] = now
+
+    def env(place: Tensor) -> ViewMazeEnv:
+        return ViewMazeEnv(every[:, place], max_steps=max_steps)
+
+    if not len(levels):  # of which there is no environment
+        return went, steps
+    begin = env(torch.arange(len(levels), device=first.device))
+    for step, (place, state, counts) in enumerate(play(agent, begin, max_steps, noise, env), 1):
+        went[:, place, step] = torch.cat([state["agent"], state["direction"].unsqueeze(-1)], -1)
         steps[:, place] += counts
     return went, steps
 
 
-@torch.no_grad()
 def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
     """Where K Solvers are on levels [C] when they take the most probable actions.
 
@@ -104,49 +72,8 @@ def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
         Share of the steps of one episode after which an agent is in each cell, float32
         ``[K, C, H, W]``.
     """
-    every = levels.expand(agent.copies, *levels.batch_size)
-    grid = levels.walls.shape[-2:]
-    seen = torch.zeros(*every.batch_size, *grid, device=levels.walls.device)
-
-    for place, state, counts in _episodes(agent, every, max_steps, None):
-        seen[:, place] += cell_plane(state["agent"], grid) * counts[..., None, None]
-    return seen / seen.sum((-2, -1), keepdim=True).clamp(min=1)
-
-
-def _episodes(
-    agent: ActorCritic,
-    levels: ViewLevel,
-    max_steps: int,
-    noise: Tensor | None,
-) -> Iterator[Played]:
-    """Play one episode of each Solver on each of its levels [K, N], all at once.
-
-    Args:
-        agent: K Solvers.
-        levels: of each.
-        max_steps: step limit.
-        noise: of the actions, as for :func:`walks`.
-    """
-    if not levels.batch_size[1]:
-        return
-    env = ViewMazeEnv(levels, max_steps=max_steps)
-    state = env.reset()
-    state.update(agent.no_memory(state))
-    place = torch.arange(levels.batch_size[1], device=levels.walls.device)
-    over = torch.zeros(levels.batch_size, dtype=torch.bool, device=levels.walls.device)
-    for step in range(max_steps):
-        if step % SWEEP == 0:  # levels that all Solvers have finished are left out
-            left = (~over).any(0).nonzero().squeeze(1)
-            if not len(left):
-                return
-            place, over, state = place[left], over[:, left], state[:, left]
-            env = ViewMazeEnv(levels[:, place], max_steps=max_steps)
-        state = agent(state)
-        if noise is None:
-            action = state[agent.logits_key].argmax(-1)
-        else:
-            given = noise[step, place].expand(state.batch_size)
-            action = draw(agent.distribution(state), given)
-        state = env.step(state.set(agent.action_key, action))["next"]
-        yield Played(place, state, ~over)
-        over = over | state["done"].squeeze(-1)
+    went, steps = walks(agent, levels, max_steps)
+    seen = torch.zeros(*went.shape[:2], *levels.walls.shape[-2:], device=went.device)
+    for step, cells in enumerate(went[..., 1:, :2].unbind(2)):
+        seen += cell_plane(cells, seen.shape[-2:]) * (step < steps)[..., None, None]
+    return seen / steps[..., None, None].clamp(min=1)

@@ -75,7 +75,7 @@ def directed(level: Level, direction: Tensor) -> ViewLevel:
 
 
 def validate_view_levels(level: ViewLevel) -> None:
-    """Checks levels that were made by hand.
+    """Checks hand-designed levels.
 
     Raises:
         ValueError: As :func:`~proposer_rl.tasks.mazes.levels.validate_levels`, or if there is no

@@ -1,4 +1,4 @@
-"""The settings of the field's maze."""
+"""The settings of the partially observable maze."""
 
 from __future__ import annotations
 

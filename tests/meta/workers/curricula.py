@@ -2,47 +2,25 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
-from proposer_rl.cli.build import make_in_place, make_task
+from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Parts, Workers, proposer
 from proposer_rl.streams import Streams
-from proposer_rl.task import Place, Task
+from proposer_rl.task import ComputeContext, Task
 from tests.tiny import composed
 
 COPIES = 3
 OVERRIDES = ["+method=perf_gain", "+scale=smoke", f"proposer.rollouts={COPIES}"]
 # Three actions for each copy: the Proposer's forward pass is over all copies, wherever it is made.
 OVERRIDES += ["proposer.advance=best", "proposer.action_repeat=1", "compute.threads=1"]
-
-
-class Hangs(BaseException):
-    """Not an Exception: nothing may take it for the loss of a worker."""
-
-
-@contextmanager
-def within(seconds: int) -> Iterator[None]:
-    """Fail instead of waiting for ever."""
-
-    def give_up(*_: object) -> None:
-        raise Hangs(f"nothing came of it for {seconds} seconds")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def config(*overrides: str) -> RunConfig:
@@ -63,7 +41,7 @@ def make(
     maker, solver = task_maker(settings.task), settings.solver
 
     def make_in_worker(device: str) -> Task:
-        return make_in_place(maker, solver, Place(torch.device(device)))
+        return maker(solver=solver, context=ComputeContext(torch.device(device)))
 
     task = make_task(settings)
     found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)

@@ -16,9 +16,8 @@ from proposer_rl.meta.rewards import Reward, TrainingStep, performance_gain
 from proposer_rl.meta.workers import WorkersError, shares
 from proposer_rl.meta.workers import copies as copies_module
 from proposer_rl.streams import Streams
-from tests.meta.workers.curricula import COPIES, cycles, make, within, workers
+from tests.meta.workers.curricula import COPIES, cycles, make, workers
 
-SECONDS = 120
 LENGTH = 3  # updates of an episode at smoke scale
 
 
@@ -70,7 +69,7 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
     try:
         ours, threads = getsignal(SIGTERM), torch.get_num_threads()
         # Three copies over two workers; one is killed in the middle of the first cycle.
-        with within(SECONDS), pytest.warns(RuntimeWarning, match="a worker was lost") as warned:
+        with pytest.warns(RuntimeWarning, match="a worker was lost") as warned:
             came = cycles(task, curriculum, between=kill_one_between_the_cycles)
         lost = sum("a worker was lost" in str(w.message) for w in warned)
         assert lost == (2 if engine == "multiprocess" else 1)
@@ -85,8 +84,7 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
             diverges(task, curriculum)
     finally:
         signal(SIGTERM, handler)
-        with within(SECONDS):
-            curriculum.close()
+        curriculum.close()
 
 
 def diverges(task: Any, curriculum: Any) -> None:
@@ -95,7 +93,7 @@ def diverges(task: Any, curriculum: Any) -> None:
     broken = solver.snapshot()
     next(iter(broken.values()))["value"].fill_(torch.nan)
     solver.restore(broken)
-    with within(SECONDS), pytest.raises(DivergedError, match="update 0 of the episode of the So"):
+    with pytest.raises(DivergedError, match="update 0 of the episode of the So"):
         curriculum.improve(solver, 0, [Streams(0, "cycle", 0)])
 
 

@@ -14,10 +14,11 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
-from proposer_rl.tasks.gymnasium.levels import ParameterSpace, space_bins
+from proposer_rl.tasks.gymnasium.levels import space_bins
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.gymnasium.settings import SuccessSettings
 from proposer_rl.tasks.gymnasium.success import Steps, success_rule
+from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 
 K, P, T = 2, 3, 20
@@ -128,8 +129,8 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
     [
         ({"kind": "return"}, "success.least: missing"),
         ({"kind": "info"}, "success.key: missing"),
-        ({"kind": "survived", "least": 1.0}, "success.least: is of no use"),
-        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: is of no use"),
+        ({"kind": "survived", "least": 1.0}, "success.least: has no effect"),
+        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:

@@ -78,25 +78,3 @@ def test_drawn_actions_give_the_same_distribution() -> None:
     assert abs(float(found["return"] - totals.mean())) < 4 * error
     assert 0.1 < float(successes.mean()) < 0.9
     assert abs(float(found["success"] - successes.mean())) < 4 * (0.5 / episodes) ** 0.5
-
-
-def test_nobody_is_changed_by_company() -> None:
-    """Neither by other Solvers, nor by levels that are played at once."""
-    agent, levels = solvers(), TASK.space.sample(150, Streams(1).generator())
-    both = TASK.performance(agent, levels, Streams(2).generator())
-    alone = solvers(copies=1)
-    for name, parameter in alone.named_parameters():
-        parameter.data.copy_(dict(agent.named_parameters())[name][:1])
-    assert (TASK.performance(alone, levels, Streams(2).generator()) == both[:1]).all()
-    again = TASK.performance(agent, levels, Streams(2).generator())
-    assert (again == both).all()
-    other = TASK.performance(agent, levels, Streams(3).generator())
-    assert not torch.equal(other["return"], both["return"])
-
-
-def test_each_solver_may_have_levels_of_its_own() -> None:
-    agent, levels = solvers(), TASK.space.sample(2 * E, Streams(1).generator())
-    own = TASK.performance(agent, levels.reshape(K, E), Streams(2).generator())
-    first = TASK.performance(agent, levels[:E], Streams(2).generator())
-    second = TASK.performance(agent, levels[E:], Streams(2).generator())
-    assert (own[0] == first[0]).all() and (own[1] == second[1]).all()

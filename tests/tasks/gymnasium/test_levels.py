@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.levels import Bins, ParameterSpace, space_bins, target_bins
+from proposer_rl.tasks.gymnasium.levels import space_bins, target_bins
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.parameters import Bins, ParameterSpace
 from tests.tasks.gymnasium.toys import PARAMETERS
 
 BINS = {name: space_bins(settings) for name, settings in PARAMETERS.items()}

@@ -47,7 +47,7 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ({"parameters": {}}, "parameters: at least one"),
         (
             {"parameters": {"seed": PARAMETERS["width"]}},
-            "parameters.seed: is a column of what is told of training",
+            "parameters.seed: is a column of training.csv",
         ),
         (
             {"parameters": {"width": ParameterSettings(values=[2.0, 1.0], target=1.0)}},
@@ -81,11 +81,11 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ),
         (
             {"parameters": {"updates": PARAMETERS["width"]}},
-            "parameters.updates: is a column of what is told of training",
+            "parameters.updates: is a column of training.csv",
         ),
         (
             {"parameters": {"entropy": PARAMETERS["width"]}},
-            "parameters.entropy: is a column of what is told of training",
+            "parameters.entropy: is a column of training.csv",
         ),
         (
             {"wrappers": ["tests.tasks.gymnasium.test_task.with_whole_actions"]},
@@ -156,7 +156,8 @@ def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) 
 def test_evaluations_take_no_process_for_each_level() -> None:
     task = walk_task(vectorization="async")
     levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
-    kinds = [type(task._env(levels, once=once)._vector) for once in (True, False)]
+    made = (task.evaluation_environment(levels), task.environment(levels))
+    kinds = [type(env._vector) for env in made]
     assert kinds == [gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv]
 
 
@@ -181,7 +182,7 @@ def test_statistics_and_returns_are_those_of_the_environment() -> None:
     levels = task.space.sample(4, Streams(1).generator()).unsqueeze(0)
     learner.env.set_levels(levels)
     rollout = learner.collect([Streams(2).generator()])
-    told = task.statistics(levels, rollout)
+    told = task.training_metrics(levels, rollout)
     first = [row.tolist().index(True) + 1 for row in rollout["next", "done"][0].squeeze(-1)]
     rewards = rollout["next", "reward"][0].squeeze(-1) / 0.5
     returns = [float(row[:end].sum()) for row, end in zip(rewards, first, strict=True)]

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from proposer_rl.settings import PPOSettings, SolverSettings
-from proposer_rl.task import Place
+from proposer_rl.task import ComputeContext
 from proposer_rl.tasks.gymnasium.settings import (
     EvaluationSettings,
     NetworkSettings,
@@ -93,6 +93,6 @@ def walk_task(**changed: Any) -> GymnasiumTask:
         "vectorization": "sync",
         "extra": None,
         "solver": SolverSettings(batch_size=4, ppo=ppo),
-        "place": Place(),
+        "context": ComputeContext(),
     }
     return GymnasiumTask(**{**parts, **changed})

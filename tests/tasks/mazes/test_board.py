@@ -10,12 +10,11 @@ import pytest
 import torch
 
 from proposer_rl.models import ActorCritic, cell_maps
+from proposer_rl.play.board import PlayableTask
 from proposer_rl.streams import Streams
-from proposer_rl.task import PlayableTask
 from proposer_rl.tasks.mazes import Level, MazeEnv, planes
 from proposer_rl.tasks.mazes.board import shortest_path
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
-from proposer_rl.tasks.mazes.level_scores import score_levels
 from proposer_rl.tasks.mazes.settings import MazeSettings
 from proposer_rl.tasks.mazes.task import MazeTask
 from tests.tasks.mazes.oracles import moved, path_length, random_levels
@@ -61,7 +60,7 @@ def test_what_is_told_is_what_its_parts_tell(solver: int, observe_agent: bool) -
     agent, level = solvers(task), task.board.read(DRAWN)
     told = json.loads(json.dumps(task.board.examine(agent, solver, level, None)))
     assert told["max_steps"] == 16  # two for each of the eight moves
-    score = score_levels(agent, {"drawn": level}, lambda _: 16, rules.step_penalty)[solver]
+    score = task.results_of(agent, {"drawn": level}, lambda _: 16)[solver]
     for name in ("success", "return"):
         assert told["results"][name] == pytest.approx(score.results[name], abs=1e-5)
     assert 0.005 < told["results"]["success"] < 0.995
@@ -102,7 +101,7 @@ def test_the_path_is_the_greedy_policys(solver: int) -> None:
             walked.append(list(cell))
         assert path == walked and told["goal"] == goal
         outcomes.add(path[-1] == goal)
-        scored = score_levels(agent, {"level": level}, lambda _: 10)[solver]
+        scored = task.results_of(agent, {"level": level}, lambda _: 10)[solver]
         assert scored.results["greedy_success"] == (path[-1] == goal)
     assert outcomes == {True, False}
 
@@ -134,7 +133,7 @@ def test_an_endless_solver_is_refused() -> None:
     task = tiny_task()
     agent = solvers(task)
     next(agent.parameters()).data.fill_(torch.nan)
-    with pytest.raises(ValueError, match="numbers without an end"):
+    with pytest.raises(ValueError, match="NaN or infinity"):
         task.board.examine(agent, 0, task.board.read(DRAWN), None)
 
 

@@ -144,5 +144,5 @@ def test_wrong_arguments_are_refused() -> None:
     levels = random_levels(4, 3, 3, 0.2, 0).reshape(2, 2)
     with pytest.raises(ValueError, match="count must be at least 0, got -1"):
         edit_levels(levels, -1, seeded(0, 1))
-    with pytest.raises(ValueError, match="2 generators are needed for levels of 2 copies, got 3"):
+    with pytest.raises(ValueError, match="2 generators are needed for levels of 2 replicas, got 3"):
         edit_levels(levels, 1, seeded(0, 1, 2))

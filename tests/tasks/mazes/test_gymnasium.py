@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from proposer_rl.tasks.mazes import Level, MazeEnv
-from proposer_rl.tasks.mazes.as_gymnasium.vector import AHEAD
+from proposer_rl.tasks.vector_env import AHEAD
 from tests.tasks.mazes.oracles import path_length, play
 
 ID = "proposer_rl/Maze-v0"

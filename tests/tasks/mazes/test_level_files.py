@@ -186,7 +186,9 @@ def test_levels_that_could_not_be_read_again_are_not_written(tmp_path: Path) -> 
 
 def test_the_sets_that_come_along() -> None:
     assert shipped_sets() == ["shapes", "small"]
-    with pytest.raises(ValueError, match=r"nothing: there is no such set .*\['shapes', 'small'\]"):
+    with pytest.raises(
+        ValueError, match=r"nothing: no such set of levels; available: \['shapes', 'small'\]"
+    ):
         shipped_levels("nothing")
 
 

@@ -14,7 +14,7 @@ from proposer_rl.methods import Parts, proposer
 from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import EditableTask, OptimalTask, Place
+from proposer_rl.task import ComputeContext, EditableTask, OptimalTask
 from proposer_rl.tasks.mazes import Level, LevelSpec, shortest_path_length
 from proposer_rl.tasks.mazes.settings import (
     DistributionSettings,
@@ -32,7 +32,7 @@ SMALL = ProposerSettings(
 )
 
 
-def test_performance_and_measurements_are_those_of_the_exact_evaluator() -> None:
+def test_performance_and_metrics_are_those_of_the_exact_evaluator() -> None:
     agent = learners(2).agent
     levels = TASK.target.sample(5, Streams(0).generator())
     assert (TASK.performance(agent, levels, torch.Generator()) == evaluate(agent, levels)).all()
@@ -42,17 +42,7 @@ def test_performance_and_measurements_are_those_of_the_exact_evaluator() -> None
         torch.testing.assert_close(measured[f"id_{kind}"], expected[kind].mean(1))
     # A tenth of eight levels is less than one: the worst.
     torch.testing.assert_close(measured["id_success_worst10"], expected["success"].amin(1))
-    assert set(measured.keys()) == set(TASK.measurements)
-
-
-def test_evaluation_levels_are_the_same_in_every_run_and_follow_their_seed() -> None:
-    same, other = (
-        tiny_task(evaluation=EvaluationSettings(distributions=["id"], levels=8, seed=seed))
-        for seed in (0, 1)
-    )
-    levels = TASK.evaluation_levels("id")
-    assert (levels == same.evaluation_levels("id")).all()
-    assert not (levels == other.evaluation_levels("id")).all()
+    assert set(measured.keys()) == set(TASK.metrics)
 
 
 def test_another_network_takes_the_unets_place() -> None:
@@ -67,7 +57,9 @@ def test_another_network_takes_the_unets_place() -> None:
             return maps.split([4, 1], -3)
 
     unused = NetworkSettings(channels=[64, 128, 256, 512])
-    own = tiny_task(make_network=Convolution, network=unused, place=Place(precision="auto"))
+    own = tiny_task(
+        make_network=Convolution, network=unused, context=ComputeContext(precision="auto")
+    )
     assert own.precision == "fp32" and named(own, "shapes")
     solvers = own.learner([Streams(0), Streams(1)])
     assert sum(p.numel() for p in solvers.agent.parameters()) == 2 * (3 * 9 + 1) * 5
@@ -113,27 +105,27 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
             state = env.step(state)["next"]
 
 
-def test_statistics_and_records_of_what_was_trained_on() -> None:
+def test_metrics_and_records_of_what_was_trained_on() -> None:
     ppo = learners(2)
     levels = TASK.space.generate(
         torch.tensor([[0, 1, 2, 3]] * 2), [Streams(k).generator() for k in (0, 1)]
     )
     ppo.env.set_levels(levels)
     rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
-    statistics = TASK.statistics(levels, rollout)
-    torch.testing.assert_close(statistics["obstacle_fraction"], torch.full((2,), 0.1))
-    torch.testing.assert_close(statistics["path_length"], torch.full((2,), 3.0))
-    torch.testing.assert_close(statistics["path_length_sd"], torch.ones(2))
+    metrics = TASK.training_metrics(levels, rollout)
+    torch.testing.assert_close(metrics["obstacle_fraction"], torch.full((2,), 0.1))
+    torch.testing.assert_close(metrics["path_length"], torch.full((2,), 3.0))
+    torch.testing.assert_close(metrics["path_length_sd"], torch.ones(2))
     for k in range(2):
         solved = []
         for record, level in zip(TASK.record(levels[k], rollout[k]), levels[k], strict=True):
             first, *_ = level.to_text().splitlines()
             assert record["text"][0].replace(" ", "").replace("•", ".") == first
             solved.append(record["path"][-1] == level.goal.tolist())
-        assert statistics["train_success"][k] == sum(solved) / 4
+        assert metrics["train_success"][k] == sum(solved) / 4
 
 
-def test_statistics_of_levels_that_have_no_path_or_too_long_a_one() -> None:
+def test_metrics_of_levels_that_have_no_path_or_too_long_a_one() -> None:
     rows = ["#" * 5] * 4
     near, far, walled = (
         Level.from_text("\n".join(text))
@@ -146,11 +138,11 @@ def test_statistics_of_levels_that_have_no_path_or_too_long_a_one() -> None:
     levels = torch.stack([torch.stack([near, far, walled, near]), torch.stack([walled] * 4)])
     ppo = learners(2)
     ppo.env.set_levels(levels)
-    statistics = TASK.statistics(levels, ppo.collect())
-    assert statistics["path_length"].tolist() == pytest.approx([14 / 3, 0])
+    metrics = TASK.training_metrics(levels, ppo.collect())
+    assert metrics["path_length"].tolist() == pytest.approx([14 / 3, 0])
     variance = (2 * (1 - 14 / 3) ** 2 + (12 - 14 / 3) ** 2) / 3
-    assert statistics["path_length_sd"].tolist() == pytest.approx([variance**0.5, 0])
-    assert statistics["solvable"].tolist() == [0.5, 0.0]
+    assert metrics["path_length_sd"].tolist() == pytest.approx([variance**0.5, 0])
+    assert metrics["solvable"].tolist() == [0.5, 0.0]
 
 
 def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
@@ -161,10 +153,10 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
     assert not (edited == levels).all()
     ppo.env.set_levels(edited)
     rollout = ppo.update([Streams(k).generator("actions") for k in (0, 1)]).rollout
-    statistics = TASK.statistics(edited, rollout)
-    assert all(bool(value.isfinite().all()) for value in statistics.values())
-    assert (statistics["train_success"] <= statistics["solvable"]).all()
-    assert statistics["solvable"].min() < 1
+    metrics = TASK.training_metrics(edited, rollout)
+    assert all(bool(value.isfinite().all()) for value in metrics.values())
+    assert (metrics["train_success"] <= metrics["solvable"]).all()
+    assert metrics["solvable"].min() < 1
     for record, level in zip(TASK.record(edited[0], rollout[0]), edited[0], strict=True):
         drawn = [row.replace(" ", "").replace("•", ".") for row in record["text"]]
         assert (Level.from_text("\n".join(drawn)) == level).all()
@@ -172,7 +164,7 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
         reached = TASK.performance(ppo.agent, edited, torch.Generator())["return"]
     optimum = TASK.optimal_return(edited)
     assert optimum.shape == (2, 4) and (reached <= optimum + 1e-5).all()
-    unsolvable = statistics["solvable"] < 1
+    unsolvable = metrics["solvable"] < 1
     assert torch.equal((optimum < 0).any(1), unsolvable)  # eight steps of 0.01, for nothing
 
 
@@ -224,7 +216,7 @@ def test_settings_that_do_not_go_together_are_refused_naming_the_key(parts, mess
 
 def named(task: MazeTask, name: str, max_steps: int | None = None) -> dict[str, float]:
     """The step limits of a set's levels."""
-    scores = task.scores(learners(1).agent, name, max_steps)
+    scores = task.level_results(learners(1).agent, name, max_steps)
     return {score.level: score.about["max_steps"] for score in scores}
 
 
@@ -235,7 +227,7 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
     assert set(named(TASK, "ID").values()) == {8}
     agent = learners(1).agent
     usual, *others = (
-        [(score.level, score.results) for score in TASK.scores(agent, name, None)]
+        [(score.level, score.results) for score in TASK.level_results(agent, name, None)]
         for name in ("id@6x6", "ID@6x6", "id@06x6")
     )
     assert usual[0][0] == "id@6x6_000" and others == [usual, usual]
@@ -246,14 +238,6 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
         match="--levels mazes: must be one of: shapes, small, a file ",
     ):
         named(TASK, "mazes")
-
-
-def test_levels_of_copies_are_those_of_each_alone() -> None:
-    choices = torch.randint(TASK.space.size, (3, 6))
-    together = TASK.space.generate(choices, [Streams(k).generator() for k in range(3)])
-    for k in range(3):
-        alone = TASK.space.generate(choices[k : k + 1], [Streams(k).generator()])
-        assert (together[k] == alone[0]).all()
 
 
 def test_the_bins_are_the_product_of_the_axes() -> None:

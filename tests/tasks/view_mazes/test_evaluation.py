@@ -14,18 +14,24 @@ from proposer_rl.models import ActorCritic, categorical
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.view_mazes.distance import optimal_return
 from proposer_rl.tasks.view_mazes.env import FORWARD, ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import play, visits
-from proposer_rl.tasks.view_mazes.level_scores import score_view_levels
+from proposer_rl.tasks.view_mazes.evaluation import played_performance, visits
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.settings import EvaluationSettings
+from proposer_rl.tasks.view_mazes.task import ViewMazeTask
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.tiny import tiny_view_task
 
 K, E = 2, 10
-CPU = torch.device("cpu")
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def task(episodes: int) -> ViewMazeTask:
+    """A task that plays so many episodes on each named level."""
+    evaluation = EvaluationSettings(distributions=["id"], levels=4, named_episodes=episodes)
+    return tiny_view_task(evaluation=evaluation)
 
 
 def solvers() -> ActorCritic:
@@ -58,15 +64,21 @@ def scripted(act: Any) -> ActorCritic:
     return cast(ActorCritic, Scripted(act))
 
 
+def performance(agent: ActorCritic, levels: ViewLevel, *arguments: Any) -> TensorDict:
+    """Of levels [E], or [K, E]."""
+    each = levels.expand(agent.copies, levels.batch_size[-1])
+    return played_performance(agent, each, *arguments)
+
+
 def always(action: int) -> ActorCritic:
     return scripted(lambda state: torch.full(state.batch_size, action))
 
 
 def test_playing_all_at_once_is_playing_one_by_one() -> None:
-    """Though finished levels are left out; 30 steps are more than one look at who still plays."""
+    """Though finished levels are left out; 30 steps are more than one check of who still plays."""
     agent, levels, limit, episodes = solvers(), random_levels(E, side=5), 30, 3
     with torch.no_grad():
-        found = play(agent, levels, limit, episodes, generator())
+        found = performance(agent, levels, limit, episodes, generator())
     noise = torch.rand(limit, episodes, E, generator=generator())
     policy = RolloutPolicy(agent)
     for i in range(E):
@@ -84,29 +96,19 @@ def test_playing_all_at_once_is_playing_one_by_one() -> None:
     assert 0 < float(found["success"].mean()) < 1
 
 
-def test_a_solver_gets_the_same_in_any_company() -> None:
-    agent, levels = solvers(), random_levels(E, side=5)
-    shared = play(agent, levels, 12, 2, generator())
-    own = play(agent, levels.expand(K, E), 12, 2, generator())
-    assert bool((shared == own).all())
-    few = torch.stack([levels, random_levels(E, side=5, seed=5)])
-    other = play(agent, few, 12, 2, generator())  # type: ignore[arg-type]
-    assert bool((other[0] == shared[0]).all())
-
-
 def test_scripted_solvers_get_what_they_must() -> None:
     levels = ViewLevel.from_text([">..G", "<..G", ">#.G"])
-    straight = play(always(FORWARD), levels, 10, 1, generator())
+    straight = performance(always(FORWARD), levels, 10, 1, generator())
     assert straight["success"].tolist() == [[1.0, 0.0, 0.0]]
     torch.testing.assert_close(straight["return"][0], torch.tensor([0.73, 0.0, 0.0]))
-    assert not play(always(0), levels, 10, 1, generator())["success"].any()
+    assert not performance(always(0), levels, 10, 1, generator())["success"].any()
 
 
 def test_memory_reaches_the_next_step() -> None:
     """A Solver that turns twice and then moves, by the number of steps that it remembers."""
     counting = scripted(lambda state: torch.where(state["count"] < 2, 1, FORWARD))
     levels = ViewLevel.from_text(["G..<", "G..>"])
-    found = play(counting, levels, 10, 2, generator())
+    found = performance(counting, levels, 10, 2, generator())
     assert found["success"].tolist() == [[0.0, 1.0]]
     torch.testing.assert_close(found["return"][0, 1], optimal_return(levels, 10)[1])
 
@@ -123,10 +125,12 @@ def test_scores_count_episodes_and_bound_them() -> None:
     agent = solvers()
     levels = {f"level {i}": level for i, level in enumerate(random_levels(3, side=5))}
     levels["wide"] = ViewLevel.from_text(">....G")
-    scores = score_view_levels(agent, levels, lambda n: 5 + n, 8, Streams(0), CPU)
+    scores = task(8).results_of(agent, levels, lambda n: 5 + n)
     assert [(s.level, s.solver) for s in scores] == [(n, k) for n in levels for k in range(K)]
     # The wide one, of another size than the others, is played alone.
-    alone = play(agent, levels["wide"].unsqueeze(0), 10, 8, Streams(0).generator("wide"))
+    alone = performance(
+        agent, levels["wide"].unsqueeze(0), 10, 8, Streams(0, "scores").generator("wide")
+    )
     for score, success in zip(scores[-K:], alone["success"][:, 0].tolist(), strict=True):
         assert score.results["success"] == success
     for score in scores:
@@ -137,13 +141,12 @@ def test_scores_count_episodes_and_bound_them() -> None:
         assert score.about["max_steps"] == 5 + score.about["fewest_actions"]
         assert score.picture().ndim == 3
     last: Tensor = torch.tensor([list(s.about.values()) for s in scores[-K:]])
-    assert last.tolist() == [[1, 6, 10, 5]] * K
+    assert last.tolist() == [[1, 6, 5, 10]] * K
 
 
 def test_a_certain_success_is_shown_as_such() -> None:
-    (score,) = score_view_levels(
-        always(FORWARD), {"hall": ViewLevel.from_text(">.G")}, lambda n: 10, 100, Streams(0), CPU
-    )
+    hall = {"hall": ViewLevel.from_text(">.G")}
+    (score,) = task(100).results_of(always(FORWARD), hall, lambda n: 10)
     assert score.results["success"] == 1 and score.results["success_high"] == 1
     assert score.results["success_low"] == pytest.approx(0.963, abs=5e-4)
     assert score.note == "100 of 100 episodes, fewest actions 2"

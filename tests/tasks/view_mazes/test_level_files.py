@@ -12,7 +12,7 @@ import pytest
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 
 from proposer_rl.tasks.mazes.level_files import shipped_levels
-from proposer_rl.tasks.mazes.records import level_records
+from proposer_rl.tasks.mazes.rendering import level_records
 from proposer_rl.tasks.view_mazes.level_files import read_view_levels
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from research.benchmarks.minigrid_env import MiniGridMaze

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from proposer_rl.cli.instruments import evaluate
+from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.train import main as train
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes.edits import edit_levels
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
 from proposer_rl.tasks.view_mazes.levels import ViewLevel, validate_view_levels
 from tests.commands import call
@@ -35,19 +36,21 @@ def test_the_fields_numbers_are_the_default() -> None:
     assert config.curriculum["score"] == "max_mc" and config.curriculum["capacity"] == 4000
 
 
-def test_measurements_repeat_and_are_said_to_be_played() -> None:
+def test_metrics_repeat_and_are_said_to_be_played() -> None:
     task = tiny_view_task()
     agent = task.learner([Streams(0)]).agent
     assert bool((task.measure(agent) == task.measure(agent)).all())
     assert not task.exact_performance and task.facts["exact"] is False
 
 
-def test_edits_keep_levels_valid_and_their_directions() -> None:
+def test_edits_keep_levels_valid_their_class_and_their_directions() -> None:
     task = tiny_view_task()
     levels = task.space.sample(12, Streams(0).generator()).reshape(2, 6)
-    draws = [Streams(k).generator() for k in range(2)]
-    children = task.edit(levels, 4, draws)  # type: ignore[arg-type]
+    children = edit_levels(levels, 4, [Streams(k).generator() for k in range(2)])
     validate_view_levels(children)
+    assert type(children) is ViewLevel
+    again = task.edit(levels, 4, [Streams(k).generator() for k in range(2)])
+    assert bool((again == children).all())
     assert torch.equal(children.direction, levels.direction)
     assert not (children.walls == levels.walls).all()
 
@@ -77,9 +80,9 @@ def test_statistics_count_what_can_be_solved_in_time() -> None:
     task = tiny_view_task()  # 8 steps
     levels = ViewLevel.from_text([">...G", "<.#.G", "<...G", ">#..G"])
     env = ViewMazeEnv(levels.unsqueeze(0), max_steps=8)
-    told = task.statistics(levels.unsqueeze(0), env.rollout(8, break_when_any_done=False))
-    assert float(told["solvable"]) == 0.5
-    assert float(told["obstacle_fraction"]) == pytest.approx(0.1)
+    metrics = task.training_metrics(levels.unsqueeze(0), env.rollout(8, break_when_any_done=False))
+    assert float(metrics["solvable"]) == 0.5
+    assert float(metrics["obstacle_fraction"]) == pytest.approx(0.1)
 
 
 def test_a_run_is_trained_resumed_and_evaluated(

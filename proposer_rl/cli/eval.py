@@ -1,0 +1,84 @@
+"""``bin/eval`` and ``proposer-eval``: help and refusals, before what takes seconds to import."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from proposer_rl.cli.arguments import number
+from proposer_rl.cli.errors import command
+
+MOST_STEPS = 10**5
+SUFFIXES = {"output": (".json", ".csv"), "pictures": (".png",)}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    command(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> None:
+    from proposer_rl.cli.config import ConfigError
+
+    for option, suffixes in SUFFIXES.items():
+        file: Path | None = getattr(options, option)
+        if file is not None and file.suffix not in suffixes:
+            raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
+        if file is not None and not file.parent.is_dir():
+            raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
+    from proposer_rl.cli.evaluate import run
+
+    try:
+        run(options)
+    except ValueError as error:
+        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bin/eval",
+        description="Evaluate a trained Solver on named levels, one by one: as exactly as its task "
+        "can, on levels of any size where it has files of them.",
+        epilog="docs/levels.md describes such files and the sets that come along.",
+    )
+    parser.add_argument(
+        "checkpoint",
+        nargs="+",
+        type=Path,
+        help="a run's folder, or one of its checkpoints; several folders of runs, or one with runs "
+        "in it, for a table of methods, which takes no checkpoints",
+    )
+    parser.add_argument(
+        "--levels",
+        metavar="FILE|NAME",
+        nargs="+",
+        default=[],
+        help="a distribution of the run such as id or ood; where the task has files of levels also "
+        "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
+        "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
+        "on another one; several for a table of methods, of runs' folders",
+    )
+    parser.add_argument(
+        "--max-steps",
+        type=number(int, 1, MOST_STEPS),
+        metavar="N",
+        help="step limit of every level, where the task lets it be chosen (the run's, or on levels "
+        "that are none of a distribution 2 for each move of the shortest path if this is more)",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        help="a file for the rows that ends in .json or .csv; of several runs their means, and "
+        "those that are in it are not computed again",
+    )
+    parser.add_argument(
+        "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""What Solvers reach on levels, by playing whole episodes there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from proposer_rl.models import ActorCritic, draw
+
+SEEDS = 2**62
+SWEEP = 16  # steps between two checks which levels all Solvers have finished
+
+
+class Step(NamedTuple):
+    """A step on those levels on which some Solver may still be playing.
+
+    Attributes:
+        place: of these m levels among all, int64 [m].
+        after: the state after the step, with the reward, [K, m].
+        counts: whether the step belongs to the Solver's first episode there, bool [K, m].
+    """
+
+    place: Tensor
+    after: TensorDictBase
+    counts: Tensor
+
+
+@torch.no_grad()
+def play(
+    agent: ActorCritic,
+    env: EnvBase,
+    max_steps: int,
+    noise: Tensor | None = None,
+    remake: Callable[[Tensor], EnvBase] | None = None,
+) -> Iterator[Step]:
+    """Play one episode of each of K Solvers on each of its levels, all at once.
+
+    Args:
+        agent: K Solvers, with memory or without.
+        env: of batch [K, N].
+        max_steps: of an episode.
+        noise: of the actions, uniform numbers [T, N, ...], one for each element of an action, the
+            same for every Solver; None for the most probable actions.
+        remake: makes an environment [K, m] of some of the levels, int64 [m]. With it levels that
+            all Solvers have finished are left out now and then; without it they are reset, and
+            begin again without being counted.
+    """
+    device = env.device or torch.device("cpu")
+    place = torch.arange(env.batch_size[1], device=device)
+    over = torch.zeros(env.batch_size, dtype=torch.bool, device=device)
+    state = env.reset()
+    state.update(agent.no_memory(state))
+    for step in range(max_steps):
+        if step % SWEEP == 0 and step and remake is not None:
+            left = (~over).any(0).nonzero().squeeze(1)
+            place, over, state = place[left], over[:, left], state[:, left]
+            env = remake(place) if len(left) else env
+        if (remake is None or step % SWEEP == 0) and bool(over.all()):
+            return
+        distribution = agent.distribution(agent(state))
+        if noise is None:
+            action = distribution.mode
+        else:
+            given = noise[step, place]
+            action = draw(distribution, given.expand(len(over), *given.shape))
+        after = env.step(state.set(agent.action_key, action))["next"]
+        yield Step(place, after, ~over)
+        over = over | after["done"].squeeze(-1)
+        state = after.exclude("reward")
+        if remake is None:
+            state = env.maybe_reset(state)
+
+
+def mean_performance(
+    agent: ActorCritic,
+    make_env: Callable[[Any], EnvBase],
+    levels: Any,
+    generator: torch.Generator,
+    *,
+    max_steps: int,
+    episodes: int = 1,
+    greedy: bool = False,
+    reward_scale: float = 1.0,
+    at_once: int | None = None,
+    drop_finished: bool = False,
+) -> TensorDict:
+    """Mean return and share of successes of K Solvers over episodes on levels.
+
+    The random numbers are those of the levels, the same for every Solver: they differ by what they
+    do alone, and what one gets does not depend on which others are evaluated with it.
+
+    Args:
+        agent: K Solvers.
+        make_env: makes an environment that plays levels [K, m] from its next reset on.
+        levels: each Solver's own, [K, E].
+        generator: source of randomness, on the CPU.
+        max_steps: of an episode.
+        episodes: played on each level.
+        greedy: whether the most probable actions are taken, or drawn ones.
+        reward_scale: of the environment's rewards, which is taken out of the returns.
+        at_once: episodes of each Solver that are played at once; None for all.
+        drop_finished: whether to make environments of fewer levels as others are finished; for
+            environments that are made in no time, and may be stepped beyond an episode's end.
+
+    Returns:
+        ``return`` and ``success``, float32 [K, E].
+    """
+    count = levels.batch_size[1]
+    if count == 0:  # of which there is no environment
+        empty = torch.zeros(levels.batch_size)
+        return TensorDict({"return": empty, "success": empty.clone()}, levels.batch_size)
+    # Played in parts, the episodes of a level belong together.
+    side = 1 if at_once is None else 2
+    every: Any = torch.stack([levels] * episodes, side).flatten(1, 2)
+    size = at_once or every.batch_size[1]
+    parts = []
+    for some in every.split(size, 1):
+        draws = generator
+        if at_once is not None:  # what is drawn for one part does not depend on the others
+            draws = torch.Generator().manual_seed(
+                int(torch.randint(SEEDS, (), generator=generator))
+            )
+        env = make_env(some)
+        device, shape = env.device, env.full_action_spec[agent.action_key].shape[1:]
+        noise = None if greedy else torch.rand(max_steps, *shape, generator=draws).to(device)
+        returns, success = torch.zeros(2, *some.batch_size, device=device)
+        remake = (lambda place, some=some: make_env(some[:, place])) if drop_finished else None
+        for place, after, counts in play(agent, env, max_steps, noise, remake):
+            ended = after.get("success", after["terminated"]).squeeze(-1)
+            returns[:, place] += after["reward"].squeeze(-1) * counts / reward_scale
+            success[:, place] += (ended & counts).float()
+        parts.append(TensorDict({"return": returns, "success": success}, some.batch_size))
+    shape = (episodes, count) if side == 1 else (count, episodes)
+    return torch.cat(parts, 1).unflatten(1, shape).mean(side)

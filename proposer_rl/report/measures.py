@@ -1,0 +1,314 @@
+"""What can be drawn of a study as curves: every measure once, for the figures and for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from proposer_rl.report.records import (
+    GAINS,
+    LONGEST_TEXT,
+    PLACE,
+    Column,
+    Record,
+    number,
+    numbers,
+    words,
+)
+from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.runs.columns import is_rate
+
+UPDATES = "Solver updates"
+# What training cost beside updates: in words, and of a run at each of its evaluations.
+COSTS: Mapping[str, Callable[[Run], Column]] = {
+    "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
+    "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
+}
+GRID_POINTS = 100
+SHARES = np.geomspace(0.01, 1.0, 61)  # of the levels, the worst
+MOST = 30  # measures of a kind
+OF_REPLICAS: Mapping[str, Callable[[Column], float]] = {"maximum": np.max, "mean": np.mean}
+OWN = {
+    "entropy": "entropy (nats)",
+    "kl_approx": "KL divergence per epoch (nats)",
+    "clip_fraction": "share of clipped ratios",
+    "explained_variance": "explained variance of the value",
+    "reward_sd": "sd of total reward over the replicas",
+    "reward_explained": "share of rewards explained by actions",
+}
+MEASURED, TRAINED = "Measured", "What the Solver trained on"
+RECORDED = "The curricula's own numbers"
+
+Value = Callable[[Record], float]  # of a cycle; NaN where it has none
+
+
+class Series(NamedTuple):
+    """A number of a method's runs along an axis.
+
+    Attributes:
+        x: places on the axis, [n].
+        rows: of each run, [runs, n], NaN where it has none.
+        runs: whose rows these are.
+    """
+
+    x: Column
+    rows: Column
+    runs: Sequence[Run]
+
+
+class Band(NamedTuple):
+    """Mean and interval of the runs at each place, [n]; NaN where there is none.
+
+    Attributes:
+        mean: over the runs that have a value.
+        whole: whether all runs have one, bool [n].
+        low, high: ends of the 95 % interval, where all runs have a value.
+    """
+
+    mean: Column
+    whole: NDArray[np.bool_]
+    low: Column
+    high: Column
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of every method along one axis or several.
+
+    Attributes:
+        kind: what it is listed under.
+        name: as an axis is named.
+        axes: by the axis the method's series; None where it has none.
+        column: of the runs' ``metrics``; empty for what does not stand there.
+        rate: whether it goes from 0 to 1.
+        log: whether the axis is logarithmic.
+    """
+
+    kind: str
+    name: str
+    axes: Mapping[str, Callable[[Group], Series | None]]
+    column: str = ""
+    rate: bool = False
+    log: bool = False
+
+
+def measured(study: Study) -> dict[str, Measure]:
+    """What was measured of the Solver against updates and every cost, by its column."""
+    first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]
+    every = dict.fromkeys([*first, *(name for run in study.runs for name in run.metrics)])
+    known = {name for run in study.runs for name in run.metrics} - set(COST)
+    return {
+        name: Measure(
+            MEASURED,
+            axis_text(name),
+            {
+                UPDATES: partial(over_updates, name=name),
+                **{axis: partial(over_cost, name=name, cost=cost) for axis, cost in COSTS.items()},
+            },
+            name,
+            is_rate(name),
+        )
+        for name in [name for name in every if name in known][:MOST]
+    }
+
+
+def trained(study: Study) -> list[Measure]:
+    """The task's statistics of the batches."""
+    names = dict.fromkeys(name for run in study.runs for name in run.statistics)
+    return [
+        Measure(
+            TRAINED,
+            name.replace("_", " "),
+            {UPDATES: partial(over_updates, name=name, table="training")},
+            rate=is_rate(name),
+        )
+        for name in list(names)[:MOST]
+    ]
+
+
+def gains(study: Study) -> list[Measure]:
+    """Maximum and mean of the gains of a cycle's replicas."""
+    names = dict.fromkeys(filter(None, map(recorded_gain, study.groups)))
+    return [
+        _of_cycles(
+            f"total gain in {GAINS[name]}, {text} of the replicas",
+            partial(of_gains, names=[name], reduce=reduce),
+        )
+        for name in names
+        for text, reduce in OF_REPLICAS.items()
+    ]
+
+
+def own_numbers(study: Study) -> list[Measure]:
+    """Whatever numbers the curricula recorded in cycles that are not drawn elsewhere."""
+    groups = [group for group in study.groups if group.logs]
+    cycles = [cycle for group in groups for run in group.logs for cycle in run.cycles]
+    found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
+    names = {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}
+    texts = {name: text for name, text in OWN.items() if name in names}
+    texts |= {name: name.replace("_", " ") for name in sorted(names - texts.keys())}
+    own = [
+        _of_cycles(text, partial(_value, name=name)) for name, text in list(texts.items())[:MOST]
+    ]
+    if any(map(recorded_gain, groups)):
+        ratio = partial(of_gains, names=GAINS, reduce=_ratio)
+        own.append(_of_cycles("total gain: mean / sd of replicas", ratio))
+    return own
+
+
+def worst(study: Study) -> list[Measure]:
+    """The mean over the worst levels at the end against their share (CVaR)."""
+    levels = study.example.task.levels
+    return [
+        Measure(
+            f"Single {levels} at the end",
+            f"{axis_text(name)} on the worst share",
+            {f"worst share of the {levels}": partial(_worst_series, study=study, name=name)},
+            rate=is_rate(name),
+            log=True,
+        )
+        for name in of_levels(study)
+    ]
+
+
+def axis_text(name: str) -> str:
+    """A measurement as an axis is named."""
+    rate = " rate" if is_rate(name) else ""
+    return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
+
+
+def over_updates(group: Group, name: str, table: str = "metrics") -> Series | None:
+    """A column of the runs' ``metrics`` or ``training`` against updates; None where no run has it.
+
+    Runs that were evaluated at different updates have no value at those of the others.
+    """
+    runs = [run for run in group.runs if name in getattr(run, table)]
+    if not runs:
+        return None
+    columns = [getattr(run, table) for run in runs]
+    return _aligned([(own["updates"], own[name]) for own in columns], runs)
+
+
+def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series | None:
+    """A measurement against a cost; None where no run has it.
+
+    Runs stand at different costs when they are measured, so they are interpolated in between.
+    """
+    runs = [run for run in group.runs if name in run.metrics]
+    if not runs:
+        return None
+    x = np.linspace(0, max(cost(run)[-1] for run in runs), GRID_POINTS)
+    rows = [np.interp(x, cost(r), r.metrics[name], left=np.nan, right=np.nan) for r in runs]
+    return Series(x, np.array(rows), runs)
+
+
+def over_cycles(group: Group, value: Value) -> Series | None:
+    """A number of every cycle against updates, for each of the group's records of cycles."""
+    runs = group.logs
+    if not runs:
+        return None
+    columns = [
+        ([number(cycle["updates"]) for cycle in run.cycles], [value(c) for c in run.cycles])
+        for run in runs
+    ]
+    return _aligned(columns, runs)
+
+
+def _aligned(columns: Sequence[tuple[Iterable[float], Iterable[float]]], runs: list[Run]) -> Series:
+    x = np.unique(np.concatenate([np.asarray(places, float) for places, _ in columns]))
+    rows = np.full((len(runs), len(x)), np.nan)
+    for row, (places, values) in zip(rows, columns, strict=True):
+        row[np.searchsorted(x, np.asarray(places, float))] = values
+    return Series(x, rows, runs)
+
+
+def band(rows: Column) -> Band:
+    """Mean and interval over runs.
+
+    Args:
+        rows: [runs, n], NaN where a run has no value.
+    """
+    mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
+    whole = np.all(~np.isnan(rows), axis=0)
+    low, high = np.full_like(mean, np.nan), np.full_like(mean, np.nan)
+    if len(rows) > 1 and whole.any():
+        _, low[whole], high[whole] = np.array([mean_interval(v) for v in rows.T[whole]]).T
+    return Band(mean, whole, low, high)
+
+
+def worst_means(scores: Column, shares: Column) -> Column:
+    """Mean over the worst share of the levels, the conditional value at risk (CVaR).
+
+    A level counts in part where the share is no whole number of levels (Acerbi & Tasche, Journal of
+    Banking & Finance 26, 2002, definition 3).
+
+    Args:
+        scores: [runs, levels].
+        shares: above 0 and at most 1, [n].
+
+    Returns:
+        Float [runs, n].
+    """
+    levels = scores.shape[1]
+    sums = np.cumsum(np.sort(scores, 1), 1)  # [runs, levels]
+    counts = np.arange(levels + 1)
+    whole = [np.interp(shares * levels, counts, [0.0, *row]) for row in sums]
+    return np.array(whole) / (shares * levels)
+
+
+def of_levels(study: Study) -> list[str]:
+    """The measurements that some run has for every single level."""
+    groups = study.groups
+    return [n for n in study.measurements if any(study.scores(g, n) is not None for g in groups)]
+
+
+def level_means(study: Study, group: Group, name: str) -> Column | None:
+    """What a group reaches on every level, mean over seeds, [levels]; None without records."""
+    scores = study.scores(group, name)
+    return None if scores is None else scores.mean(0)
+
+
+def recorded_gain(group: Group) -> str | None:
+    """Which gain of the replicas a group has on record; None without one."""
+    return next((name for name in GAINS if lists(group, name)), None)
+
+
+def lists(group: Group, name: str) -> list[tuple[float, Column]]:
+    """A list of numbers of every cycle that has it, with the Solver's updates."""
+    cycles = [cycle for run in group.logs for cycle in run.cycles]
+    found = [(number(cycle["updates"]), numbers(cycle.get(name))) for cycle in cycles]
+    return [(updates, values) for updates, values in found if values is not None]
+
+
+def of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], float]) -> float:
+    """A number of a cycle's gains, of the first that it has; NaN where it has none."""
+    found = [values for name in names if (values := numbers(cycle.get(name))) is not None]
+    return float(reduce(found[0])) if found else np.nan
+
+
+def _of_cycles(name: str, value: Value) -> Measure:
+    return Measure(RECORDED, name, {UPDATES: partial(over_cycles, value=value)})
+
+
+def _worst_series(group: Group, study: Study, name: str) -> Series | None:
+    scores = study.scores(group, name)
+    if scores is None:
+        return None
+    return Series(SHARES, worst_means(scores, SHARES), study.tellers(group, name))
+
+
+def _value(cycle: Record, name: str) -> float:
+    return number(cycle.get(name))
+
+
+def _ratio(values: Column) -> float:
+    spread = float(values.std(ddof=1)) if len(values) > 1 else 0.0
+    return float(values.mean()) / spread if spread else np.nan

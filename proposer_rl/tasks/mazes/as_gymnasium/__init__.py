@@ -1,1 +1,0 @@
-"""The maze as Gymnasium environments, one at a time or many at once."""

@@ -1,0 +1,285 @@
+"""What the tasks on mazes share, whatever an agent can do and see there."""
+
+from __future__ import annotations
+
+import re
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.learning import first_episode_success
+from proposer_rl.models import ActorCritic, MapEncoder
+from proposer_rl.play.board import Board
+from proposer_rl.settings import SolverSettings
+from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
+from proposer_rl.tasks.mazes.distance import shortest_path_length
+from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.tasks.mazes.level_files import shipped_levels, shipped_sets
+from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.tasks.mazes.rendering import level_records
+
+SLACK = 2  # of a named level: steps allowed for each one of its shortest way
+_ON_A_GRID = re.compile(r"(.+?)(?:@(\d{1,3})x(\d{1,3}))?")
+
+
+class GridTask(Task):
+    """Mazes that are drawn, edited, read from files, and measured level by level.
+
+    Args:
+        maze: the inner environment's settings: ``height``, ``width``, ``max_steps`` and others.
+        distributions: settings by name.
+        target: the name of the one that the Solver is to master.
+        space: settings of the Proposer's bins.
+        encoder_channels: of the convolutions with which a Proposer reads a probe.
+        evaluation: settings: ``distributions``, ``levels``, ``seed`` and ``episodes``.
+        solver: the Solver's training.
+        context: device, precision and cores.
+
+    Attributes:
+        level: class of the levels.
+        suffixes: of files of levels.
+        probe_planes: of a probe.
+        steps_name: what the steps of a shortest way are called in results.
+        counting: what of an episode's steps a reader must know.
+        board: what ``bin/play`` draws on.
+
+    Raises:
+        ValueError: naming the key, if settings that are each valid do not go together.
+    """
+
+    noun = "mazes"
+    key = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
+    level: ClassVar[type[Level]] = Level
+    suffixes: ClassVar[Sequence[str]]
+    probe_planes: ClassVar[int]
+    steps_name: ClassVar[str]
+    counting: ClassVar[str] = ""
+    board: Board
+
+    def __init__(
+        self,
+        *,
+        maze: Any,
+        distributions: Mapping[str, Any],
+        target: str,
+        space: Any,
+        encoder_channels: Sequence[int],
+        evaluation: Any,
+        solver: SolverSettings,
+        context: ComputeContext,
+    ) -> None:
+        check_names(distributions, target, evaluation.distributions)
+        self.maze = maze
+        self.grid = (maze.height, maze.width)
+        self.device = torch.device(context.device)  # of what is made next
+        self._kinds, self._target = dict(distributions), target
+        self._encoder_channels = encoder_channels
+        rules = asdict(maze)
+        rules.pop("observe_agent", None)
+        super().__init__(
+            distributions={
+                name: named(f"distributions.{name}", self.make_distribution, kind, *self.grid)
+                for name, kind in distributions.items()
+            },
+            target=target,
+            space=named("space", self.make_space, space),
+            solver=solver,
+            context=context,
+            measured_on=evaluation.distributions,
+            levels=evaluation.levels,
+            seed=evaluation.seed,
+            max_steps=maze.max_steps,
+            episodes=evaluation.episodes,
+            measured={
+                "maze": rules,
+                "distributions": {
+                    name: asdict(distributions[name])
+                    for name in (*evaluation.distributions, target)
+                },
+                "target": target,
+                "levels": [evaluation.levels, evaluation.seed]
+                + ([] if self.exact_metrics else [evaluation.episodes]),
+            },
+        )
+        self.default_levels = "shapes"
+
+    def edit(self, levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
+        """Levels [K, n] after random edits; replica k's from generator k."""
+        return edit_levels(levels, count, generators)
+
+    def probe_encoder(self, features: int) -> MapEncoder:
+        """A convolutional network that reads probes."""
+        return MapEncoder(self.probe_planes, self._encoder_channels, features)
+
+    def training_metrics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
+        """What Solvers trained on and how they fared there, each [K] from [K, P].
+
+        - ``obstacle_fraction``: obstacles per cell;
+        - ``path_length``, ``path_length_sd``: mean and standard deviation of the moves on the
+          shortest path, over the levels that have a path; both 0 where none has;
+        - ``solvable``: share of the levels whose goal can be reached within the step limit;
+        - ``train_success``: share of the levels whose goal the first episode reached.
+        """
+        length, steps = shortest_path_length(levels), self.fewest_steps(levels)
+        mean, deviation = _moments(length.float(), length >= 0)
+        solvable = (steps >= 0) & (steps <= self.maze.max_steps)
+        metrics = {
+            "obstacle_fraction": levels.walls.float().mean((-3, -2, -1)),
+            "path_length": mean,
+            "path_length_sd": deviation,
+            "solvable": solvable.float().mean(-1),
+            "train_success": first_episode_success(rollout).float().mean(-1),
+        }
+        return TensorDict(metrics, levels.batch_size[:1])
+
+    def record(self, levels: Level, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
+        """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
+        return list(level_records(levels, rollout))
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Texts about the task, by their labels."""
+        height, width = self.grid
+        kinds = "; ".join(f"{name.upper()} ({self.describe(name)})" for name in self.evaluated_on)
+        return {
+            "Mazes": f"{height}×{width}, at most {self.maze.max_steps} steps{self.counting}",
+            "Measured on": f"{kinds}; {self._levels} fixed levels each"
+            + ("" if self.exact_metrics else f", episodes on each: {self.episodes}"),
+        }
+
+    @abstractmethod
+    def make_distribution(self, settings: Any, height: int, width: int) -> Any:
+        """The levels of a distribution's settings on a grid."""
+
+    @abstractmethod
+    def make_space(self, settings: Any) -> Any:
+        """The Proposer's bins."""
+
+    @abstractmethod
+    def fewest_steps(self, levels: Level) -> Tensor:
+        """Steps of a shortest way to the goal of levels [*B]: int64 [*B], -1 for none."""
+
+    @abstractmethod
+    def describe(self, name: str) -> str:
+        """A distribution's settings in words."""
+
+    @abstractmethod
+    def read_file(self, path: str) -> dict[str, Any]:
+        """The levels of a file, by their names."""
+
+    @abstractmethod
+    def results_on(
+        self,
+        agent: ActorCritic,
+        levels: Any,
+        about: Mapping[str, Mapping[str, int]],
+        max_steps: int,
+    ) -> Iterator[LevelResult]:
+        """What K Solvers reach on levels [n] of one size, given by name what each is like."""
+
+    @abstractmethod
+    def at_once(self, cells: int) -> int:
+        """How many levels of so many cells are evaluated together."""
+
+    def check_level(self, name: str, level: Level) -> None:
+        """Refuse a level that these Solvers cannot see.
+
+        Raises:
+            ValueError: naming the level.
+        """
+
+    def step_limit(self, steps: int, slack: int = SLACK) -> int:
+        """The step limit of a level, given the steps of its shortest way."""
+        return max(self.maze.max_steps, slack * steps)
+
+    def level_results(
+        self, agent: ActorCritic, name: str, max_steps: int | None
+    ) -> list[LevelResult]:
+        """What Solvers reach on a distribution's levels, a file's or those of a shipped set.
+
+        Without a step limit a distribution has that of the task, so that the means are those of its
+        metrics, also on another grid (``id@13x13``); other levels at least twice the steps of a
+        shortest way.
+        """
+        levels, slack = self._named_levels(name)
+        for known, level in levels.items():
+            self.check_level(known, level)
+        return self.results_of(
+            agent, levels, lambda steps: max_steps or self.step_limit(steps, slack)
+        )
+
+    def results_of(
+        self, agent: ActorCritic, levels: Mapping[str, Any], limit_of: Callable[[int], int]
+    ) -> list[LevelResult]:
+        """What K Solvers reach on levels of any size, in the levels' order.
+
+        Those of one size and one step limit are evaluated together.
+
+        Args:
+            agent: K Solvers.
+            levels: of batch shape [], by their names.
+            limit_of: the step limit of a level, given the steps of its shortest way.
+        """
+        about: dict[str, dict[str, int]] = {}
+        batches: dict[tuple[int, ...], list[str]] = {}
+        for known, level in levels.items():
+            steps, (height, width) = int(self.fewest_steps(level)), level.walls.shape
+            limit = limit_of(steps)
+            size = {"height": height, "width": width}
+            about[known] = {**size, self.steps_name: steps, "max_steps": limit}
+            batches.setdefault((limit, height, width), []).append(known)
+        results: list[LevelResult] = []
+        for (limit, height, width), members in batches.items():
+            together = max(self.at_once(height * width), 1)
+            for first in range(0, len(members), together):
+                told = {known: about[known] for known in members[first : first + together]}
+                batch: Any = torch.stack([levels[known] for known in told])
+                results += self.results_on(agent, batch.to(self.device), told, limit)
+        place = {known: number for number, known in enumerate(levels)}
+        return sorted(results, key=lambda result: (place[result.level], result.solver))
+
+    def _named_levels(self, name: str) -> tuple[dict[str, Any], int]:
+        """The levels [] that a user names, and the steps allowed for each of their shortest way.
+
+        Raises:
+            ValueError: if there are no such levels.
+            StorageError: if a file cannot be read.
+        """
+        if Path(name).suffix in self.suffixes:
+            if not Path(name).exists():
+                raise ValueError(f"--levels {name}: there is no such file")
+            return self.read_file(name), SLACK
+        asked = _ON_A_GRID.fullmatch(name)
+        for known, kind in self._kinds.items():
+            if asked is None or known.casefold() != asked[1].casefold():
+                continue
+            levels: Any
+            if asked[2] is None:
+                levels = self.evaluation_levels(known)
+            else:  # the same levels and names however it was spelt
+                size = [int(cells) for cells in asked.group(2, 3)]
+                known = f"{known}@{size[0]}x{size[1]}"
+                grid = named(f"--levels {known}", self.make_distribution, kind, *size)
+                levels = grid.sample(self._levels, self.stream("levels", known))
+            return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
+        if name in shipped_sets():
+            return dict(shipped_levels(name, self.level)), SLACK
+        raise ValueError(
+            f"--levels {name}: must be one of: {', '.join(shipped_sets())}, a file that ends in "
+            f"{' or '.join(self.suffixes)}, or a distribution: {', '.join(self._kinds)}, as it is "
+            f"or on another grid as in {self._target}@13x13"
+        )
+
+
+def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of some of the values [*B, P], 0 of none: float [*B] each."""
+    count = which.sum(-1).clamp_min(1)
+    mean = (values * which).sum(-1) / count
+    square = (values - mean.unsqueeze(-1)).square()
+    return mean, ((square * which).sum(-1) / count).sqrt()

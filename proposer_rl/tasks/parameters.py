@@ -1,0 +1,142 @@
+"""Levels that are values of named parameters: distributions over them, and spaces of bins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+Number = int | float
+
+SEED = "seed"
+LARGEST_SEED = 2**31 - 1
+
+
+class Bins(NamedTuple):
+    """Parts of a parameter's line that are equally likely.
+
+    Attributes:
+        low, high: ends of each part, float64 or int64 [n]; equal where the part is a single value.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    @property
+    def middles(self) -> list[Number]:
+        """The value that stands for each part."""
+        return self.low.lerp(self.high, 0.5).tolist() if self.wide else self.low.tolist()
+
+    @property
+    def wide(self) -> bool:
+        """Whether the parts are more than single values."""
+        return bool((self.high > self.low).any())
+
+    def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
+        """A value of each of the parts int64 [P]: [P]."""
+        low, high = self.low[index], self.high[index]
+        if not self.wide:
+            return low
+        return low.lerp(high, torch.rand(len(index), generator=generator, dtype=low.dtype))
+
+    def shares(self, of: Bins) -> Tensor:
+        """Which of these parts values of other parts lie in, float64 [n].
+
+        What lies beyond the first or the last part, or between single values, counts for the
+        nearest part.
+        """
+        total = torch.zeros(len(self.low), dtype=torch.float64)
+        for low, high in zip(of.low, of.high, strict=True):
+            if high == low:
+                apart = torch.maximum(self.low - low, low - self.high).clamp_min(0)
+                total[apart.argmin()] += 1
+            else:
+                inner = self.high[:-1].clamp(low, high)
+                ends = torch.cat([low.view(1), inner, high.view(1)])
+                total += ends.diff() / (high - low)
+        return total / len(of.low)
+
+
+def points(values: Sequence[Number], key: str = "values") -> Bins:
+    """Bins that are single values; whole numbers, if all of them are.
+
+    Raises:
+        ValueError: naming the key, if they do not rise.
+    """
+    whole = all(isinstance(value, int) for value in values)
+    line = torch.tensor(values, dtype=torch.int64 if whole else torch.float64)
+    if (line.diff() <= 0).any():
+        raise ValueError(f"{key}={list(values)} must rise")
+    return Bins(line, line)
+
+
+def intervals(low: float, high: float, count: int = 1) -> Bins:
+    """Equal parts of a range, within which values are uniform.
+
+    Raises:
+        ValueError: if the range is none.
+    """
+    if not low < high:
+        raise ValueError(f"low={low} must be below high={high}")
+    edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
+    return Bins(edges[:-1], edges[1:])
+
+
+class ParameterSpace:
+    """The levels of all combinations of some parameters' bins; a distribution and a space.
+
+    A level is a tensordict with an entry for each parameter, float64 or int64, and the ``seed`` of
+    its reset, int64: two episodes on it begin alike.
+
+    Args:
+        bins: of each parameter, by name.
+
+    Example:
+        >>> space = ParameterSpace({"gravity": points([5, 10]), "force": intervals(2.0, 18.0, 4)})
+        >>> space.size, list(space.sample(3, torch.Generator()).keys())
+        (8, ['gravity', 'force', 'seed'])
+    """
+
+    def __init__(self, bins: Mapping[str, Bins]) -> None:
+        self.bins = dict(bins)
+        self.axes = {name: part.middles for name, part in self.bins.items()}
+        self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Of each bin, from -1 to 1 along every axis (0 along one of a single bin): [N, D]."""
+        lines = [_scaled(values) for values in self.axes.values()]
+        return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        """Levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""
+        copies = [self._draw(own, g) for own, g in zip(choices, generators, strict=True)]
+        return torch.stack(copies)
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """Levels [count], uniformly from the bins."""
+        return self._draw(torch.randint(self.size, (count,), generator=generator), generator)
+
+    def shares(self, other: ParameterSpace) -> Tensor:
+        """Which of these bins the levels of another distribution lie in, float [N]."""
+        parts = [self.bins[name].shares(bins) for name, bins in other.bins.items()]
+        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts).float()
+
+    def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
+        places = torch.unravel_index(choices, [len(values) for values in self.axes.values()])
+        level = {
+            name: part.draw(place, generator)
+            for (name, part), place in zip(self.bins.items(), places, strict=True)
+        }
+        seeds = torch.randint(LARGEST_SEED, choices.shape, generator=generator)
+        return TensorDict({**level, SEED: seeds}, choices.shape)
+
+
+def _scaled(values: Sequence[Number]) -> Tensor:
+    points = torch.tensor(values, dtype=torch.float64)
+    reach = points[-1] - points[0]
+    return 2 * (points - points[0]) / reach - 1 if reach > 0 else 0 * points

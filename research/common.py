@@ -1,0 +1,73 @@
+"""What the instruments share: their options, their exit codes and the files of their rows."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import command
+from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
+
+Rows = list[dict[str, Any]]
+STAGES = "A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000."
+
+
+class Checkpoint(NamedTuple):
+    """A run and one of its stages."""
+
+    run: StoredRun
+    stage: Stage
+
+
+def checkpoints(folders: Sequence[Path]) -> Iterator[Checkpoint]:
+    """Every checkpoint of the runs in some folders, with a progress bar.
+
+    Raises:
+        ConfigError, CheckpointError: if a folder is no run's, or a checkpoint cannot be read.
+    """
+    runs = [stored_run(folder) for folder in folders]
+    found = [(run, file) for run in runs for file in run.files]
+    for run, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
+        yield Checkpoint(run, run.stage(file))
+
+
+def parser_of(name: str, description: str, seed: str, epilog: str = "") -> argparse.ArgumentParser:
+    """A parser with the options of every instrument; ``seed`` says what the seed is of."""
+    parser = argparse.ArgumentParser(
+        prog=f"bin/research {name}", description=description, epilog=f"{epilog} {STAGES}".strip()
+    )
+    parser.add_argument("--seed", type=int, default=0, help=f"of {seed} (0)")
+    parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
+    return parser
+
+
+def answer(
+    options: argparse.Namespace,
+    measure: Callable[[argparse.Namespace], Rows],
+    show: Callable[[str, Rows], Table],
+) -> None:
+    """Measure, print a table for each run, and write the rows; bad input ends in one line."""
+    command(lambda: _answer(options, measure, show))
+
+
+def _answer(options: argparse.Namespace, measure: Any, show: Any) -> None:
+    file: Path | None = options.output
+    if file is not None and file.suffix != ".json":
+        raise ConfigError(f"--output {file}: must end in .json")
+    if file is not None and not file.parent.is_dir():
+        raise ConfigError(f"--output {file}: there is no folder {file.parent}")
+    try:
+        rows: Rows = measure(options)
+    except (ValueError, TypeError) as error:
+        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+    for run in dict.fromkeys(row["run"] for row in rows):
+        Console().print(show(run, [row for row in rows if row["run"] == run]))
+    write_rows(rows, file)

@@ -1,0 +1,179 @@
+"""An environment that holds what pip installs of a wheel, and nothing of the tests' tools.
+
+It is made offline and in a second: the wheel is unpacked, and of what it requires, as installed
+here, the files are linked. Run as a program in such an environment, this file calls commands.
+"""
+
+from __future__ import annotations
+
+import sys
+import venv
+import zipfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+
+def make_environment(folder: Path, wheel: Path, extra: str) -> Path:
+    """Make a virtual environment of a wheel and what it requires.
+
+    Args:
+        folder: where it goes.
+        wheel: of this project.
+        extra: one of its extras; empty for none.
+
+    Returns:
+        Its interpreter.
+    """
+    venv.create(folder, with_pip=False, symlinks=True)
+    (site,) = folder.glob("lib/python*/site-packages")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    (project,) = metadata.distributions(path=[str(site)])
+    required = {name: metadata.distribution(name) for name in closure(project, extra)}
+    _link(required, site)
+    return folder / "bin" / "python"
+
+
+def closure(project: metadata.Distribution, extra: str) -> set[str]:
+    """Names of all distributions that one requires, and those require, with their extras."""
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    found: set[tuple[str, str]] = set()
+
+    def follow(distribution: metadata.Distribution, extras: set[str]) -> None:
+        for line in distribution.requires or []:
+            requirement = Requirement(line)
+            for asked in {"", *extras}:
+                marker = requirement.marker
+                if marker is not None and not marker.evaluate({"extra": asked}):
+                    continue
+                name = canonicalize_name(requirement.name)
+                new = {(name, inner) for inner in {"", *requirement.extras}} - found
+                if new:
+                    found.update(new)
+                    follow(metadata.distribution(name), set(requirement.extras))
+
+    follow(project, {extra} - {""})
+    return {name for name, _ in found}
+
+
+def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
+    """Link whole folders that are only theirs, and file by file those that others write into."""
+    from packaging.utils import canonicalize_name
+
+    owners: dict[str, set[str]] = defaultdict(set)
+    files = {}
+    for distribution in metadata.distributions():
+        name = canonicalize_name(distribution.name)
+        # Not ``distribution.files``, which looks for each of a hundred thousand.
+        record = (distribution.read_text("RECORD") or "").splitlines()
+        files[name] = [line.split(",")[0].strip('"') for line in record]
+        for top in {file.split("/")[0] for file in files[name]}:
+            owners[top].add(name)
+    for name, distribution in required.items():
+        assert files[name], f"{name} is installed without a list of its files"
+        places = {
+            file if owners[top] - required.keys() else top
+            for file in files[name]
+            if (top := file.split("/")[0]) not in ("..", "__pycache__")
+            and not file.endswith((".pth", ".pyc"))
+        }
+        for place in places:
+            if not (site / place).exists():
+                (site / place).parent.mkdir(parents=True, exist_ok=True)
+                (site / place).symlink_to(Path(str(distribution.locate_file(place))))
+
+
+RUN = "runs"
+SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
+GYMNASIUM = [
+    *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
+    "proposer.validation_levels=2", "proposer.probe_levels=2",
+]  # fmt: skip
+SMOKE = ["+scale=smoke", "compute.progress=false"]
+
+
+def _trained(name: str, *arguments: str) -> list[str]:
+    return ["train", *arguments, f"hydra.run.dir={RUN}/{name}"]
+
+
+def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
+    """What is called in the environment with an extra.
+
+    Args:
+        extra: its name; empty for none, where everything is called that needs none.
+        methods: all that there are.
+    """
+    if extra == "":
+        others = {"alp_gmm", "frozen_proposer"}
+        for method in methods:
+            if method not in others:
+                yield _trained(method, f"+method={method}", *SMOKE)
+        # A run goes on; a Proposer that has learnt is taken over.
+        yield _trained("perf_gain", "+method=perf_gain", *SMOKE, "schedule.updates=9")
+        yield _trained("frozen", "+method=frozen_proposer", *SMOKE, f"checkpoint={RUN}/perf_gain")
+        yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", SMOKE[1])
+        for method in ("first_order_sampled", "perf_gain"):
+            yield _trained(f"cartpole_{method}", "task=cartpole", f"+method={method}", *GYMNASIUM)
+        yield ["watch", RUN, "--once"]
+        yield ["report", f"{RUN}/cartpole_perf_gain", "-o", "report"]
+        yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))
+    elif extra == "alp-gmm":
+        # More than 250 episodes, after which a mixture is fitted for the first time.
+        yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
+    elif extra in ("box2d", "minigrid"):
+        task = {"box2d": "lunar_lander", "minigrid": "minigrid"}[extra]
+        yield _trained(task, f"task={task}", "+method=domain_randomization", *GYMNASIUM)
+    else:
+        logger = ["logger=tensorboard"] if extra == "tensorboard" else []
+        yield _trained("run", "+method=target", *SMOKE, *logger)
+        if extra == "play":
+            yield ["play", f"{RUN}/run"]
+
+
+def _call(command: Callable[..., Any], name: str, arguments: list[str]) -> None:
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    sys.argv = [f"proposer-{name}", *arguments]
+    try:
+        command()
+    except SystemExit as end:
+        assert not end.code, f"{sys.argv} ended with {end.code}"
+
+
+def _play(arguments: list[str]) -> None:
+    """Open the page that the command serves, and end it."""
+    import signal
+    import subprocess
+    import urllib.request
+
+    command = [sys.executable, "-m", "proposer_rl.cli.play", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None
+        address = served.stdout.readline().split()[1]
+        with urllib.request.urlopen(address) as page:
+            assert b"<html" in page.read()
+        served.send_signal(signal.SIGINT)
+    assert served.returncode == 0
+
+
+def _main(extra: str) -> None:
+    from proposer_rl.cli.config import methods
+
+    scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
+    for name, *arguments in commands(extra, methods()):
+        command = scripts[f"proposer-{name}"].load()
+        if name == "play":
+            _play(arguments)
+        else:
+            _call(command, name, arguments)
+        print("DID", name, *arguments, flush=True)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,116 @@
+"""``bin/research snr`` and ``conditioning`` as users call them, on runs of a few updates."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from proposer_rl.cli.train import main as train
+from research.conditioning import main as look
+from research.snr import EXPLORATIONS
+from research.snr import main as snr
+from tests.commands import call, trained_run
+
+SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained_run(tmp_path_factory.mktemp("runs") / "learnt", "+method=perf_gain", *SMOKE)
+
+
+def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "snr.json"
+    sizes = ["--proposals", "2", "--copies", "2", "--levels", "2", "4", "--output", str(output)]
+    assert call(snr, str(run), *sizes) == 0
+    rows = json.loads(output.read_text())
+    stages = sorted({row["updates"] for row in rows})
+    assert stages == [4, 6]
+    assert len(rows) == len(stages) * len(EXPLORATIONS) * 2 * 2
+    by_return, by_logarithm = (
+        [row for row in rows if row["measure"] == name] for name in ("return", "log_success")
+    )
+    assert all(
+        one["mean"] != other["mean"] for one, other in zip(by_return, by_logarithm, strict=True)
+    )
+    said = capsys.readouterr().out
+    assert "learnt: total gain over 3 updates" in said and "uneven" in said
+    assert call(snr, str(run), *sizes) == 0
+    assert json.loads(output.read_text()) == rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: holds no checkpoints"),
+        (["{run}", "--explorations", "all"], "argument --explorations: invalid choice: 'all'"),
+        (
+            ["{run}", "--output", "no/where/snr.json"],
+            "--output no/where/snr.json: there is no folder no/where",
+        ),
+        (["{run}", "--copies", "1"], "--copies: must be a whole number of at least 2, got '1'"),
+        (["{run}", "--levels", "0"], "must be a whole number of at least 1, got '0'"),
+        (["{run}", "--levels", "few"], "must be a whole number of at least 1, got 'few'"),
+    ],
+)
+def test_snr_refuses_in_one_line(run: Path, arguments: list[str], message: str, capsys) -> None:
+    assert call(snr, *(argument.format(run=run) for argument in arguments)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_look_shows_every_stage_and_what_changes(run: Path, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "look.json"
+    assert call(look, str(run), str(run), "--output", str(output)) == 0
+    rows = json.loads(output.read_text())
+    asis = [row for row in rows if row["seen"] == "as it is"]
+    assert [row["updates"] for row in asis] == [4, 6]
+    for row in rows:
+        easy, hard = row["shares"]  # of the obstacle fractions 0 and 0.2
+        assert sum(easy) + sum(hard) == pytest.approx(1)
+        assert row["obstacle fraction"] == pytest.approx(0.2 * sum(hard))
+        assert row["path length"] == pytest.approx(2 + 2 * (easy[1] + hard[1]))
+        assert 0 <= row["distance"] <= 1
+    assert all(row["distance"] == 0 for row in asis)
+    # The first stage cannot be shown its own probes, nor the last its own.
+    assert [row["seen"] for row in rows if row["updates"] == 4] == [
+        "as it is", "probes of the last", "log_success of the last",
+    ]  # fmt: skip
+    assert "as it is" in capsys.readouterr().out
+
+
+def test_look_shows_the_first_of_several_solvers(run: Path, tmp_path: Path) -> None:
+    both, alone = tmp_path / "both", tmp_path / "alone"
+    assert call(train, "+method=target", *SMOKE, "seeds=[0,1]", f"hydra.run.dir={both}") == 0
+    assert call(train, "+method=target", *SMOKE, "seed=0", f"hydra.run.dir={alone}") == 0
+    rows = []
+    for folder in (both, alone):
+        output = tmp_path / "look.json"
+        assert call(look, str(run), str(folder), "--output", str(output)) == 0
+        rows.append([row["distance"] for row in json.loads(output.read_text())])
+    assert rows[0] == pytest.approx(rows[1], abs=1e-3) and len(rows[0]) > 2
+
+
+def test_look_refuses_a_run_without_a_proposer(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "target"
+    assert call(train, "+method=target", *SMOKE, f"hydra.run.dir={folder}") == 0
+    capsys.readouterr()
+    assert call(look, str(folder), str(folder)) == 2
+    assert "holds no Proposer" in capsys.readouterr().err
+
+
+def test_folders_of_something_else_are_refused(tmp_path: Path, run: Path, capsys) -> None:
+    for content, message in (("{", "is no JSON"), ("{}", "does not hold"), ("[1]", "does not")):
+        (tmp_path / "config.json").write_text(content)
+        assert call(look, str(tmp_path), str(run)) == 2
+        assert message in capsys.readouterr().err
+    settings = json.loads((run / "config.json").read_text())
+    for change, message in (({"seed": -1}, "seed=-1"), ({"surprise": 1}, "surprise: there is no")):
+        (tmp_path / "config.json").write_text(json.dumps({**settings, **change}))
+        assert call(look, str(tmp_path), str(run)) == 2
+        assert message in capsys.readouterr().err
+    del settings["task"]
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    assert call(look, str(tmp_path), str(run)) == 2
+    assert "task: missing" in capsys.readouterr().err

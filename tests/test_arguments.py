@@ -1,0 +1,139 @@
+"""The one validator: what a signature says is what may be given, and the refusal is one line."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, Protocol
+
+import pytest
+import torch
+from annotated_types import Interval
+
+from proposer_rl.settings import (
+    ArgumentError,
+    Count,
+    Positive,
+    ProposerSettings,
+    Share,
+    SolverSettings,
+    arguments,
+    checked,
+)
+
+
+class Task(Protocol):
+    """Something that no value can be compared with."""
+
+
+@checked
+def make(
+    task: Task,
+    every: Count = 1,
+    share: Share = 0.5,
+    step: Positive = 1.0,
+    source: Literal["exact", "episodes"] = "exact",
+    best: Annotated[int, Interval(ge=2, le=9)] | None = None,
+    names: Sequence[str] = (),
+    shape: tuple[int, ...] = (),
+    bins: Mapping[str, list[float]] | None = None,
+    reward: Callable[..., Any] | None = None,
+    solver: SolverSettings | None = None,
+    flag: bool = False,
+) -> dict[str, Any]:
+    """Give back what was read."""
+    return dict(locals())
+
+
+WRONG = [
+    ("every", 0, "every=0: input should be greater than or equal to 1"),
+    ("every", 10**7, "every=10000000: input should be less than or equal to 1000000"),
+    ("every", 1.0, "every=1.0: input should be a valid integer"),
+    ("every", True, "every=True: input should be a valid integer"),
+    ("every", "3", "every='3': input should be a valid integer"),
+    ("share", 1.5, "share=1.5: input should be less than or equal to 1"),
+    ("step", 0, "step=0: input should be greater than 0"),
+    ("step", float("nan"), "step=nan: input should be a finite number"),
+    ("step", float("inf"), "step=inf: input should be a finite number"),
+    ("source", "luck", "source='luck': input should be 'exact' or 'episodes'"),
+    ("best", 1, "best=1: input should be greater than or equal to 2"),
+    ("names", "id", "names='id': input should be a valid array"),
+    ("names", ["id", 3], "names.1=3: input should be a valid string"),
+    ("shape", [1, "a"], "shape.1='a': input should be a valid integer"),
+    ("bins", {"a share": [1, "b"]}, "bins.a share.1='b': input should be a valid number"),
+    ("reward", 3, "reward=3: input should be callable"),
+    (
+        "solver",
+        {"batch_size": 0},
+        "solver.batch_size=0: input should be greater than or equal to 1",
+    ),
+    ("solver", {"size": 1, "ppo": {}}, "solver.size: unknown; there are: ppo"),
+    ("solver", 3, "solver=3: input should be"),
+    ("flag", 1, "flag=1: input should be a valid boolean"),
+    ("temperature", 1, "temperature: unknown; there are: task, every, share, step, source"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "line"), WRONG, ids=[line for *_, line in WRONG])
+def test_what_is_not_allowed_is_refused_in_one_line_by_the_callable_and_before_it(
+    name: str, value: Any, line: str
+) -> None:
+    with pytest.raises(ArgumentError) as by_call:
+        make(object(), **{name: value})
+    with pytest.raises(ArgumentError) as before:
+        arguments(make, {name: value}, given=["task"])
+    assert str(by_call.value).startswith(line) and "\n" not in str(by_call.value)
+    assert str(before.value).startswith(line.replace("there are: task, ", "there are: "))
+
+
+def test_values_come_as_the_signature_has_them() -> None:
+    layer, given = torch.nn.Linear(1, 1), ["id"]
+    read = make(layer, 3, 1, names=given, shape=[1, 2], solver={"batch_size": 4}, reward=abs)
+    assert read["task"] is layer and read["reward"] is abs
+    assert type(read["share"]) is float and read["shape"] == (1, 2)
+    assert read["names"] == given and read["names"] is not given
+    assert read["solver"] == SolverSettings(batch_size=4)
+    assert arguments(make, {"share": 1}, given=["task"]) == {"share": 1.0}
+
+
+def test_a_missing_argument_is_named() -> None:
+    with pytest.raises(ArgumentError, match=r"^task: missing$"):
+        arguments(make, {"every": 1})
+    with pytest.raises(TypeError, match="'task'"):
+        make()
+
+
+def test_further_arguments_are_passed_on_where_they_are_taken() -> None:
+    @checked
+    def passes(*parts: int, every: Count, **others: Any) -> tuple[Any, ...]:
+        return parts, every, others
+
+    assert passes(1, 2, every=3, x="y") == ((1, 2), 3, {"x": "y"})
+    assert arguments(passes, {"every": 3, "x": 0}) == {"every": 3, "x": 0}
+    with pytest.raises(ArgumentError, match=r"^every=0"):
+        passes(every=0)
+
+
+def test_a_class_is_held_to_its_constructor_and_keeps_its_signature() -> None:
+    class Curriculum:
+        @checked
+        def __init__(self, task: Task, step: Positive) -> None:
+            self.step = step
+
+    assert Curriculum(object(), step=2).step == 2.0
+    assert list(inspect.signature(Curriculum).parameters) == ["task", "step"]
+    for call in (
+        lambda: Curriculum(object(), 0),
+        lambda: arguments(Curriculum, {"step": 0}, ["task"]),
+    ):
+        with pytest.raises(ArgumentError, match=r"^step=0: "):
+            call()
+
+
+def test_settings_are_checked_where_they_are_made() -> None:
+    with pytest.raises(ArgumentError, match=r"^batch_size=0: "):
+        SolverSettings(batch_size=0)
+    with pytest.raises(ArgumentError, match=r"^action\.spread=-1: input should be greater than 0"):
+        ProposerSettings(action={"kind": "mixture", "spread": -1})
+    with pytest.raises(ArgumentError, match=r"^action\.kind='x': .* 'mixture', 'problems'"):
+        ProposerSettings(action={"kind": "x"})

@@ -1,0 +1,35 @@
+"""Every command sets how PyTorch's threads wait before it loads it, unless the user has."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.test_packaging import PROJECT
+
+ASK = """
+import importlib, os, sys
+importlib.import_module(sys.argv[1])
+print(os.environ.get("GOMP_SPINCOUNT"), "torch" in sys.modules)
+"""
+MODULES = sorted({script.partition(":")[0] for script in PROJECT["scripts"].values()})
+
+
+def waits(module: str, **given: str) -> list[str]:
+    kept = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    command = [sys.executable, "-c", ASK, module]
+    said = subprocess.run(command, env=kept | given, capture_output=True, text=True, check=True)
+    return said.stdout.split()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_command_says_how_threads_wait_before_it_loads_pytorch(module: str) -> None:
+    assert waits(module) == ["1000", "False"]
+
+
+def test_what_the_user_says_counts() -> None:
+    assert waits("proposer_rl.cli.start", GOMP_SPINCOUNT="7")[0] == "7"
+    assert waits("proposer_rl.cli.start", OMP_WAIT_POLICY="active")[0] == "None"
