@@ -19,18 +19,18 @@ from proposer_rl.report.studies import read_studies
 
 ROOT = Path(__file__).parents[1]
 FRAMES = "with the curriculum's (M)"
-GYMNASIUM = "docs/your_gymnasium_environment.md"
+GYMNASIUM = "docs/how_to/gymnasium_environment.md"
 # Pages with tables, updates of the runs in them, folder of their results, headline, least number of
 # rows. A page has no two tables of runs of the same length.
 TABLES = [
-    ("docs/comparison.md", 240, "curricula", "ID success", 20),
-    ("docs/first_order.md", 240, "curricula", "ID success", 8),
-    ("docs/filtering.md", 240, "curricula", "ID success", 8),
-    ("docs/replay.md", 240, "sampled", "ID success", 11),
+    ("docs/explanation/results.md", 240, "curricula", "ID success", 20),
+    ("docs/explanation/first_order.md", 240, "curricula", "ID success", 8),
+    ("docs/explanation/filtering.md", 240, "curricula", "ID success", 8),
+    ("docs/explanation/replay.md", 240, "sampled", "ID success", 11),
     ("README.md", 400, "medium", "ID success", 5),
-    ("docs/comparison.md", 400, "medium", "ID success", 5),
-    ("docs/proposer.md", 400, "medium", "ID success", 6),
-    ("docs/comparison.md", 750, "paper", "ID success", 4),
+    ("docs/explanation/results.md", 400, "medium", "ID success", 5),
+    ("docs/explanation/proposer.md", 400, "medium", "ID success", 6),
+    ("docs/explanation/results.md", 750, "paper", "ID success", 4),
     (GYMNASIUM, 40, "cartpole", "target success", 4),
     (GYMNASIUM, 80, "lunar_lander", "target success", 4),
     (GYMNASIUM, 60, "minigrid", "target success", 4),
@@ -111,7 +111,7 @@ def test_the_columns_by_seed_have_the_numbers_of_the_measurements() -> None:
     folder = ROOT / "results" / "paper"
     runs = pd.read_csv(folder / "runs.csv.gz")[["run", "method"]]
     metrics = pd.read_csv(folder / "metrics.csv.gz").merge(runs, on="run")
-    for row in rows("docs/comparison.md", 750):
+    for row in rows("docs/explanation/results.md", 750):
         of_method = metrics[metrics["method"] == row["method"].strip("`")].sort_values("updates")
         seeds = [run for _, run in of_method.groupby("seed")]
         ends = [f"{run['id_success'].iloc[-1]:.3f}" for run in seeds]
@@ -167,7 +167,7 @@ def test_the_published_proposer_can_be_used(
 
 
 # Pages whose numbers are all of runs whose tables are in the repository, prose and tables.
-PROSE = ["README.md", "docs/filtering.md", "docs/comparison.md", "docs/replay.md", GYMNASIUM]
+PROSE = ["README.md", "docs/explanation/filtering.md", "docs/explanation/results.md", "docs/explanation/replay.md", GYMNASIUM]
 NUMBER = r"[−]?\d*\.\d+"
 INTERVAL = re.compile(rf"\+?(?P<shown>{NUMBER} \[{NUMBER}, {NUMBER}\])")
 P_VALUE = re.compile(r",? \(?(?:undecided, )?p = (0?\.\d+)")

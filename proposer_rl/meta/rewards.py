@@ -42,7 +42,7 @@ Reward = Callable[[TrainingStep], Tensor]
 def performance_gain(step: TrainingStep) -> Tensor:
     """How much the mean return on the validation levels went up: R(after) - R(before).
 
-    The paper's reward (its section on the method; docs/method.md).
+    The paper's reward (its section on the method; docs/explanation/method.md).
 
     Example:
         >>> import torch
