@@ -66,7 +66,7 @@ def retired(text: str) -> Iterator[tuple[str, str]]:
         yield text.strip()[:30], "a full sentence"
 
 
-@pytest.mark.parametrize("texts", [pages], ids=lambda texts: texts.__name__)
+@pytest.mark.parametrize("texts", [pages, package], ids=lambda texts: texts.__name__)
 def test_only_the_fields_words_are_used(texts) -> None:
     assert [(place, *hit) for place, text in texts() for hit in retired(text)] == []
 

@@ -1,4 +1,4 @@
-"""First-order performance gain: what levels are worth to a Solver, without training copies of it.
+"""First-order performance gain: what levels bring a Solver, without training replicas of it.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 

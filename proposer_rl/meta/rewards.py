@@ -1,4 +1,4 @@
-"""What the Proposer is paid for: functions of one training step of K Solvers, each to float [K]."""
+"""Rewards of the Proposer: functions of one training step of K Solvers, each to float [K]."""
 
 from __future__ import annotations
 
