@@ -36,10 +36,9 @@ RETIRED = {
 
 
 def pages() -> Iterator[tuple[str, str]]:
-    """README and docs, without what commands have drawn or generated."""
+    """README and docs."""
     for file in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
-        if not {"findings", "api"} & set(file.parts):
-            yield str(file.relative_to(ROOT)), file.read_text(encoding="utf-8")
+        yield str(file.relative_to(ROOT)), file.read_text(encoding="utf-8")
 
 
 def package() -> Iterator[tuple[str, str]]:
