@@ -120,7 +120,7 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(settings: Mapping[str, Any]) -> Maker:
-    """What makes the task, called with ``solver`` and ``place`` besides.
+    """What makes the task, called with ``solver`` and ``context`` besides.
 
     Args:
         settings: ``task`` of the configuration.
