@@ -59,7 +59,7 @@ def package() -> Iterator[tuple[str, str]]:
 def retired(text: str) -> Iterator[tuple[str, str]]:
     """Every retired term in a text, and its replacement."""
     for pattern, instead in RETIRED.items():
-        for match in re.finditer(pattern, " ".join(text.split())):
+        for match in re.finditer(pattern, " ".join(text.split()), re.IGNORECASE):
             yield match[0], instead
     if re.match(r"\s*\.\.\. \w", text):
         yield text.strip()[:30], "a full sentence"
