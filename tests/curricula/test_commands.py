@@ -14,7 +14,7 @@ SMOKE = ("+scale=smoke", "compute.progress=false", "hydra.run.dir=run")
         (["+method=learning_progress", "curriculum.fast=1"], "curriculum: fast must be from 0 to"),
         (["+method=alp_gmm", "curriculum.refit=300"], "components=10 must be at most refit=300"),
         (["+method=currot", "curriculum.epsilon=.nan"], "curriculum: epsilon must be a finite"),
-        (["+method=currot", "compute.collector=multiprocess"], "this method trains no copies"),
+        (["+method=currot", "compute.collector=multiprocess"], "this method trains no replicas"),
     ],
 )
 def test_the_command_refuses_in_one_line(
