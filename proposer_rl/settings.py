@@ -385,7 +385,7 @@ class ScheduleSettings:
 
 @settings
 class HandDesignedSettings:
-    """A curriculum by hand.
+    """A hand-designed curriculum.
 
     Attributes:
         distributions: of the task, in order.
@@ -454,7 +454,7 @@ class ComputeSettings:
         device: ``auto``: cuda where there is one, else cpu.
         graphs: replay updates and evaluations as CUDA graphs on a GPU, where it is untried.
         threads: CPU threads of one operation; None leaves torch's choice.
-        cores: copies of the Solver computed at once on a CPU; None for all cores.
+        cores: replicas of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
         workers: processes for them; None for one for each GPU, or core, at most one for each copy.
         worker_devices: of the workers, in turn; None for all GPUs, or the CPU.

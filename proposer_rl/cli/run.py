@@ -108,7 +108,7 @@ def proceed(
 
 
 def run(experiment: Experiment, config: RunConfig) -> float:
-    """Run to the end, write summary and picture, say what came out.
+    """Run to the end, write summary and picture, print the results.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
