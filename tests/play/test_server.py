@@ -214,7 +214,7 @@ def test_cars_are_looked_at_though_they_cannot_be_drawn(car_page: Page) -> None:
         reached = task.performance(agent, levels, torch.Generator())
     for number, level in enumerate(drawn["levels"]):
         assert level["rows"] is None and level["picture"]
-        assert level["text"][0] == f"gravity {levels['gravity'][number]:.2f}"
+        assert level["text"][0] == f"gravity {levels['gravity'][number]:.4g}"
         expected = reached["return"][0, number].item()
         assert level["results"]["return"] == pytest.approx(expected, abs=1e-6)
     trained_on = asked(car_page, "levels", {"source": "curriculum", "row": 0})["levels"]
