@@ -128,20 +128,20 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
         given = dict(options or {})
         levels = self._read(given.pop("level")) if "level" in given else None
         which = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, np.bool_)))
-        if given:
-            raise ValueError(
-                f"options must be among ['level', 'reset_mask'], got {next(iter(given))!r}"
-            )
+        for unknown in given:
+            raise ValueError(f"options must be among ['level', 'reset_mask'], got {unknown!r}")
         if which.dtype != np.bool_ or which.shape != (self.num_envs,) or not which.any():
             raise ValueError(
                 f"options['reset_mask'] must be {self.num_envs} bools, not all False, got {which}"
             )
-        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
-        if seeds is not None and len(seeds) != self.num_envs:
+        if isinstance(seed, int):
+            seed = range(seed, seed + self.num_envs)
+        seeds = [None] * self.num_envs if seed is None else list(seed)
+        if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} of them, got {len(seeds)}")
-        for i in which.nonzero()[0].tolist() if seeds is not None else ():
-            if seeds[i] is not None:
-                self.set_random(i, seeding.np_random(seeds[i])[0])
+        for i in which.nonzero()[0].tolist():
+            if (own := seeds[i]) is not None:
+                self.set_random(i, seeding.np_random(own)[0])
         self._begin(which, levels)
         self._begun = True
         return self._observe(), {}
@@ -178,7 +178,8 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
         if resets.any():
             self._begin(resets)
             reward[resets], terminated[resets], truncated[resets] = 0.0, False, False
-        self._over, info = terminated | truncated, {}
+        self._over = terminated | truncated
+        info: Info = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
             last = self._observe()
             for i in self._over.nonzero()[0].tolist():

@@ -185,7 +185,7 @@ class MazeTask(GridTask, ExactTask):
     def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
         """Exact return and success of K Solvers, each on its own levels [K, E], with gradients."""
         logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
-        return self._sampled.differentiable(levels, logits)
+        return self._sampled(levels, logits)
 
     def optimal_return(self, levels: Level) -> Tensor:
         """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
