@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import gymnasium
 import numpy as np
@@ -26,6 +26,7 @@ from proposer_rl.tasks.mazes.settings import Fractions, MazeSettings, Mechanism,
 AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}
 
+N = TypeVar("N", int, float)
 Observation = dict[str, Any]
 Info = dict[str, Any]
 Mask = NDArray[np.bool_]
@@ -70,9 +71,8 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
         **maze: Any,
     ) -> None:
         rules = MazeSettings(**maze)
-        fractions, lengths = (
-            each if isinstance(each, list) else [each] for each in (obstacle_fraction, path_length)
-        )
+        fractions = _several(obstacle_fraction)
+        lengths = _several(path_length)
         if max(lengths) > rules.max_steps:
             raise ArgumentError(
                 f"max_steps={rules.max_steps}: must be at least the path length {max(lengths)}, "
@@ -296,6 +296,10 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         """Draw it: uint8 [H', W', 3] or text, as ``render_mode`` says, else nothing."""
         pictures = self._mazes.render()
         return None if pictures is None else pictures[0]
+
+
+def _several(value: N | list[N]) -> list[N]:
+    return value if isinstance(value, list) else [value]
 
 
 def _one(observation: Observation, index: int) -> Observation:

@@ -86,8 +86,8 @@ class ExactEvaluator:
                 after = pad(origin * stay, (0, 0, 1, 1, 1, 1))
             else:
                 torch.mul(origin, stay, out=after[1:-1, 1:-1])
-            for move, chosen in zip(MOVES, leave, strict=True):
-                _shifted(after, move).addcmul_(origin, chosen)
+            for move, chance in zip(MOVES, leave, strict=True):
+                _shifted(after, move).addcmul_(origin, chance)
             here, after = after, here
             success = here.flatten(0, 1).gather(0, goal).squeeze(0)
         return _result(levels, success - self.step_penalty * steps, success)
