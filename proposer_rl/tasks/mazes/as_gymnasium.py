@@ -83,7 +83,7 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
         self.render_mode = render_mode
         self.autoreset_mode = autoreset_mode
         self.metadata = {**METADATA, "autoreset_mode": autoreset_mode}
-        self.randoms = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
         self._space = SpecificationSpace(fractions, lengths, mechanism, *grid)
         self._drawn = self._draw([torch.Generator().manual_seed(0) for _ in range(num_envs)])
         self._next = torch.full((num_envs,), AHEAD)  # of the levels drawn ahead; AHEAD: all used
@@ -141,15 +141,11 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
             raise ValueError(f"seed must be one or {self.num_envs} of them, got {len(seeds)}")
         for i in which.nonzero()[0].tolist():
             if (own := seeds[i]) is not None:
-                self.set_random(i, seeding.np_random(own)[0])
+                self._randoms[i] = seeding.np_random(own)[0]
+                self._next[i] = AHEAD
         self._begin(which, levels)
         self._begun = True
         return self._observe(), {}
-
-    def set_random(self, index: int, random: np.random.Generator) -> None:
-        """Take another source of a maze's levels; those drawn ahead are dropped."""
-        self.randoms[index] = random
-        self._next[index] = AHEAD
 
     def step(
         self, actions: NDArray[np.int64]
@@ -212,7 +208,7 @@ class VectorMaze(VectorEnv[Any, Any, Any]):
         """The next level of each of m marked mazes, from its own randomness: [m]."""
         empty = (mask & (self._next == AHEAD)).nonzero().squeeze(1)
         if len(empty):
-            seeds = [int(self.randoms[i].integers(2**63)) for i in empty.tolist()]
+            seeds = [int(self._randoms[i].integers(2**63)) for i in empty.tolist()]
             self._drawn[empty] = self._draw([torch.Generator().manual_seed(s) for s in seeds])
             self._next[empty] = 0
         index = mask.nonzero().squeeze(1)
@@ -281,9 +277,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, Info]:
         """Begin an episode; see :meth:`VectorMaze.reset`."""
         super().reset(seed=seed)
-        if self._mazes.randoms[0] is not self.np_random:
-            self._mazes.set_random(0, self.np_random)
-        observation, info = self._mazes.reset(options=options)
+        observation, info = self._mazes.reset(seed=seed, options=options)
         return _one(observation, 0), info
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, Info]:

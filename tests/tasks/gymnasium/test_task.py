@@ -272,26 +272,6 @@ def test_curricula_run_from_the_command_line(method: str, train: Any) -> None:
     assert told["title"] == "CartPole-v1" and told["exact"] is False
 
 
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize(
-    ("method", "message"),
-    [
-        ("regret", "GymnasiumTask must define optimal_return"),
-        ("pace", "GymnasiumTask must define differentiable_performance"),
-        ("first_order_gain", "must define differentiable_performance"),
-        ("first_order_proposer", "must define differentiable_performance"),
-        ("accel", "the task has no edit("),
-    ],
-)
-def test_what_the_task_cannot_tell_is_refused(
-    method: str, message: str, train: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert train("task=cartpole", f"+method={method}", *TINY, "hydra.run.dir=run") == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
-    assert not Path("run").exists()
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_folder")
 def test_the_file_that_the_page_shows_is_all_that_is_needed(train: Any) -> None:

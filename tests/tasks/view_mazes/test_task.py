@@ -109,35 +109,6 @@ def test_a_run_is_trained_resumed_and_evaluated(
         assert row["max_steps"] == 12
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["+method=first_order_gain"], "must define differentiable_performance"),
-        (["+method=regret"], "ViewMazeTask tells performance by playing, which is not exact"),
-        (["+method=sfl"], "ViewMazeTask tells performance by playing"),
-        (["+method=target", "task.maze.height=4"], "distributions.ood: perfect mazes have odd"),
-        (["+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23 walls"),
-        (
-            ["+method=target", "task.distributions.id.kind=spiral"],
-            "task.distributions.id.kind='spiral': input should be one of 'four_rooms', 'perfect', "
-            "'scattered'",
-        ),
-    ],
-)
-def test_what_does_not_go_is_refused_before_anything_is_written(
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(tmp_path / "none", *words) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and said in lines[0]
-    assert not list(tmp_path.iterdir())
-
-
 def test_files_that_hold_no_levels_are_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
