@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from functools import cache
 from itertools import combinations, permutations
 
 import pytest
@@ -222,14 +223,18 @@ def carved_paths(path: list[Cell], length: int) -> Iterator[tuple[list[Cell], fl
             yield whole, probability / len(choices)
 
 
+@cache
+def moves(walls: frozenset[Cell], start: Cell, goal: Cell) -> int:
+    return path_length(as_level(set(walls), start, goal))
+
+
 def opened(path: list[Cell], order: tuple[Cell, ...], obstacles: int) -> set[Cell] | None:
     """Obstacles left after opening cells one by one, None if too many are."""
     walls = set(CELLS) - set(path)
     for cell in order:
         if len(walls) == obstacles:
             break
-        level = as_level(walls - {cell}, path[0], path[-1])
-        if path_length(level) == len(path) - 1:
+        if moves(frozenset(walls - {cell}), path[0], path[-1]) == len(path) - 1:
             walls -= {cell}
     return walls if len(walls) == obstacles else None
 
