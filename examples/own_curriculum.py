@@ -24,7 +24,7 @@ from tensordict import TensorDictBase
 
 from proposer_rl import Batch, Curriculum, Streams
 from proposer_rl.curricula import Inbox, Student
-from proposer_rl.methods import Parts
+from proposer_rl.methods import Components
 from proposer_rl.task import Distribution
 
 
@@ -67,7 +67,7 @@ class Again(Curriculum):
         self._inbox.load_state_dict(state)
 
 
-def again(parts: Parts, probability: float) -> Curriculum:
+def again(parts: Components, probability: float) -> Curriculum:
     """The factory that the configuration names: from a run's parts to its curriculum."""
     return Again(parts.task.target, probability)
 

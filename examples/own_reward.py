@@ -19,7 +19,7 @@ from small_mazes import proposer_settings, report, small_task, train
 from torch import Tensor
 
 from proposer_rl.meta.rewards import TrainingStep
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 
 
 def learnability(step: TrainingStep) -> Tensor:
@@ -36,7 +36,7 @@ def learnability(step: TrainingStep) -> Tensor:
 def main(updates: int = 60) -> None:
     """Train a Solver on the proposals of a Proposer that is paid for learnability."""
     task = small_task()
-    curriculum = proposer(Parts(task, proposer_settings(), seeds=[0]), reward=learnability)
+    curriculum = proposer(Components(task, proposer_settings(), seeds=[0]), reward=learnability)
     report(train(task, curriculum, updates))
 
 

@@ -239,7 +239,7 @@ WRONG_COMMANDS = [
     (["+method=3"], "Config group override must be a string or a list. Got int"),
     (
         ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
-        "curriculum: proposer.action.ratio=joint: here each draw is paid by itself",
+        "curriculum: proposer.action.ratio=joint: here each draw is rewarded by itself",
     ),
     (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
     (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: medium, paper, quick, smoke"),
@@ -256,7 +256,7 @@ WRONG_COMMANDS = [
     (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (
         ["+method=hand_designed", "hand_designed.distributions=[x]"],
-        "some of ['id', 'mix', 'ood'], got",
+        "curriculum.distributions=['x']: must be some of ['id', 'mix', 'ood']",
     ),
     (
         ["+method=hand_designed", "curriculum.distributions=mix"],
@@ -318,7 +318,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=first_order_gain", *SMOKE, "curriculum.measure=luck"],
-        "curriculum: measure must be log_success or return, got 'luck'",
+        "curriculum.measure='luck': input should be 'log_success' or 'return'",
     ),
     (
         ["+method=plr", *SMOKE, "curriculum.new_levels=3"],
@@ -342,7 +342,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=target", "compute.collector=ray"],
-        "compute.collector=ray: this method trains no copies of the Solver",
+        "compute.collector=ray: this method trains no replicas",
     ),
     (
         ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],

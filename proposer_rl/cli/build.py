@@ -19,7 +19,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Parts, Workers, filtered
+from proposer_rl.methods import Components, Workers, filtered
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
@@ -130,7 +130,9 @@ def _curriculum(
         tell(done)
         signals.check()
 
-    chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task, tell))
+    chosen = Components(
+        task, config.proposer, config.seeds, on_update, _workers(config, task, tell)
+    )
     try:
         curriculum = curriculum_maker(config.curriculum)(chosen)
     except ArgumentError as error:
@@ -145,8 +147,8 @@ def _curriculum(
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if chosen.workers is not None and not learned:
         raise ConfigError(
-            f"compute.collector={config.compute.collector}: this method trains no copies of the "
-            "Solver that workers could have; leave compute.collector=single"
+            f"compute.collector={config.compute.collector}: this method trains no replicas "
+            "that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)

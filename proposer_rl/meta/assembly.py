@@ -35,13 +35,13 @@ def meta_env(
     on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
-    """The environment in which a share of the K copies of a Solver is trained.
+    """The environment in which a share of a Solver's K replicas is trained.
 
     Args:
         task: that they learn.
         chosen: what is seen of them, how actions are drawn and how long they hold.
         streams: of the run's Proposer.
-        reward: what an update is worth.
+        reward: of an update.
         share: numbers of the copies.
         on_update: called with the number of updates done in an episode.
         kind: the class.

@@ -15,9 +15,11 @@ from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.learner import Learner
 from proposer_rl.meta.rewards import Reward, TrainingStep
 from proposer_rl.meta.view import SolverView
+from proposer_rl.settings import signed
 from proposer_rl.streams import Streams
 
 
+@signed
 class SolverTrainingEnv(EnvBase):
     """Training K Solvers as a batch of K episodes (section 5 of the paper).
 
@@ -37,7 +39,7 @@ class SolverTrainingEnv(EnvBase):
         solvers: K of them; see :class:`~proposer_rl.meta.learner.Learner`.
         view: what is seen of the Solvers, and the validation levels that the gain is measured on.
         actions: the levels that an action stands for.
-        reward: what an update is worth; a step is worth the sum of its updates.
+        reward: of an update; that of a step is the sum over its updates.
         meta_episode_length: updates L of an episode.
         action_repeat: updates for which an action holds; divides L.
         first_copy: number of the first of these Solvers, where others are trained elsewhere: a

@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 
 from proposer_rl.curricula import alp_gmm
-from proposer_rl.curricula.alp_gmm import MixtureCurriculum, absolute_progress, nearest
-from proposer_rl.curricula.mixtures import TaskMixture, draw, fit
+from proposer_rl.curricula.gaussians import (
+    MixtureCurriculum,
+    TaskMixture,
+    absolute_progress,
+    draw,
+    fit,
+    nearest,
+)
 from proposer_rl.streams import Streams
 from tests.curricula.scripted import Scripted, reached, step
 
@@ -266,23 +272,6 @@ def test_performance_is_that_before_the_update_and_counted() -> None:
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proposer_rl.curricula.mixtures.find_spec", lambda name: None)
+    monkeypatch.setattr("proposer_rl.curricula.gaussians.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"install it with: .*\[alp-gmm\]'?$"):
         small(Scripted(torch.zeros(1, 3)))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"source": "both"}, "source must be episodes or exact, got 'both'"),
-        ({"components": 1}, "components must be a whole number from 2 to 1,000,000, got 1"),
-        ({"refit": 2.5}, "refit must be a whole number from 2 to 1,000,000, got 2.5"),
-        ({"warmup": None}, "warmup must be a whole number from 2 to 1,000,000, got None"),
-        ({"exploration": 1.1}, "exploration must be from 0 to 1, got 1.1"),
-        ({"components": 65}, "components=65 must be at most refit=64, and that at most warmup=64"),
-        ({"warmup": 63}, "components=4 must be at most refit=64, and that at most warmup=63"),
-    ],
-)
-def test_values_out_of_range_are_refused(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        small(Scripted(torch.zeros(1, 3)), **options)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
+from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import cell_index
 from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
@@ -24,6 +25,7 @@ AGENT = (VIEW // 2, VIEW - 1)  # where the agent is in its view
 PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
 
 
+@signed
 class ViewMazeEnv(LevelEnv):
     """The maze of PAIRED, PLR, ACCEL, SFL and their libraries; a batch of them.
 

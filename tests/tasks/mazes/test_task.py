@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from proposer_rl.meta.rewards import performance_gain, task_difficulty
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
@@ -78,7 +78,7 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
     reward, observe_agent
 ) -> None:
     maze = tiny_task(maze=replace(TASK.maze, observe_agent=observe_agent))
-    trainer = proposer(Parts(maze, SMALL, seeds=[0]), reward).trainer
+    trainer = proposer(Components(maze, SMALL, seeds=[0]), reward).trainer
     assert trainer is not None
     env = trainer.env
     for module in env.solvers.agent.modules():
