@@ -24,7 +24,7 @@ from proposer_rl.task import Distribution, Levels, Space
 
 
 class ProblemProposer(Curriculum):
-    """Draws each of P problems from a policy over probes, and learns what each was worth.
+    """Draws each of P problems from a policy over probes, and learns from the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few

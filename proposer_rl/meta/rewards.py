@@ -1,4 +1,4 @@
-"""What the Proposer is paid for: functions of one training step of K Solvers, each to float [K]."""
+"""What the Proposer is rewarded for: functions of a training step of K Solvers, float [K] each."""
 
 from __future__ import annotations
 
