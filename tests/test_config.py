@@ -276,6 +276,11 @@ WRONG_COMMANDS = [
         "and a run goes on with hydra.run.dir=FOLDER",
     ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
+    (
+        ["+method=plr", "+curriculum.x=1"],
+        "curriculum.x: unknown; there are: score, source, rollouts, prioritization",
+    ),
+    (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
     (
         ["+method=perf_gain", "+ablation=meta_episode_length_10", "+scale=quick"],
