@@ -135,7 +135,7 @@ def _takes_numbers_of(make: Callable[..., Curriculum], *given: str) -> Callable[
         gives = {*given, *(p.name for p in own)}
         parameters = inspect.signature(make).parameters.values()
         numbers = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in gives]
-        hints = get_type_hints(make.__init__, include_extras=True)  # type: ignore[misc]
+        hints = get_type_hints(make.__init__, include_extras=True)
         factory.__signature__ = inspect.Signature([*own, *numbers])  # type: ignore[attr-defined]
         factory.__annotations__ |= {number.name: hints[number.name] for number in numbers}
         return factory

@@ -223,7 +223,7 @@ WRONG = [
         "curriculum._target_=os.system",
         "curriculum._target_=os.system: Target 'os.system' is blocklisted",
     ),
-    ("+curriculum.x=1", "curriculum.x: unknown; there are: filter"),
+    ("+curriculum.x=1", "curriculum.x: unknown; there are none"),
 ]
 WRONG_COMMANDS = [
     (["+method=target", "seeds=0"], "seeds=0: input should be a valid array"),
@@ -271,8 +271,8 @@ WRONG_COMMANDS = [
         "curriculum.until=3: input should be a valid array",
     ),
     (
-        ["+method=perf_gain", "checkpoint=lives/0"],
-        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does, "
+        ["+method=target", "checkpoint=other"],
+        "checkpoint=other: method=target takes none; those with a Proposer do, "
         "and a run goes on with hydra.run.dir=FOLDER",
     ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
@@ -293,7 +293,7 @@ WRONG_COMMANDS = [
     (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
     (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
     (
-        ["+method=task_difficulty", *SMOKE, "curriculum._target_=builtins.len"],
+        ["+method=target", *SMOKE, "curriculum._target_=builtins.len"],
         "curriculum: must make a Curriculum, but makes int",
     ),
     (
@@ -339,7 +339,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
-        "curriculum.reward: unknown; there are none",
+        "curriculum.reward: unknown; there are: checkpoint",
     ),
     (
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
