@@ -1,13 +1,21 @@
 """The names of ``proposer_rl`` itself."""
 
+from proposer_rl import curricula, tasks
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
+    Filtered,
+    LearnedCurriculum,
+    Mixed,
     ProposerCurriculum,
     ProposerTrainer,
     SamplingCurriculum,
+    Schedule,
+    Student,
+    TaskStudent,
 )
 from proposer_rl.experiment import Experiment
+from proposer_rl.front import Run, train
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -22,7 +30,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.settings import PPOSettings, Schedule, SolverSettings
+from proposer_rl.settings import ArgumentError, PPOSettings, ScheduleSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
@@ -31,16 +39,20 @@ from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 __all__ = [
     "PPO",
     "ActorCritic",
+    "ArgumentError",
     "Batch",
     "ComputeContext",
     "Curriculum",
     "ExactEvaluator",
     "Experiment",
+    "Filtered",
+    "LearnedCurriculum",
     "LeaveOneOutBaseline",
     "Level",
     "LevelSpec",
     "MapEncoder",
     "MazeEnv",
+    "Mixed",
     "Mixture",
     "MixtureHead",
     "PPOSettings",
@@ -51,17 +63,24 @@ __all__ = [
     "ProposerNetwork",
     "ProposerTrainer",
     "RolloutEvaluator",
+    "Run",
     "SamplingCurriculum",
     "Schedule",
+    "ScheduleSettings",
     "SolverSettings",
     "SolverTrainingEnv",
     "SolverView",
     "Streams",
+    "Student",
     "Task",
+    "TaskStudent",
     "UNet",
+    "curricula",
     "generate_levels",
     "log_success_gain",
     "performance_gain",
     "shortest_path_length",
     "task_difficulty",
+    "tasks",
+    "train",
 ]

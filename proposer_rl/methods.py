@@ -29,13 +29,13 @@ from proposer_rl.curricula import (
     ReplayRule,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
+    Schedule,
     Scorer,
     SelectionCurriculum,
     SomeBins,
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula import Schedule as StagedCurriculum
 from proposer_rl.curricula.buffer import Prioritization
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
@@ -179,7 +179,7 @@ def schedule(components: Components, distributions: list[str], until: list[int])
     known = components.task.distributions
     if any(name not in known for name in distributions):
         raise ArgumentError(f"distributions={distributions}: must be some of {sorted(known)}")
-    return StagedCurriculum([SamplingCurriculum(known[name]) for name in distributions], until)
+    return Schedule([SamplingCurriculum(known[name]) for name in distributions], until)
 
 
 def proposer(

@@ -1,4 +1,4 @@
-"""Completion in the shell and config folders, as docs/configuration.md describes them."""
+"""Completion in the shell and config folders, as docs/reference/configuration.md describes them."""
 
 from __future__ import annotations
 

@@ -347,7 +347,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=target", "compute.collector=ray"],
-        "compute.collector=ray: this method trains no copies of the Solver",
+        "compute.collector=ray: this method trains no replicas",
     ),
     (
         ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],

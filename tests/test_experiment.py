@@ -27,7 +27,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted, StopSignals
-from proposer_rl.settings import Schedule
+from proposer_rl.settings import ScheduleSettings
 from proposer_rl.streams import Streams
 from tests.same_run import assert_same_run
 from tests.stops import StopAt
@@ -44,12 +44,12 @@ def learner(*seeds: int) -> PPO:
 def experiment(
     path: Path, *seeds: int, curriculum: Curriculum | None = None, **options
 ) -> Experiment:
-    lengths = {key: options.pop(key) for key in list(options) if hasattr(Schedule, key)}
+    lengths = {key: options.pop(key) for key in list(options) if hasattr(ScheduleSettings, key)}
     return Experiment(
         TASK,
         learner(*seeds),
         curriculum or SamplingCurriculum(TASK.target),
-        schedule=Schedule(**{"threshold": 0.1, **LENGTHS, **lengths}),
+        schedule=ScheduleSettings(**{"threshold": 0.1, **LENGTHS, **lengths}),
         seeds=seeds,
         folder=RunFolder(path),
         progress=False,
@@ -158,7 +158,7 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
             cars,
             cars.learner([Streams(0)]),
             Demanding(cars.space),
-            schedule=Schedule(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
+            schedule=ScheduleSettings(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
             seeds=[0],
             folder=RunFolder(tmp_path / "run"),
         )

@@ -48,7 +48,7 @@ def test_a_proposer_observes_what_the_task_tells() -> None:
 
 def test_every_method_says_what_it_needs() -> None:
     assert set(NEEDS) == {file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml")}
-    known = {TARGET, EXACT, GRADIENTS, "levels sorted by hand", "a Proposer that has learnt"}
+    known = {TARGET, EXACT, GRADIENTS, "a schedule", "a Proposer that has learnt"}
     assert {need for found in NEEDS.values() for need in found} == known
     assert "a Proposer that has learnt" in NEEDS[REUSED]
 

@@ -149,8 +149,8 @@ def _curriculum(
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if components.workers is not None and not learned:
         raise ConfigError(
-            f"compute.collector={config.compute.collector}: this method trains no copies of the "
-            "Solver that workers could have; leave compute.collector=single"
+            f"compute.collector={config.compute.collector}: this method trains no replicas "
+            "that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)

@@ -27,7 +27,7 @@ from proposer_rl.settings import (
     LoggerSettings,
     PoolSettings,
     ProposerSettings,
-    Schedule,
+    ScheduleSettings,
     SolverSettings,
     arguments,
     settings,
@@ -82,7 +82,7 @@ class RunConfig:
     pool: PoolSettings
     solver: SolverSettings
     proposer: ProposerSettings
-    schedule: Schedule
+    schedule: ScheduleSettings
     compute: ComputeSettings
     logger: LoggerSettings
 

@@ -16,7 +16,7 @@ from proposer_rl.task import Distribution, Levels, Space
 
 
 class SomeBins:
-    """Levels of some of a space's bins, drawn evenly.
+    """Levels of some of a space's bins, drawn uniformly.
 
     Args:
         space: with the bins.

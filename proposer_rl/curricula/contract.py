@@ -202,7 +202,7 @@ class LearnedCurriculum(Curriculum):
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Prepare for the next cycle, whose first proposal has not been made.
 
-        Whatever is raised in it may be followed by :meth:`load_state_dict` and a repeated call.
+        After whatever it raises may come :meth:`Curriculum.load_state_dict`, and a repeated call.
 
         Args:
             student: as it is before the cycle.

@@ -35,7 +35,7 @@ def meta_env(
     on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
-    """The environment in which a share of the K copies of a Solver is trained.
+    """The environment in which a share of a Solver's K replicas is trained.
 
     Args:
         task: that they learn.

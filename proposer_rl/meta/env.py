@@ -15,9 +15,11 @@ from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.learner import Learner
 from proposer_rl.meta.rewards import Reward, TrainingStep
 from proposer_rl.meta.view import SolverView
+from proposer_rl.settings import signed
 from proposer_rl.streams import Streams
 
 
+@signed
 class SolverTrainingEnv(EnvBase):
     """Training K Solvers as a batch of K episodes (section 5 of the paper).
 

@@ -1,4 +1,4 @@
-"""First-order performance gain: the value of levels to a Solver, without training replicas of it.
+"""First-order performance gain: what levels bring a Solver, without training replicas of it.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 
@@ -24,7 +24,7 @@ Here u is scaled to a root mean square of 1 over the parameters of each Solver: 
 moves a parameter by about s, as a step of Adam with that learning rate does. For a million
 parameters together that is a long way, on which returns are no straight lines: with s the learning
 rate the difference is a secant, what a step towards the target changes, and with a twentieth of it
-the derivative (docs/first_order.md compares them).
+the derivative (docs/explanation/first_order.md compares them).
 
 Relatives: gradients of training examples aligned with those of a validation set: TracIn (Pruthi et
 al. 2020, arXiv 2002.08484), example weights (Ren et al. 2018, arXiv 1803.09050); in curricula the

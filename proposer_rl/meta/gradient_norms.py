@@ -87,8 +87,8 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
     """Makes what takes the gradient of each level by itself, and a population for it to work with.
 
     The population has :data:`AT_ONCE` Solvers. All of them become copies of one whose levels are to
-    be scored, and each gets one level of its own. So the sum of their values, differentiated
-    once, gives each the gradient of its level.
+    be scored, and each gets one level of its own. So the sum of their values, differentiated once,
+    gives each the gradient of its level.
 
     Args:
         task: that makes Solvers.

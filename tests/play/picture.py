@@ -1,4 +1,4 @@
-"""The picture of the page in docs/play.md: ``python -m tests.play.picture RUN FILE``."""
+"""The picture of the page in docs/how_to/play.md: ``python -m tests.play.picture RUN FILE``."""
 
 from __future__ import annotations
 

@@ -9,12 +9,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
+from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.dynamics import MOVES, successors
 from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
 from proposer_rl.tasks.mazes.rendering import draw_level
 
 
+@signed
 class MazeEnv(LevelEnv):
     """A batch of mazes, one agent in each.
 

@@ -1,4 +1,4 @@
-"""Named levels as text and as JSON, and those of a run's record. docs/levels.md has the formats."""
+"""Named levels as text and JSON, and those of a run's record (formats: docs/how_to/levels.md)."""
 
 from __future__ import annotations
 

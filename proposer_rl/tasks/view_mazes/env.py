@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
+from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import cell_index
 from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
@@ -24,6 +25,7 @@ AGENT = (VIEW // 2, VIEW - 1)  # where the agent is in its view
 PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
 
 
+@signed
 class ViewMazeEnv(LevelEnv):
     """The maze of PAIRED, PLR, ACCEL, SFL and their libraries; a batch of them.
 
@@ -32,12 +34,11 @@ class ViewMazeEnv(LevelEnv):
     - Observation, what a Solver sees: ``"view"``, uint8 ``[*B, 5, 5]``, and ``"direction"``, int64
       ``[*B]``, 0 right, 1 down, 2 left, 3 up. The view shows the cells before the agent: 1 empty, 2
       wall, 8 goal, as MiniGrid's ``image[:, :, 0]`` with ``agent_view_size=5`` and
-      ``see_through_walls=True``, which are the field's. The first index runs from the agent's left
-      to its right, the second from afar to near; the agent is at ``[2, 4]`` and not shown. Walls
-      hide nothing; outside of the grid there are walls.
-    - State besides: ``"agent"``, ``"step_count"``
-    (:class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`),
-      and ``"is_init"``, bool ``[*B, 1]``, whether an episode begins, as TorchRL calls it.
+      ``see_through_walls=True``, as PLR, ACCEL and SFL have it. The first index runs from the
+      agent's left to its right, the second from afar to near; the agent is at ``[2, 4]`` and not
+      shown. Walls hide nothing; outside of the grid there are walls.
+    - State besides: ``"agent"``, ``"step_count"``, and ``"is_init"``, bool ``[*B, 1]``, whether an
+      episode begins, as TorchRL calls it.
     - Reward: float32 ``[*B, 1]``, 1 - 0.9 t / ``max_steps`` on entering the goal with step t, else
       0.
     - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached

@@ -19,7 +19,7 @@ MOST_DRAWS = 1000  # of a level whose goal is to be reachable
 def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
     """Levels with exact numbers of walls; their cells, start, goal and direction are uniform.
 
-    Nothing else is asked of them: the goal may be out of reach, as in the field's generators.
+    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's.
 
     Args:
         count: of the walls of each level, int64 ``[N]`` on the CPU, at most H * W - 2.
