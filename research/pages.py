@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-
-from PIL import Image
 
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
@@ -243,8 +240,7 @@ def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
 
 def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
     path = f"{FIGURES}/{drawing.name}.png"
-    with Image.open(io.BytesIO(render(drawing).png)) as image:
-        files[path] = in_few_colours(image)
+    files[path] = in_few_colours(render(drawing).png)
     return f"![{escape_markdown(drawing.title)}]({path})"
 
 

@@ -19,14 +19,15 @@ from proposer_rl.report import (
     proposals,
     tidy,
 )
-from proposer_rl.report.answer import Meanings, answer, glossary
+from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.records import words
 from proposer_rl.report.stages import stages
+from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
-from proposer_rl.runs.columns import can_reach
+from proposer_rl.runs.columns import can_reach, is_rate
 from proposer_rl.runs.folder import write_atomically
 
 PAGE = "report.html"
@@ -48,10 +49,8 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.diagnostics,
 )
 
-# Of these the page has pictures alone, and of others charts only where levels of several stages
-# can be shown.
+# These are no charts, so that the page has them as pictures.
 STILL = {levels.side_by_side, levels.recorded_by_curricula}
-STAGED = {proposals.heat_maps, levels.along_training}
 
 
 def read_checked(
@@ -118,10 +117,6 @@ def write_report(
     title = "Curricula: what the runs show"
     command = page.report_command("bin/report", folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
-    if len(html) > page.LARGEST:  # the figures that are charts there, too, are files anyway
-        for section in sections:
-            section["figures"] = [one for one in section["figures"] if not one["charted"]]
-        html = page.render(title=title, command=command, sections=sections, notes=notes)
     parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
     parts += [
         markdown.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)
@@ -160,8 +155,6 @@ def _section(
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = tidy.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}
-    staged = stages(study)
-    still = STILL if staged else STILL | STAGED
     figures = []
     for draw in DRAWINGS:
         bar.set_postfix_str(draw.__name__.replace("_", " "))
@@ -169,23 +162,23 @@ def _section(
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
             drawn = render(drawing)
-            figures.append(page.figure(drawing, drawn, draw not in still))
+            if draw in STILL:
+                figures.append(page.figure(drawing, drawn.png))
             files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
-            animations = [panel.animation for panel in drawing.panels if panel.animation]
-            files |= {f"{path}_{_slug(name)}.gif": make() for name, make in animations}
         bar.update()
-    data = {**charts(study), "stages": staged}
+    data = {**charts(study), "stages": stages(study)}
     return {
         "study": study,
         "headline": words(study.headline),
         "answer": answer(study),
-        "glossary": glossary(study),
+        "rate": is_rate(study.headline),
+        "few": FEWEST,
         "facts": page.facts(study),
         "origin": page.origin(study),
         "incomplete": page.incomplete(study),
         "looks": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
-        "staged": staged is not None,
+        "staged": data["stages"] is not None,
         "single": bool(data["levels"]),
         "methods": methods,
         "figures": figures,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from textwrap import fill
 
@@ -24,10 +24,10 @@ from proposer_rl.report.measures import (
     trained,
     worst,
 )
-from proposer_rl.report.records import level_text, words
+from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Look, Panel, axes_of, finish, style
+from proposer_rl.report.style import PANEL, Drawing, Look, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
 
 MOST_PANELS = 12
@@ -49,11 +49,6 @@ def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
     every = measured(study)
     panels = [_panel(study, every[name]) for name in study.measurements[:MOST_PANELS]]
-    bars = Panel(
-        f"Updates until {words(study.headline)} reached "
-        f"{level_text(study.headline, study.threshold)}, by method, the soonest first.",
-        partial(_draw_bars, study=study),
-    )
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
@@ -62,7 +57,7 @@ def learning_curves(study: Study) -> Drawing:
         "runs of the method are that long. Bars: mean number of "
         "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
         "runs, which never got there.",
-        [*panels, bars],
+        [*panels, partial(_draw_bars, study=study)],
         3,
         study.legend,
     )
@@ -169,15 +164,9 @@ def level_by_level(study: Study) -> Drawing | None:
         f"{words(name)} on each of the {task.levels}, against {label}",
         f"Dots: {task.levels}, each the mean over seeds after {study.horizon} updates. Above the "
         f"line the method is better there, below it {label} is.{more}",
-        [
-            Panel(
-                f"{words(name)} of {group.label} against that of {label}, on each level.",
-                partial(_draw_scatter, study=study, group=group, name=name),
-                (SIDE, SIDE),
-            )
-            for _, group in best
-        ],
+        [partial(_draw_scatter, study=study, group=group, name=name) for _, group in best],
         4,
+        size=(SIDE, SIDE),
     )
 
 
@@ -205,34 +194,25 @@ def _drawing(
     caption: str,
     measures: Iterable[Measure],
     columns: int = 3,
-    size: tuple[float, float] | None = None,
+    size: tuple[float, float] = PANEL,
 ) -> Drawing | None:
     """A panel for each measure, with the methods that have any in the legend; None without any."""
     panels, shown = [], set()
     for measure in measures:
-        (series,) = [of for axis, of in measure.axes.items() if axis == next(iter(measure.axes))]
+        series = next(iter(measure.axes.values()))
         having = {group.label for group in study.groups if series(group) is not None}
         if having:
-            panels.append(_panel(study, measure, size=size))
+            panels.append(_panel(study, measure))
             shown |= having
     if not panels:
         return None
     legend = {label: look for label, look in study.legend.items() if label in shown}
-    return Drawing(name, title, caption, panels, columns, legend)
+    return Drawing(name, title, caption, panels, columns, legend, size)
 
 
-def _panel(
-    study: Study,
-    measure: Measure,
-    axis: str | None = None,
-    size: tuple[float, float] | None = None,
-) -> Panel:
+def _panel(study: Study, measure: Measure, axis: str = "") -> Callable[[FigureBase], None]:
     axis = axis or next(iter(measure.axes))
-    panel = Panel(
-        f"{measure.name} against {axis}, by method.",
-        partial(_draw_curves, study=study, measure=measure, axis=axis),
-    )
-    return panel if size is None else panel._replace(size=size)
+    return partial(_draw_curves, study=study, measure=measure, axis=axis)
 
 
 def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str) -> None:

@@ -20,7 +20,6 @@ from proposer_rl.report.style import (
     SKY,
     VERMILLION,
     Drawing,
-    Panel,
     axes_of,
     finish,
 )
@@ -36,11 +35,7 @@ def along_training(study: Study) -> Drawing | None:
     """The paper's Figure 3: levels of the batch at several stages."""
     shown = [(group.label, group.runs[0].samples) for group in study.groups]
     panels = [
-        Panel(
-            f"Levels that {label} trained on at several stages.",
-            partial(_draw_stages, samples=samples, title=label),
-            (SIDE * STAGES, SIDE * BATCH + 0.5),
-        )
+        partial(_draw_stages, samples=samples, title=label)
         for label, samples in shown
         if any(level.picture for sample in samples for level in sample.levels[:BATCH])
     ]
@@ -52,6 +47,7 @@ def along_training(study: Study) -> Drawing | None:
         f"{task.levels.capitalize()} along training (the paper's Figure 3)",
         f"The first {BATCH} {task.levels} of the batch of the method's first seed. {task.key}",
         panels,
+        size=(SIDE * STAGES, SIDE * BATCH + 0.5),
     )
 
 
@@ -62,52 +58,44 @@ def side_by_side(study: Study) -> Drawing | None:
     for group in study.groups:
         samples = group.runs[0].samples if group.proposes else ()
         for stage, sample in zip(("first", "last"), (*samples[:1], *samples[-1:]), strict=False):
-            title = f"{group.label}, {stage} (update {sample.updates})"
-            rows.append((title, sample.levels))
-    panels = [
-        Panel(
-            f"Sample {task.levels}: {title}.",
-            partial(_draw_row, levels=levels, title=title),
-            (SIDE * SAMPLES, SIDE + 0.35),
-        )
-        for title, levels in rows
-        if any(level.picture for level in levels[:SAMPLES])
-    ]
-    if not panels:
-        return None
-    return Drawing(
+            rows.append((f"{group.label}, {stage} (update {sample.updates})", sample.levels))
+    return _in_rows(
+        rows,
         "samples",
         "Samples: what is measured on, and proposals (the paper's Figure 5)",
         f"Random {task.levels} of the distributions, and those that the Proposers made at their "
         f"first and last evaluated update. {task.key}",
-        panels,
-        1,
     )
 
 
 def recorded_by_curricula(study: Study) -> Drawing | None:
     """Levels that curricula recorded: the last time, of each method's first seed."""
-    panels = [
-        Panel(
-            f"{study.example.task.levels.capitalize()} that the curriculum of {group.label} "
-            f"recorded: {caption}.",
-            partial(_draw_row, levels=levels, title=f"{group.label}: {caption}"),
-            (SIDE * SAMPLES, SIDE + 0.35),
-        )
+    task = study.example.task
+    rows = [
+        (f"{group.label}: {caption}", levels)
         for group in study.groups
         for caption, levels in group.runs[0].sheets.items()
+    ]
+    return _in_rows(
+        rows,
+        "recorded",
+        f"{task.levels.capitalize()} that the curricula recorded",
+        "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
+        f"{task.key}",
+    )
+
+
+def _in_rows(
+    rows: Sequence[tuple[str, Sequence[LevelRecord]]], name: str, title: str, caption: str
+) -> Drawing | None:
+    """A row of pictures for each title that has any; None without one."""
+    panels = [
+        partial(_draw_row, levels=levels, title=head)
+        for head, levels in rows
         if any(level.picture for level in levels[:SAMPLES])
     ]
-    if not panels:
-        return None
-    return Drawing(
-        "recorded",
-        f"{study.example.task.levels.capitalize()} that the curricula recorded",
-        "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
-        f"{study.example.task.key}",
-        panels,
-        1,
-    )
+    size = (SIDE * SAMPLES, SIDE + 0.35)
+    return Drawing(name, title, caption, panels, 1, size=size) if panels else None
 
 
 def draw_run(folder: Path, title: str) -> Path:

@@ -117,6 +117,7 @@
     const stage = found.stages[number], [x, y] = found.curve, [rows, columns] = data.stages.axes.length > 1
       ? data.stages.axes : [null, data.stages.axes[0]];
     const reached = y[x.indexOf(stage.updates)] ?? null;
+    parts.levels.parentElement.hidden = !found.stages.some((each) => each.levels.length);
     parts.moment.textContent = `update ${stage.updates}: ${short(reached)}`;
     parts.levels.replaceChildren(...stage.levels.map((level, i) => {
       const name = `number ${i + 1} of the batch at update ${stage.updates}`;
@@ -263,6 +264,6 @@
     for (const section of document.querySelectorAll("section.study")) await study(section);
     document.documentElement.dataset.ready = "1";
   };
-  // A browser that cannot do this shows the still figures.
+  // A browser that cannot do this shows tables, and where the figures are.
   start().catch(() => document.documentElement.classList.remove("live-page"));
 })();

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
+import io
 import json
 import shlex
 from collections.abc import Sequence
@@ -19,12 +20,10 @@ from proposer_rl.report.answer import Meanings, meaning
 from proposer_rl.report.records import anywhere, level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import DPI, Drawing, Drawn, Look, in_few_colours
+from proposer_rl.report.style import DPI, Drawing, in_few_colours
 
 PIXELS = 78  # of an inch of a figure
-LARGEST = 8 * 2**20  # bytes of a page
 LONGEST_WORD = 2000  # of a command
-WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
 MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
 
@@ -58,37 +57,31 @@ def pack(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def figure(drawing: Drawing, drawn: Drawn, charted: bool = False) -> Section:
-    """A figure as the page shows it: each panel an image of its own, so that they can wrap.
-
-    Args:
-        drawing: the figure.
-        drawn: the same.
-        charted: whether the page has a chart of the same, which stands in for it in a browser.
-    """
-    legend = [{"label": label, **_look(look)} for label, look in drawing.legend.items()]
+def figure(drawing: Drawing, png: bytes) -> Section:
+    """A figure that is none of the charts, as the page shows it."""
+    with Image.open(io.BytesIO(png)) as image:
+        width = round(image.width * PIXELS / DPI)
+    content = base64.b64encode(in_few_colours(png)).decode()
     return {
         "title": drawing.title,
         "caption": drawing.caption,
-        "images": [
-            _image(panel.description, picture)
-            for panel, picture in zip(drawing.panels, drawn.panels, strict=True)
-        ],
-        "legend": legend,
-        "charted": charted,
+        "address": f"data:image/png;base64,{content}",
+        "width": width,
     }
 
 
 def methods(study: Study, meanings: Meanings) -> list[Section]:
     """The methods with their looks and what they do, in their order in the charts."""
     return [
-        {"label": group.label, "meaning": meaning(group, meanings), **_look(group.look)}
+        {
+            "label": group.label,
+            "meaning": meaning(group, meanings),
+            "colour": group.look.colour,
+            "dash": DASHES[group.look.dash],
+            "mark": MARKS[group.look.mark],
+        }
         for group in study.groups
     ]
-
-
-def _look(look: Look) -> Section:
-    return {"colour": look.colour, "dash": DASHES[look.dash], "mark": MARKS[look.mark]}
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
@@ -144,18 +137,6 @@ def configs(study: Study) -> list[tuple[str, str]]:
         (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
         for group in study.groups
     ]
-
-
-def _image(description: str, picture: Image.Image) -> Section:
-    content = base64.b64encode(in_few_colours(picture)).decode()
-    width, height = (side / DPI for side in picture.size)
-    return {
-        "address": f"data:image/png;base64,{content}",
-        "description": description,
-        "width": round(width * PIXELS),
-        "height": round(height * PIXELS),
-        "wide": width >= WIDE,
-    }
 
 
 def _digest(script: str) -> str:

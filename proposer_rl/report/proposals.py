@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
@@ -29,14 +26,12 @@ from proposer_rl.report.reading import read_run
 from proposer_rl.report.records import GAINS, Column, Record, number
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import SETTINGS, Drawing, Panel, axes_of, finish
+from proposer_rl.report.style import SETTINGS, Drawing, axes_of, finish
 
 STAGES = 5
 STRIP = (7.6, 2.1)  # inches, of a row of heat maps
-ANIMATION = (3.6, 3.0)
-FRAME_SECONDS = 0.5
+SINGLE = (3.6, 3.0)
 MOST_TICKS = 10
-MOST_FRAMES = 150
 
 
 def gains(study: Study) -> Drawing | None:
@@ -53,13 +48,7 @@ def gains(study: Study) -> Drawing | None:
         "(the paper's Figure 4)",
         "Dots: the total gain on the target of every replica of every seed over one "
         "meta-episode. Lines: maximum and mean over a cycle's replicas, averaged over the seeds.",
-        [
-            Panel(
-                f"Total {GAINS[name]} gains of the replicas against Solver updates, {group.label}.",
-                partial(_draw_gains, group=group, name=name, every=every[name]),
-            )
-            for group, name in shown
-        ],
+        [partial(_draw_gains, group=group, name=name, every=every[name]) for group, name in shown],
     )
 
 
@@ -75,15 +64,11 @@ def heat_maps(study: Study) -> Drawing | None:
         "under domain randomization, orange is more, purple less: a map that stays "
         "white is a Proposer that has not learnt, or seeds that went different ways.",
         [
-            Panel(
-                f"Heat maps of the proposals of {group.label} at several stages of training.",
-                partial(_draw_strip, group=group, updates=updates, shares=shares),
-                STRIP,
-                (group.label, partial(_animate, group, updates, shares)),
-            )
+            partial(_draw_strip, group=group, updates=updates, shares=shares)
             for group, (updates, shares) in found
         ],
         1,
+        size=STRIP,
     )
 
 
@@ -114,7 +99,8 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
         return None
     with rc_context(SETTINGS):
         drawn = share_map(shares)
-        figure, _, _ = _one_map(drawn, run, drawn.max())
+        figure = Figure(figsize=SINGLE, layout="constrained")
+        _draw_maps(figure, [axes_of(figure)], [drawn], run, drawn.max())
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -146,32 +132,9 @@ def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Colum
     figure.suptitle(group.label, fontsize=10, x=0.01, ha="left")
 
 
-def _animate(group: Group, updates: Column, shares: Column) -> bytes:
-    frames = np.unique(np.linspace(0, len(shares) - 1, min(len(shares), MOST_FRAMES)).round())
-    with rc_context(SETTINGS), tempfile.TemporaryDirectory() as folder:
-        figure, axes, mesh = _one_map(shares[0], group.runs[0], shares.max())
-        title = axes.set_title("")
-
-        def draw(frame: float) -> list[Any]:
-            mesh.set_array(shares[int(frame)])
-            title.set_text(f"{group.label}, update {updates[int(frame)]:.0f}")
-            return [mesh, title]
-
-        file = Path(folder) / "animation.gif"
-        writer = PillowWriter(fps=round(1 / FRAME_SECONDS))
-        FuncAnimation(figure, draw, frames=list(frames)).save(file, writer=writer, dpi=100)
-        return file.read_bytes()
-
-
-def _one_map(share: Column, run: Run, largest: float) -> tuple[Figure, Axes, Any]:
-    figure = Figure(figsize=ANIMATION, layout="constrained")
-    axes = axes_of(figure)
-    return figure, axes, _draw_maps(figure, [axes], [share], run, largest)
-
-
 def _draw_maps(
     figure: FigureBase, row: Sequence[Axes], shares: Sequence[Column], run: Run, largest: float
-) -> Any:
+) -> None:
     """Maps side by side with one bar of colours: white is even, orange more, purple less."""
     even = 1 / shares[0].size
     largest = max(largest, 2 * even)
@@ -190,7 +153,6 @@ def _draw_maps(
     bar.set_ticks([0, even, largest])
     bar.set_label("share of proposals", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    return mesh
 
 
 def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:

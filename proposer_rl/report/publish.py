@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from proposer_rl.report.markdown import document, section
 from proposer_rl.report.page import report_command
@@ -81,8 +78,7 @@ def write_page(folder: Path) -> None:
         (folder / "figures").mkdir(exist_ok=True)
         drawings = [each for each in (learning_curves(study), heat_maps(study)) if each]
         for drawing in drawings:
-            with Image.open(io.BytesIO(render(drawing).png)) as image:
-                picture = in_few_colours(image)
+            picture = in_few_colours(render(drawing).png)
             write_atomically(folder / f"{prefix}{drawing.name}.png", picture)
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]

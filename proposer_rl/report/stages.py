@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from proposer_rl.report.charts import plain
-from proposer_rl.report.records import LevelRecord, SampleRecord, number, picture
+from proposer_rl.report.records import LevelRecord, number, picture
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.studies import Study
 
@@ -25,15 +26,24 @@ MOST_BYTES = 2**20  # of all pictures of a study
 def stages(study: Study) -> dict[str, Json] | None:
     """What the page's slider shows: of every method one run, the first that recorded levels.
 
+    Where none of a method's runs did, the first that recorded proposals.
+
     Returns:
         ``axes``: names and values of the space of levels, at most two. ``pictures``: each once, a
         PNG in base64. ``methods``: for every method null or the ``seed``, the ``curve`` of its
         headline and the ``stages``: updates, ``levels`` (the number of a picture, or lines of
         text) and ``map``, the last record of what was proposed (rows of shares) or null.
-        ``first``: the number of the method to begin with. None where no run recorded levels, or
-        their pictures are too large for a page.
+        ``first``: the number of the method to begin with. None where no run recorded either, or
+        the pictures are too large for a page.
     """
-    runs = [next((run for run in group.runs if run.samples), None) for group in study.groups]
+    like = study.example
+    runs = [
+        next((run for run in group.runs if run.samples), None)
+        or next(
+            (run for run in group.runs if any(like.shares(c) is not None for c in run.cycles)), None
+        )
+        for group in study.groups
+    ]
     for most in STAGES:
         pictures: dict[str, int] = {}
         methods = [None if run is None else _method(run, study, most, pictures) for run in runs]
@@ -47,7 +57,7 @@ def stages(study: Study) -> dict[str, Json] | None:
     proposed = [number for number, method in shown.items() if method["stages"][-1]["map"]]
     axes = [
         {"name": name, "values": plain(values)}
-        for name, values in list(study.example.task.space.items())[:2]
+        for name, values in list(like.task.space.items())[:2]
     ]
     return {
         "axes": axes,
@@ -58,21 +68,26 @@ def stages(study: Study) -> dict[str, Json] | None:
 
 
 def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict[str, Json]:
-    samples = run.samples
-    chosen = np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).round())
+    moments: list[tuple[int, Sequence[LevelRecord]]] = [(s.updates, s.levels) for s in run.samples]
+    if not moments:
+        recorded = [c for c in run.cycles if number(c.get("seed", run.seed)) == run.seed]
+        moments = [
+            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in recorded})
+        ]
+    last = len(moments) - 1
+    chosen = np.unique(np.linspace(0, last, min(most, len(moments))).round()).astype(int)
     curve = (run.metrics["updates"], run.metrics[study.headline])
     return {
         "seed": run.seed,
         "curve": [plain(values) for values in curve],
-        "stages": [_stage(run, study.example, samples[int(i)], pictures) for i in chosen],
-    }
-
-
-def _stage(run: Run, like: Run, sample: SampleRecord, pictures: dict[str, int]) -> Json:
-    return {
-        "updates": sample.updates,
-        "levels": [_level(level, pictures) for level in sample.levels[:LEVELS]],
-        "map": _map(run, like, sample.updates),
+        "stages": [
+            {
+                "updates": moments[i][0],
+                "levels": [_level(level, pictures) for level in moments[i][1][:LEVELS]],
+                "map": _map(run, study.example, moments[i][0]),
+            }
+            for i in chosen
+        ],
     }
 
 
