@@ -41,7 +41,7 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.worst_curves,
     curves.level_by_level,
     curves.difficulty,
-    proposals.gains,
+    curves.gains_of_replicas,
     proposals.heat_maps,
     levels.along_training,
     levels.side_by_side,
@@ -157,7 +157,6 @@ def _section(
     files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}
     figures = []
     for draw in DRAWINGS:
-        bar.set_postfix_str(draw.__name__.replace("_", " "))
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"

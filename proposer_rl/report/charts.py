@@ -22,8 +22,6 @@ from proposer_rl.report.measures import (
     trained,
     worst,
 )
-from proposer_rl.report.records import Column
-from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
@@ -38,9 +36,8 @@ def charts(study: Study) -> dict[str, Json]:
 
     Returns:
         ``methods``: each with its look and seeds. ``axes``: what can be on the abscissa.
-        ``places``: of every method's runs where they were evaluated, by axis. ``measures``: each
-        by axis with mean and interval of every method, and with ``rows`` of its runs, at their
-        places or, where they are another table's, at the means' own; null where there is none.
+        ``measures``: each by axis with mean and interval of every method, and with ``rows`` of its
+        runs and their ``seeds``; null where there is none.
         ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
         that two methods have for single levels what each reaches there, null without records.
         ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
@@ -56,7 +53,6 @@ def charts(study: Study) -> dict[str, Json]:
             for group in study.groups
         ],
         "axes": [UPDATES, *COSTS],
-        "places": [[_places(run) for run in group.runs] for group in study.groups],
         "measures": [
             _measure(study, each)
             for each in (
@@ -79,31 +75,11 @@ def plain(values: Iterable[float]) -> list[float | None]:
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in map(float, values)]
 
 
-def _places(run: Run) -> Json:
-    costs = {axis: plain(cost(run)) for axis, cost in COSTS.items()}
-    return {UPDATES: plain(run.metrics["updates"]), **costs}
-
-
 def _measure(study: Study, measure: Measure) -> Json:
-    """Means and intervals by axis, and the rows of single runs.
-
-    Those of a column of ``metrics`` stand at the runs' own places, others at the means'.
-    """
-    found = {axis: [of(group) for group in study.groups] for axis, of in measure.axes.items()}
-    first = next(iter(found.values()))
-    if measure.column:
-        rows = [[_row(r.metrics.get(measure.column)) for r in g.runs] for g in study.groups]
-    else:
-        rows = [
-            [_row(_of_run(series, run)) for run in group.runs]
-            for group, series in zip(study.groups, first, strict=True)
-        ]
     return {
         "kind": measure.kind,
         "name": measure.name,
-        "axes": {axis: [_means(one) for one in series] for axis, series in found.items()},
-        "rows": rows,
-        "own": not measure.column,
+        "axes": {axis: [_series(of(g)) for g in study.groups] for axis, of in measure.axes.items()},
         "rate": measure.rate,
         "log": measure.log,
     }
@@ -126,7 +102,7 @@ def _levels(study: Study) -> list[Json]:
     ]
 
 
-def _means(series: Series | None) -> Json:
+def _series(series: Series | None) -> Json:
     if series is None:
         return None
     found = band(series.rows)
@@ -136,16 +112,9 @@ def _means(series: Series | None) -> Json:
         "whole": found.whole.tolist(),
         "low": plain(found.low),
         "high": plain(found.high),
+        "seeds": [run.seed for run in series.runs],
+        "rows": [plain(row) for row in series.rows],
     }
-
-
-def _of_run(series: Series | None, run: Run) -> Column | None:
-    rows = () if series is None else zip(series.runs, series.rows, strict=True)
-    return next((row for one, row in rows if one is run), None)
-
-
-def _row(values: Column | None) -> Json:
-    return None if values is None else plain(values)
 
 
 def _outcomes(study: Study) -> list[Json]:

@@ -17,12 +17,14 @@ from proposer_rl.report.measures import (
     Measure,
     Series,
     band,
+    gains,
     level_means,
     measured,
     of_levels,
     own_numbers,
     trained,
     worst,
+    worst_tenths,
 )
 from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST
@@ -63,21 +65,6 @@ def learning_curves(study: Study) -> Drawing:
     )
 
 
-def worst_levels(study: Study) -> Drawing | None:
-    """The tenth of the levels where the Solver is worst; None where that was not measured."""
-    levels, every = study.example.task.levels, measured(study)
-    names = [f"{name}_worst10" for name in study.measurements[:MOST_PANELS]]
-    return _drawing(
-        study,
-        "worst_levels",
-        f"The worst tenth of the {levels} (CVaR)",
-        f"Mean over the 10 % of the {levels} where the Solver is worst at that "
-        "moment: a policy that gives up on hard ones shows here first.",
-        [every[name] for name in names if name in every],
-        2,
-    )
-
-
 def cost_curves(study: Study) -> Drawing:
     """The headline against updates and every cost, the curriculum's part included."""
     measure = measured(study)[study.headline]
@@ -98,47 +85,6 @@ def cost_curves(study: Study) -> Drawing:
         [_panel(study, measure, axis) for axis in measure.axes],
         3,
         study.legend,
-    )
-
-
-def difficulty(study: Study) -> Drawing | None:
-    """What the Solver trained on, by the task's own statistics."""
-    return _drawing(
-        study,
-        "difficulty",
-        "What the Solver trained on",
-        "Statistics of the task over the batch of each evaluated update: means, or where a name "
-        "says so standard deviations (sd). Lines and bands as above.",
-        trained(study)[:MOST_PANELS],
-    )
-
-
-def diagnostics(study: Study) -> Drawing | None:
-    """How the curricula's own training goes: whatever numbers they recorded."""
-    return _drawing(
-        study,
-        "diagnostics",
-        "The curricula's own numbers",
-        "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, "
-        "mean over standard deviation between the replicas: where it is large, all replicas gain "
-        "alike whatever they are proposed, and there is little to learn from.",
-        own_numbers(study),
-        size=SMALL,
-    )
-
-
-def worst_curves(study: Study) -> Drawing | None:
-    """Mean over the worst levels against their share, of each distribution; None without any."""
-    levels = study.example.task.levels
-    return _drawing(
-        study,
-        "worst_share",
-        f"The worst share of the {levels} at the end (CVaR)",
-        f"Mean over the share of the {levels} where a Solver is worst, after {study.horizon} "
-        "updates: at 100 % the mean over all. Each seed has worst levels of its own. Lines: mean "
-        f"over seeds, with bands as above. {SELECTION[study.example.task.exact]}",
-        worst(study),
-        2,
     )
 
 
@@ -187,29 +133,6 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
     return mean
 
 
-def _drawing(
-    study: Study,
-    name: str,
-    title: str,
-    caption: str,
-    measures: Iterable[Measure],
-    columns: int = 3,
-    size: tuple[float, float] = PANEL,
-) -> Drawing | None:
-    """A panel for each measure, with the methods that have any in the legend; None without any."""
-    panels, shown = [], set()
-    for measure in measures:
-        series = next(iter(measure.axes.values()))
-        having = {group.label for group in study.groups if series(group) is not None}
-        if having:
-            panels.append(_panel(study, measure))
-            shown |= having
-    if not panels:
-        return None
-    legend = {label: look for label, look in study.legend.items() if label in shown}
-    return Drawing(name, title, caption, panels, columns, legend, size)
-
-
 def _panel(study: Study, measure: Measure, axis: str = "") -> Callable[[FigureBase], None]:
     axis = axis or next(iter(measure.axes))
     return partial(_draw_curves, study=study, measure=measure, axis=axis)
@@ -247,16 +170,15 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     found.sort(key=lambda each: -each[0].estimate)
     groups = [group for _, group in found]
     for place, (interval, group) in enumerate(found):
-        waiting = group.waiting(study.headline, study.threshold)
+        waiting = [run.reached(study.headline, study.threshold) for run in group.runs]
         colour = group.look.colour
         axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
         axes.plot(interval[1:], [place] * 2, color=colour, linewidth=2.5)
         offsets = place + np.linspace(-0.2, 0.2, len(waiting)) * (len(waiting) > 1)
-        for run, y in zip(waiting, offsets, strict=True):
-            marker = "o" if run.reached else ">"
-            face = colour if run.reached else "white"
-            axes.plot(min(run.updates, horizon), y, marker, ms=4.5, mfc=face, mec=colour, mew=0.9)
-        censored = sum(not run.reached for run in waiting)
+        for reached, y in zip(waiting, offsets, strict=True):
+            marker, face = (">", "white") if np.isnan(reached) else ("o", colour)
+            axes.plot(np.fmin(reached, horizon), y, marker, ms=4.5, mfc=face, mec=colour, mew=0.9)
+        censored = int(np.isnan(waiting).sum())
         axes.annotate(
             f"{censored} of {len(waiting)} censored" if censored else "all reached it",
             (horizon * 1.03, place),
@@ -269,3 +191,80 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
     axes.set_xlabel(waiting_outcome(study).name)
+
+
+def _of_measures(
+    name: str,
+    title: str,
+    caption: str,
+    measures: Callable[[Study], Iterable[Measure]],
+    columns: int = 3,
+    size: tuple[float, float] = PANEL,
+) -> Callable[[Study], Drawing | None]:
+    """A figure with a panel for each measure that a method has; None without any.
+
+    Title and caption may name what ``levels`` are called, the ``horizon``, and what ``selection``
+    does to the worst of them.
+    """
+
+    def draw(study: Study) -> Drawing | None:
+        panels, shown = [], set()
+        for measure in measures(study):
+            series = next(iter(measure.axes.values()))
+            having = {group.label for group in study.groups if series(group) is not None}
+            if having:
+                panels.append(_panel(study, measure))
+                shown |= having
+        if not panels:
+            return None
+        task = study.example.task
+        words = {"levels": task.levels, "horizon": study.horizon}
+        words["selection"] = SELECTION[task.exact]
+        legend = {label: look for label, look in study.legend.items() if label in shown}
+        texts = (text.format_map(words) for text in (title, caption))
+        return Drawing(name, *texts, panels, columns, legend, size)
+
+    return draw
+
+
+worst_levels = _of_measures(
+    "worst_levels",
+    "The worst tenth of the {levels} (CVaR)",
+    "Mean over the 10 % of the {levels} where the Solver is worst at that moment: a policy that "
+    "gives up on hard ones shows here first.",
+    worst_tenths,
+    2,
+)
+worst_curves = _of_measures(
+    "worst_share",
+    "The worst share of the {levels} at the end (CVaR)",
+    "Mean over the share of the {levels} where a Solver is worst, after {horizon} updates: at "
+    "100 % the mean over all. Each seed has worst levels of its own. Lines: mean over seeds, with "
+    "bands as above. {selection}",
+    worst,
+    2,
+)
+difficulty = _of_measures(
+    "difficulty",
+    "What the Solver trained on",
+    "Statistics of the task over the batch of each evaluated update: means, or where a name says "
+    "so standard deviations (sd). Lines and bands as above.",
+    trained,
+)
+gains_of_replicas = _of_measures(
+    "gains",
+    "Total gain of the replicas in each cycle (the paper's Figure 4)",
+    "The total gain on the target of the replicas over one meta-episode: maximum and mean over a "
+    "cycle's replicas. Lines and bands as above.",
+    gains,
+    2,
+)
+diagnostics = _of_measures(
+    "diagnostics",
+    "The curricula's own numbers",
+    "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, mean "
+    "over standard deviation between the replicas: where it is large, all replicas gain alike "
+    "whatever they are proposed, and there is little to learn from.",
+    own_numbers,
+    size=SMALL,
+)

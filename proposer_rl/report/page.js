@@ -57,11 +57,10 @@
       if (!series.whole.every(Boolean))
         lines.push({ ...look, x: series.x, y: series.mean, line: { ...line, width: 0.8 }, ...hover });
       lines.push({ ...look, x: series.x, y: series.mean.map(whole), line, ...hover, meta: "mean" });
-      measure.rows[m].forEach((row, r) => {
-        if (!row || !seeds.has(method.seeds[r])) return;
-        const x = measure.own ? series.x : data.places[m][r][along];
-        single.push({ ...look, x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
-          hovertemplate: `<b>${name}</b>, seed ${method.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
+      series.rows.forEach((row, r) => {
+        if (!seeds.has(series.seeds[r])) return;
+        single.push({ ...look, x: series.x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
+          hovertemplate: `<b>${name}</b>, seed ${series.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
       });
     });
     return [...bands, ...single, ...lines];

@@ -14,42 +14,16 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
-from proposer_rl.report.measures import (
-    OF_REPLICAS,
-    UPDATES,
-    lists,
-    of_gains,
-    over_cycles,
-    recorded_gain,
-)
 from proposer_rl.report.reading import read_run
-from proposer_rl.report.records import GAINS, Column, Record, number
+from proposer_rl.report.records import Column, number
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import SETTINGS, Drawing, axes_of, finish
+from proposer_rl.report.style import SETTINGS, Drawing, axes_of
 
 STAGES = 5
 STRIP = (7.6, 2.1)  # inches, of a row of heat maps
 SINGLE = (3.6, 3.0)
 MOST_TICKS = 10
-
-
-def gains(study: Study) -> Drawing | None:
-    """The paper's Figure 4: maximum and mean total gain of a cycle's replicas."""
-    shown = [(group, name) for group in study.groups if (name := recorded_gain(group))]
-    every = {name: np.zeros(1) for _, name in shown}  # of all groups, so that axes are alike
-    for group, name in shown:
-        every[name] = np.concatenate([every[name], *(c for _, c in lists(group, name))])
-    if not shown:
-        return None
-    return Drawing(
-        "gains",
-        f"Total gain in {' or '.join(map(GAINS.__getitem__, every))} of the replicas in each cycle "
-        "(the paper's Figure 4)",
-        "Dots: the total gain on the target of every replica of every seed over one "
-        "meta-episode. Lines: maximum and mean over a cycle's replicas, averaged over the seeds.",
-        [partial(_draw_gains, group=group, name=name, every=every[name]) for group, name in shown],
-    )
 
 
 def heat_maps(study: Study) -> Drawing | None:
@@ -72,18 +46,6 @@ def heat_maps(study: Study) -> Drawing | None:
     )
 
 
-def axis_means(run: Run, cycle: Record) -> list[float] | None:
-    """Mean value of a cycle's proposals along each axis; None without a histogram."""
-    shares = run.shares(cycle)
-    if shares is None:
-        return None
-    sides = range(shares.ndim)
-    return [
-        float(shares.sum(tuple(other for other in sides if other != side)) @ values)
-        for side, values in zip(sides, run.task.space.values(), strict=True)
-    ]
-
-
 def last_map(folder: Path) -> NDArray[np.uint8] | None:
     """The heat map of a running experiment's last cycle as pixels, uint8 [H, W, 3].
 
@@ -104,23 +66,6 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _draw_gains(figure: FigureBase, group: Group, name: str, every: Column) -> None:
-    axes = axes_of(figure)
-    colour = group.look.colour
-    points = np.array([(updates, gain) for updates, c in lists(group, name) for gain in c])
-    # As pixels also in SVG, where thousands of dots would make the page heavy.
-    axes.plot(*points.T, ".", color=colour, ms=3, alpha=0.35, rasterized=True)
-    for (text, reduce), dash in zip(OF_REPLICAS.items(), ("-", "--"), strict=True):
-        series = over_cycles(group, partial(of_gains, names=[name], reduce=reduce))
-        assert series is not None  # or there would be no panel
-        mean = np.ma.masked_invalid(series.rows).mean(0)
-        axes.plot(series.x, mean, dash, color=colour, label=f"{text} of the replicas")
-    axes.axhline(0, color="0.2", linewidth=0.8)
-    finish(axes, UPDATES, f"total gain in target {GAINS[name]}", [every])
-    axes.set_title(group.label)
-    axes.legend(loc="best")
 
 
 def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Column) -> None:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-from proposer_rl.report.progress import recorded_activity
 from proposer_rl.report.reading import FAILURE, begun
 from proposer_rl.report.records import number, small_json
 from proposer_rl.runs.folder import read_bounded
@@ -36,23 +35,19 @@ class Left(NamedTuple):
         of: so many.
         seconds: that they will take; None where nothing has finished yet.
         at_once: runs that go on side by side.
-        unlike: of how many of these nothing has finished that differs in the seed alone.
     """
 
     runs: int
     of: int
     seconds: float | None
     at_once: int
-    unlike: int
 
     def text(self) -> str:
         """As in ``sweep: 30 of 50 runs left, about 5 h, 2 at a time``."""
         said = f"sweep: {self.runs} of {self.of} runs left"
         if not self.runs or self.seconds is None:
             return said
-        said += f", about {duration(self.seconds)}, {self.at_once} at a time"
-        guessed = f"; of {self.unlike} no other seed has finished: they count as the others' mean"
-        return said + guessed * (self.unlike > 0)
+        return f"{said}, about {duration(self.seconds)}, {self.at_once} at a time"
 
 
 def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
@@ -64,7 +59,7 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
     ``${scale}``, not at all.
 
     A run takes as long as the mean of the finished ones that differ from it in the seed alone, or
-    else of all; one that goes on what it says itself.
+    else of all; of one that goes on that is the whole.
 
     Args:
         folder: of the sweep, with its plan.
@@ -79,7 +74,7 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
     asked, aside = _asked(planned, plan)
     finished: set[frozenset[str]] = set()
     spent: defaultdict[frozenset[str], list[float]] = defaultdict(list)
-    going: list[tuple[frozenset[str], float]] = []
+    going = 0
     for path, files in begun(folder):
         if SUMMARY in files:
             said = _mapping(path / SUMMARY)
@@ -87,27 +82,16 @@ def left(folder: Path, planned: Sequence[Collection[str]]) -> Left | None:
             finished.add(settings)
             if math.isfinite(took := number(said.get("seconds"))):
                 spent[_but_for_the_seed(settings)].append(took)
-        elif FAILURE in files:
-            continue
-        elif FILE in files and time.time() - (path / FILE).stat().st_mtime < GOING:
-            activity = recorded_activity(path)
-            seconds = activity.seconds_left if activity else None
-            rest = math.nan if seconds is None else seconds
-            going.append((_settings(_mapping(path / "run.json").get("overrides"), aside), rest))
+        elif FAILURE not in files and FILE in files:
+            going += time.time() - (path / FILE).stat().st_mtime < GOING
     every = [took for alike in spent.values() for took in alike]
-    runs, unlike, total = 0, 0, 0.0
-    for own in asked:
-        if own in finished:
-            continue
-        runs += 1
-        own_guess = [rest for settings, rest in going if own == settings and math.isfinite(rest)]
-        like = spent.get(_but_for_the_seed(own), [])
-        unlike += not own_guess and not like
-        known = own_guess[:1] or like or every
-        total += float(np.mean(known)) if known else math.nan
-    at_once = max(len(going), 1)
-    seconds = None if math.isnan(total) else total / at_once
-    return Left(runs, len(planned), seconds, at_once, unlike)
+    rest = [own for own in asked if own not in finished]
+    at_once = max(going, 1)
+    seconds = None
+    if every:
+        known = (spent.get(_but_for_the_seed(own), every) for own in rest)
+        seconds = sum(float(np.mean(alike)) for alike in known) / at_once
+    return Left(len(rest), len(planned), seconds, at_once)
 
 
 def _asked(

@@ -87,7 +87,8 @@ def test_lines_and_bands_are_mean_and_interval_of_the_files(
         ]
         found = np.transpose([series["mean"], series["low"], series["high"]])
         assert found == pytest.approx(np.array(expected), abs=2e-5)
-        assert measure["rows"][place] == [[r["id_success"] for r in rows] for rows in folders]
+        assert series["rows"] == [[r["id_success"] for r in rows] for rows in folders]
+        assert series["seeds"] == list(range(SEEDS))
 
 
 def test_against_a_cost_runs_stand_between_their_measurements(
@@ -100,13 +101,13 @@ def test_against_a_cost_runs_stand_between_their_measurements(
     }
     folders = [rows_of(runs / f"mine{seed}") for seed in range(SEEDS)]
     for axis, cost in costs.items():
-        series, places = measure["axes"][axis][0], data["places"][0]
-        assert [run[axis] for run in places] == [[cost(r) for r in rows] for rows in folders]
+        series = measure["axes"][axis][0]
         for i in (1, 20, 50, 98):
             values = [
                 between(series["x"][i], [cost(r) for r in rows], [r["id_success"] for r in rows])
                 for rows in folders
             ]
+            assert [row[i] for row in series["rows"]] == pytest.approx(values, abs=1e-4)
             found = [series["mean"][i], series["low"][i], series["high"][i]]
             assert found == pytest.approx(mean_and_interval(values), abs=1e-4)
 
@@ -135,6 +136,8 @@ def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         "whole": [True, True, False],
         "low": [None] * 3,
         "high": [None] * 3,
+        "seeds": [0, 1],
+        "rows": [[0, 0.5, 0.9], [0, 0.1, None]],
     }
     assert data["outcomes"][0]["methods"][0]["values"][1] is None
 
@@ -209,7 +212,8 @@ def test_a_page_of_many_long_runs_stays_small(
         write_jsonl(tmp_path / f"m{number}-0" / "curriculum.jsonl", lines)
     written = write_report([tmp_path], tmp_path / "out", progress=False)
     (data,) = page_data(written)
-    assert len(data["methods"]) == 18 and len(data["places"][0]) == 10
+    assert len(data["methods"]) == 18
+    assert len(data["measures"][0]["axes"][UPDATES][0]["rows"]) == 10
     assert written.stat().st_size < SIZE - FIGURES
 
 
