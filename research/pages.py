@@ -12,7 +12,7 @@ from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.report import curves, page, proposals
+from proposer_rl.report import curves, page, pictures
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
@@ -45,7 +45,7 @@ SCARCE = ("updates of the Solver", "environment frames", "seconds")
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.learning_curves,
     curves.cost_curves,
-    proposals.heat_maps,
+    pictures.heat_maps,
     curves.difficulty,
 )
 

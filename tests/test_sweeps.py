@@ -13,7 +13,7 @@ from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
-from proposer_rl.report.sweeps import PLAN, Left, left
+from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
 from tests.commands import call

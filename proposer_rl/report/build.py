@@ -5,25 +5,22 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from proposer_rl.report import (
     curves,
-    levels,
-    markdown,
     outcomes,
     page,
-    proposals,
+    pictures,
     tidy,
 )
 from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.records import words
-from proposer_rl.report.stages import stages
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
@@ -42,15 +39,15 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.level_by_level,
     curves.difficulty,
     curves.gains_of_replicas,
-    proposals.heat_maps,
-    levels.along_training,
-    levels.side_by_side,
-    levels.recorded_by_curricula,
+    pictures.heat_maps,
+    pictures.along_training,
+    pictures.side_by_side,
+    pictures.recorded_by_curricula,
     curves.diagnostics,
 )
 
 # These are no charts, so that the page has them as pictures.
-STILL = {levels.side_by_side, levels.recorded_by_curricula}
+STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
 
 
 def read_checked(
@@ -118,12 +115,14 @@ def write_report(
     command = page.report_command("bin/report", folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
     parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
-    parts += [
-        markdown.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)
-    ]
-    files["report.md"] = markdown.document(parts, command, notes).encode()
-    write_files(output, files, (FIGURES, TABLES))
-    write_atomically(output / PAGE, html.encode())
+    parts += [page.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)]
+    files["report.md"] = page.document(parts, command, notes).encode()
+    for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        path.mkdir(parents=True)
+    for name, content in {**files, PAGE: html.encode()}.items():
+        write_atomically(output / name, content)
     return output / PAGE
 
 
@@ -165,7 +164,7 @@ def _section(
                 figures.append(page.figure(drawing, drawn.png))
             files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
         bar.update()
-    data = {**charts(study), "stages": stages(study)}
+    data = charts(study)
     return {
         "study": study,
         "headline": words(study.headline),
@@ -185,17 +184,6 @@ def _section(
         "commands": page.commands(study),
         "configs": page.configs(study),
     }
-
-
-def write_files(output: Path, files: Mapping[str, bytes], folders: Sequence[str]) -> None:
-    """Replace a report's files; those of a former one in these folders are removed."""
-    for folder in folders:
-        path = output / folder
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        path.mkdir(parents=True)
-    for name, content in files.items():
-        write_atomically(output / name, content)
 
 
 def _slug(text: str) -> str:

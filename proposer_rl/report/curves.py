@@ -218,11 +218,11 @@ def _of_measures(
         if not panels:
             return None
         task = study.example.task
-        words = {"levels": task.levels, "horizon": study.horizon}
-        words["selection"] = SELECTION[task.exact]
+        selection = SELECTION[task.exact]
+        terms = {"levels": task.levels, "horizon": study.horizon, "selection": selection}
         legend = {label: look for label, look in study.legend.items() if label in shown}
-        texts = (text.format_map(words) for text in (title, caption))
-        return Drawing(name, *texts, panels, columns, legend, size)
+        head, text = title.format_map(terms), caption.format_map(terms)
+        return Drawing(name, head, text, panels, columns, legend, size)
 
     return draw
 

@@ -1,4 +1,4 @@
-"""The page: one study is one section, and the page holds all that it shows."""
+"""The page and the same in short: one study is one section, and the page holds all it shows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
-from proposer_rl.report.answer import Meanings, meaning
+from proposer_rl.report.answer import Meanings, answer, meaning
+from proposer_rl.report.outcomes import against_baseline, group_table
 from proposer_rl.report.records import anywhere, level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import DPI, Drawing, in_few_colours
+from proposer_rl.report.tables import escape_markdown
 
 PIXELS = 78  # of an inch of a figure
 LONGEST_WORD = 2000  # of a command
@@ -204,3 +206,36 @@ def _hardware(run: Run) -> str:
 
 def _distinct(runs: Sequence[Run], text: Any) -> str:
     return "; ".join(sorted({text(run) for run in runs}))
+
+
+def section(study: Study, figures: str) -> str:
+    """What was compared, the answer, and the tables.
+
+    Args:
+        study: the runs.
+        figures: how the addresses of its figures begin.
+    """
+    about = facts(study) + origin(study)
+    if short := incomplete(study):
+        text = f"Not finished, or shorter than {study.horizon} updates"
+        about = [*about, (text, ", ".join(short))]
+    methods, pairs = group_table(study), against_baseline(study)
+    parts = [
+        f"## {escape_markdown(study.title)}",
+        escape_markdown(" ".join(answer(study))),
+        "\n".join(f"- {escape_markdown(f'{name}: {text}')}" for name, text in about),
+        f"![Learning curves and updates to the threshold]({figures}learning_curves.png)",
+    ]
+    for table in (methods, pairs):
+        if table.rows:
+            parts += [f"### {escape_markdown(table.title)}", escape_markdown(table.note)]
+            parts.append(table.to_markdown().strip())
+    made = "\n".join(commands(study))
+    return "\n\n".join([*parts, "### Commands", f"```bash\n{made}\n```"])
+
+
+def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:
+    """Parts of a page, and how it is made."""
+    left_out = "\n".join(f"- Left out: {escape_markdown(note)}" for note in notes)
+    made = f"The whole report is written by\n\n```bash\n{command}\n```"
+    return "\n\n".join(filter(None, [*parts, left_out, made])) + "\n"

@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.report.markdown import document, section
-from proposer_rl.report.page import report_command
+from proposer_rl.report.page import document, report_command, section
 from proposer_rl.report.reading import OutputError, find_runs, read_run
 from proposer_rl.report.records import anywhere
 from proposer_rl.report.runs import Run
@@ -66,7 +65,7 @@ def write_page(folder: Path) -> None:
     What the page says above :data:`MARK` is its authors' and stays.
     """
     from proposer_rl.report.curves import learning_curves
-    from proposer_rl.report.proposals import heat_maps
+    from proposer_rl.report.pictures import heat_maps
     from proposer_rl.report.style import in_few_colours, render
 
     studies, _ = read_studies([folder], None)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.watch import main
-from proposer_rl.report.progress import find_progress, read_progress
-from proposer_rl.report.sweeps import Left, left
+from proposer_rl.report.progress import Left, find_progress, left, read_progress
 from proposer_rl.report.terminal import BLOCKS, sparkline
 from tests.report.folders import TASK, cycle, write_run
 
@@ -127,7 +126,7 @@ def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> Non
         finish(write_planned(tmp_path, method, seed), seconds)
         assert "sweep: " in watch(capsys, str(tmp_path))  # of the first run, too
     assert sorted(planned(tmp_path)) == sorted(
-        (f"seed={seed}", f"+method={method}")
+        (f"seed={seed}", f"+method={method}", "+scale=quick", "+sweep=x", "compute.threads=1")
         for seed in (4, 5)
         for method in ("target", "plr", "sfl")
     )
