@@ -22,6 +22,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.objectives import A2CLoss, ReinforceLoss
 
 from proposer_rl import ComputeContext, PPOSettings, SolverSettings, Streams, performance_gain
+from proposer_rl.curricula import TaskStudent
 from proposer_rl.methods import Parts, proposer
 from proposer_rl.settings import LearningSettings, ProposerSettings
 
@@ -59,9 +60,10 @@ def main(cycles: int = 20) -> None:
         curriculum = proposer(Parts(task, settings, seeds=[0]), performance_gain, loss)
         for cycle in range(cycles):
             stream = Streams(0, cycle)
-            outcome = curriculum.improve(task.learner([stream]), 0, [stream]).metrics
+            student = TaskStudent(task, task.learner([stream]))
+            outcome = curriculum.improve(student, [stream]).metrics
             gain = sum(outcome["return_gain"]) / len(outcome["return_gain"])
-            print(f"{loss.__name__}, cycle {cycle}: mean gain of the copies {gain:.2f}")
+            print(f"{loss.__name__}, cycle {cycle}: mean gain of the replicas {gain:.2f}")
 
 
 if __name__ == "__main__":

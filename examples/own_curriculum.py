@@ -1,8 +1,9 @@
 """A curriculum of your own: levels that the Solver has failed on come again.
 
-A curriculum proposes levels [K, P] and observes how the Solver fared there. This one draws from the
-target and, with some probability, gives a failed level once more. What it remembers is in its
-state, so that an interrupted run goes on from a checkpoint. In Python, at a scale of seconds:
+A curriculum proposes levels [K, n] and observes how the Solver fared on them. This one draws from
+the target and, with some probability, gives a failed level once more. What has come in since the
+last proposal waits in an inbox, which is all of its state, so that an interrupted run goes on from
+a checkpoint and levels may come back in any order. In Python, at a scale of seconds:
 
     python examples/own_curriculum.py [updates]
 
@@ -19,17 +20,16 @@ from typing import Any
 
 import torch
 from small_mazes import report, small_task, train
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 
-from proposer_rl import PPO, Curriculum, Proposal, SamplingCurriculum, Streams
-from proposer_rl.learning import Update, first_episode_success
+from proposer_rl import Batch, Curriculum, Streams
+from proposer_rl.curricula import Inbox, Student
 from proposer_rl.methods import Parts
 from proposer_rl.task import Distribution
-from proposer_rl.tasks.mazes import Level
 
 
 class Again(Curriculum):
-    """Levels of another curriculum, and those of the last update that were failed on.
+    """Levels of a distribution, and those of the last batch that were failed on.
 
     Args:
         fresh: draws the new ones.
@@ -39,39 +39,32 @@ class Again(Curriculum):
     def __init__(self, fresh: Distribution, probability: float) -> None:
         if not 0 <= probability <= 1:
             raise ValueError(f"probability must be from 0 to 1, got {probability}")
-        self._fresh = SamplingCurriculum(fresh)
-        self._probability = probability
-        self.begin()
+        self._fresh, self._probability = fresh, probability
+        self._inbox = Inbox(like=fresh.sample(1, torch.Generator())[0])
 
-    def begin(self) -> None:
-        """A fresh Solver has not failed on anything."""
-        self._last: dict[str, Any] = {}
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [K, n]; Solver k's draws come from its own streams."""
+        levels = torch.stack([self._fresh.sample(count, s.generator("levels")) for s in streams])
+        for seen in self._inbox.take():
+            some = slice(min(count, seen.shape[1]))
+            draws = [torch.rand(seen.shape[1], generator=s.generator("again")) for s in streams]
+            again = (seen["failed"] & (torch.stack(draws) < self._probability))[:, some]
+            old = seen["level"][:, some].to(levels.walls.device)  # the inbox is on the CPU
+            levels[:, some] = old.where(again.to(levels.walls.device), levels[:, some])
+        return self._inbox.batch(levels)
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P]; copy k's draws come from its own streams."""
-        proposal = self._fresh.propose(learner, updates, streams)
-        levels = proposal.levels
-        if not self._last:
-            return proposal
-        problems = levels.batch_size[1]
-        draws = torch.stack([torch.rand(problems, generator=s.generator("again")) for s in streams])
-        device = levels.walls.device  # what was remembered is on the CPU, as after a checkpoint
-        again = (self._last["failed"] & (draws < self._probability)).to(device)
-        last = TensorDict(self._last["levels"], levels.batch_size).to(device)
-        return proposal._replace(levels=Level.from_tensordict(last).where(again, levels))
-
-    def observe(self, learner: PPO, levels: Level, update: Update) -> None:
-        """Remember the levels and on which of them the first episode failed."""
-        failed = ~first_episode_success(update.rollout).cpu()
-        self._last = {"levels": levels.cpu().to_tensordict().to_dict(), "failed": failed}
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Put the levels aside, and on which of them the first episode failed."""
+        self._inbox.check(batch, outcome)
+        self._inbox.put(batch, level=batch.levels, failed=outcome["success"] == 0)
 
     def state_dict(self) -> dict[str, Any]:
-        """The last update's levels and failures."""
-        return {"last": self._last}
+        """What has come in."""
+        return self._inbox.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from there."""
-        self._last = dict(state["last"])
+        self._inbox.load_state_dict(state)
 
 
 def again(parts: Parts, probability: float) -> Curriculum:

@@ -1,12 +1,11 @@
 """The names of ``proposer_rl`` itself."""
 
 from proposer_rl.curricula import (
+    Batch,
     Curriculum,
-    Proposal,
     ProposerCurriculum,
     ProposerTrainer,
     SamplingCurriculum,
-    ScheduleCurriculum,
 )
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
@@ -32,6 +31,7 @@ from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 __all__ = [
     "PPO",
     "ActorCritic",
+    "Batch",
     "ComputeContext",
     "Curriculum",
     "ExactEvaluator",
@@ -47,14 +47,12 @@ __all__ = [
     "Population",
     "ProblemChoices",
     "ProblemHead",
-    "Proposal",
     "ProposerCurriculum",
     "ProposerNetwork",
     "ProposerTrainer",
     "RolloutEvaluator",
     "SamplingCurriculum",
     "Schedule",
-    "ScheduleCurriculum",
     "SolverSettings",
     "SolverTrainingEnv",
     "SolverView",

@@ -12,7 +12,14 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from proposer_rl.curricula import Curriculum
+from proposer_rl.curricula import (
+    Curriculum,
+    Improvement,
+    LearnedCurriculum,
+    TaskStudent,
+    outcome_of,
+    require,
+)
 from proposer_rl.learning import PPO, Update, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.columns import can_reach
@@ -43,11 +50,11 @@ class Experiment:
         progress: whether to draw a progress bar.
         signals: which may ask the run to stop; None where nothing does. A curriculum whose
             improvement takes long lets them interrupt it: see :meth:`StopSignals.check`.
-        scope: put before the address of every random draw; tells several lives of one seed apart.
         status: which tells what the run is doing; a curriculum may tell it of the parts of an
             improvement.
 
     Raises:
+        UnfitStudentError: if the task does not allow what the curriculum needs.
         ValueError: if the headline is none of the task's metrics.
     """
 
@@ -63,25 +70,23 @@ class Experiment:
         log: Log | None = None,
         progress: bool = True,
         signals: StopSignals | None = None,
-        scope: Sequence[str | int] = (),
         status: Status | None = None,
     ) -> None:
         check_headline(task, schedule)
         self.task = task
         self.learner = learner
+        self.student = TaskStudent(task, learner)
+        require(self.student, curriculum.needs, type(curriculum).__name__)
         self.curriculum = curriculum
         self.schedule = schedule
         self.seeds = list(seeds)
         self.folder = folder
         self.updates = 0
         self.cycles = 0
-        self._advances = False  # whether the Solver becomes a copy in place of training itself
-        self.curriculum_frames = 0
-        self.evaluations = 0
+        self._advances = False  # whether the Solver becomes a replica in place of training itself
         self._log = log
         self._progress = progress
         self._signals = signals or StopSignals()
-        self._scope = tuple(scope)
         self._status = status or Status()
         self._headline: list[float] = []
         self._checkpoints = 0
@@ -108,8 +113,8 @@ class Experiment:
         """
         return {
             "frames": self.frames,
-            "curriculum_frames": self.curriculum_frames,
-            "evaluations": self.evaluations,
+            "curriculum_frames": self.student.frames,
+            "evaluations": self.student.evaluations,
             "seconds": round(self.seconds, 3),
         }
 
@@ -157,6 +162,7 @@ class Experiment:
                         self._update()
                 bar.update(self.updates - before)
             bar.set_postfix_str(self._headline_text())
+            self._log_cycle()  # after the last checkpoint: a longer schedule writes it again
             self._measure_levels()
         return self.summary()
 
@@ -186,25 +192,12 @@ class Experiment:
         }
 
     def _improve(self) -> None:
-        streams = self._streams("cycle", self.cycles)
-        while True:
-            before = deepcopy(self._state())  # improving may change a curriculum's state in place
-            try:
-                with self._status.phase(IMPROVING):
-                    outcome = self.curriculum.improve(self.learner, self.updates, streams)
-                break
-            except StopRequested:
-                self._save(before)
-                self._signals.deliver()
-                # A handler has returned, so the run goes on.
-                self._restore(before)
-        self.curriculum_frames += outcome.frames
-        self.evaluations += outcome.evaluations
-        if outcome.metrics:
-            costs = {k: self.costs[k] for k in ("curriculum_frames", "evaluations")}
-            place = {"cycle": self.cycles, "updates": self.updates, **costs}
-            self.folder.append("cycles.jsonl", {**place, **outcome.metrics})
-            self._tell("cycles", outcome.metrics)
+        """Begin a cycle."""
+        spent = self.student.frames
+        outcome = Improvement()
+        if isinstance(self.curriculum, LearnedCurriculum):
+            outcome = self._improved(self.curriculum)
+        logged = self._log_cycle(outcome.metrics)
         self.cycles += 1
         self._advances = outcome.advance is not None
         if outcome.advance is not None:
@@ -212,25 +205,48 @@ class Experiment:
             self._measure()
             self._record(outcome.advance.levels, outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
-        self._pause(due=bool(outcome.metrics or outcome.frames))
+        self._pause(due=logged or self.student.frames > spent)
+
+    def _improved(self, curriculum: LearnedCurriculum) -> Improvement:
+        streams = self._streams("cycle", self.cycles)
+        while True:
+            before = deepcopy(self._state())  # improving may change a curriculum's state in place
+            try:
+                with self._status.phase(IMPROVING):
+                    return curriculum.improve(self.student, streams)
+            except StopRequested:
+                self._save(before)
+                self._signals.deliver()
+                # A handler has returned, so the run goes on.
+                self._restore(before)
+
+    def _log_cycle(self, improved: Mapping[str, Any] | None = None) -> bool:
+        """Append what the curriculum tells of the cycle that has ended and of its improvement."""
+        metrics = {**self.curriculum.log(), **(improved or {})}
+        if not metrics:
+            return False
+        if "levels" in metrics:
+            shown = metrics["levels"].items()
+            metrics["levels"] = {text: self.task.record(some, None) for text, some in shown}
+        costs = {k: self.costs[k] for k in ("curriculum_frames", "evaluations")}
+        place = {"cycle": self.cycles, "updates": self.updates, **costs}
+        self.folder.append("cycles.jsonl", {**place, **metrics})
+        self._tell("cycles", metrics)
+        return True
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
         with self._status.phase(TRAINING):
-            levels, frames, evaluations = self.curriculum.propose(
-                self.learner, self.updates, streams
-            )
-            self.curriculum_frames += frames
-            self.evaluations += evaluations
-            self.learner.env.set_levels(levels)
+            batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
+            self.learner.env.set_levels(batch.levels)
             update = self.learner.update([stream.generator("actions") for stream in streams])
             self.learner.check()
-        self.curriculum.observe(self.learner, levels, update)
+        self.curriculum.observe(self.student, batch, outcome_of(update.rollout))
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
-            self._record(levels, update)
+            self._record(batch.levels, update)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _plan(self) -> None:
@@ -288,7 +304,7 @@ class Experiment:
             yield seed, {str(key): float(value) for key, value in values[copy].items()}
 
     def _streams(self, *scope: str | int) -> list[Streams]:
-        return [Streams(seed, *self._scope, *scope) for seed in self.seeds]
+        return [Streams(seed, *scope) for seed in self.seeds]
 
     def _headline_text(self) -> str:
         if not self._headline:
@@ -318,8 +334,8 @@ class Experiment:
         return {
             "updates": self.updates,
             "cycles": self.cycles,
-            "curriculum_frames": self.curriculum_frames,
-            "evaluations": self.evaluations,
+            "curriculum_frames": self.student.frames,
+            "evaluations": self.student.evaluations,
             "seconds": self.seconds,
             "headline": self._headline,
             "rows": self.folder.lengths(),
@@ -348,7 +364,10 @@ class Experiment:
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
         self.curriculum.load_state_dict(state["curriculum"])
         self.updates, self.cycles = state["updates"], state["cycles"]
-        self.curriculum_frames, self.evaluations = state["curriculum_frames"], state["evaluations"]
+        self.student.frames, self.student.evaluations = (
+            state["curriculum_frames"],
+            state["evaluations"],
+        )
         self._seconds_before = state["seconds"]
         self._started = time.monotonic()
         self._headline = state["headline"]

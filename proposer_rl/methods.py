@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 
 from proposer_rl.curricula import (
-    Choice,
     Curriculum,
+    Filtered,
     FirstOrderCurriculum,
     FirstOrderProposer,
     LearningProgressCurriculum,
@@ -25,16 +25,17 @@ from proposer_rl.curricula import (
     ProposerCurriculum,
     ProposerTrainer,
     ReplayCurriculum,
+    ReplayRule,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
-    ScheduleCurriculum,
     Scorer,
     SelectionCurriculum,
+    SomeBins,
+    TaskStudent,
     TransportCurriculum,
-    require_gradients,
 )
-from proposer_rl.curricula.batches import SomeBins
-from proposer_rl.curricula.buffer import Prioritization, ReplayRule
+from proposer_rl.curricula import Schedule as StagedCurriculum
+from proposer_rl.curricula.buffer import Prioritization
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.meta import rewards
@@ -49,12 +50,9 @@ from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.runs.folder import PROPOSER
-from proposer_rl.settings import PPOSettings, ProblemSettings, ProposerSettings
+from proposer_rl.settings import FilterSettings, PPOSettings, ProblemSettings, ProposerSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
-
-Made = TypeVar("Made", bound=Curriculum)
-Filter = Mapping[str, Any] | None
+from proposer_rl.task import LocatedTarget, Task
 
 
 class Workers(NamedTuple):
@@ -91,29 +89,45 @@ class Parts(NamedTuple):
     workers: Workers | None = None
 
 
-def target(parts: Parts, filter: Filter = None) -> Curriculum:
+def filtered(curriculum: Curriculum, chosen: FilterSettings | None) -> Curriculum:
+    """A curriculum that draws more levels than are trained on, and keeps some by their scores.
+
+    Args:
+        curriculum: any.
+        chosen: how; None to leave the curriculum as it is.
+
+    Raises:
+        ValueError: if a value is wrong, naming its key.
+    """
+    if chosen is None:
+        return curriculum
+    try:
+        scorer = Scorer(chosen.score, chosen.source, chosen.rollouts)
+        return Filtered(curriculum, scorer, times=chosen.times, temperature=chosen.temperature)
+    except ValueError as error:
+        raise ValueError(f"filter.{error}") from error
+
+
+def target(parts: Parts) -> Curriculum:
     """Train on the target distribution itself (the paper's baseline)."""
-    return SamplingCurriculum(parts.task.target, _choice(parts.task, filter))
+    return SamplingCurriculum(parts.task.target)
 
 
-def domain_randomization(parts: Parts, filter: Filter = None) -> Curriculum:
-    """Train on levels drawn evenly from the Proposer's space."""
-    return SamplingCurriculum(parts.task.space, _choice(parts.task, filter))
+def domain_randomization(parts: Parts) -> Curriculum:
+    """Train on levels drawn uniformly from the Proposer's space."""
+    return SamplingCurriculum(parts.task.space)
 
 
-def schedule(
-    parts: Parts, distributions: Sequence[str], until: Sequence[int], filter: Filter = None
-) -> Curriculum:
-    """Train on named distributions one after another: a curriculum by hand.
+def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -> Curriculum:
+    """Train on named distributions one after another: a hand-designed curriculum.
 
     Args:
         parts: the task.
         distributions: names, in order.
         until: updates after which each but the last ends.
-        filter: see :func:`_choice`.
 
     Raises:
-        ValueError: for an unknown name, or as :class:`ScheduleCurriculum`.
+        ValueError: for an unknown name, or as :class:`~proposer_rl.curricula.Schedule`.
     """
     known = parts.task.distributions
     if isinstance(distributions, str) or any(name not in known for name in distributions):
@@ -122,23 +136,26 @@ def schedule(
         )
     if not isinstance(until, Sequence) or any(type(end) is not int for end in until):
         raise ValueError(f"until must be a list of whole numbers, got {until!r}")
-    choice = _choice(parts.task, filter)
-    return ScheduleCurriculum(
-        [SamplingCurriculum(known[name], choice) for name in distributions], until
-    )
+    return StagedCurriculum([SamplingCurriculum(known[name]) for name in distributions], until)
 
 
 def proposer(
-    parts: Parts, reward: rewards.Reward = rewards.log_success_gain, loss: MakeLoss | None = None
+    parts: Parts,
+    reward: rewards.Reward = rewards.log_success_gain,
+    loss: MakeLoss | None = None,
+    checkpoint: str | None = None,
 ) -> ProposerCurriculum:
     """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
 
     Args:
         parts: the task, and the Proposer's settings.
-        reward: what an update is worth.
+        reward: of an update.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.PPO`.
+        checkpoint: of a Proposer that has learnt, which goes on learning; see
+            :func:`frozen_proposer`. None to begin anew.
 
     Raises:
+        CheckpointError: if the checkpoint cannot be read.
         TypeError: if the reward is no function.
         ValueError: for several seeds, or settings that do not go together.
     """
@@ -157,10 +174,12 @@ def proposer(
     if unknown:
         raise ValueError(
             f"proposer.observes={chosen.observes}: this task does not tell {', '.join(unknown)}; "
-            "return and progress are there"
+            "return and progress are available"
         )
     with streams.as_default("weights"):
         agent = proposer_agent(task, chosen)
+    if checkpoint:
+        _load(agent, checkpoint, chosen.observes)
     numbers = PPOSettings(horizon=env.steps, **asdict(chosen.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if chosen.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
@@ -172,24 +191,21 @@ def proposer(
     return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
 
 
-def task_difficulty(parts: Parts) -> ProposerCurriculum:
+def task_difficulty(parts: Parts, checkpoint: str | None = None) -> ProposerCurriculum:
     """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
 
     The paper's ablation; no other reward can be put in its place.
     """
-    return proposer(parts, rewards.task_difficulty)
+    return proposer(parts, rewards.task_difficulty, checkpoint=checkpoint)
 
 
-def frozen_proposer(
-    parts: Parts, checkpoint: str | None, filter: Filter = None
-) -> ProposerCurriculum:
+def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
     """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
 
     Args:
         parts: the task, and the settings of the Proposer's network and actions, which must be those
             of that run.
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
-        filter: see :func:`_choice`.
 
     Raises:
         ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
@@ -200,19 +216,7 @@ def frozen_proposer(
         raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
     task, chosen = parts.task, parts.proposer
     agent = proposer_agent(task, chosen)
-    learnt = _curriculum_state(Path(checkpoint))
-    try:
-        observed = [name for name in learnt["observed"] if name != "probes"]
-        load_agent(agent, TensorDict(learnt["proposer"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
-        ) from error
-    if observed != chosen.observes:
-        raise ValueError(
-            f"proposer.observes={chosen.observes}: the Proposer of checkpoint={checkpoint} has "
-            f"learnt with {observed}"
-        )
+    _load(agent, checkpoint, chosen.observes)
     return ProposerCurriculum(
         agent,
         solver_view(task, chosen),
@@ -220,58 +224,41 @@ def frozen_proposer(
         meta_episode_length=chosen.meta_episode_length,
         action_repeat=chosen.action_repeat,
         own_action=chosen.own_action,
-        choice=_choice(task, filter),
     )
 
 
 def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
     """Train on draws from Gaussians; see :class:`MixtureCurriculum` for the numbers."""
-    return MixtureCurriculum(parts.task, **numbers)
+    return MixtureCurriculum(parts.task.space, **numbers)
 
 
-def _of_bins(
-    make: Callable[..., Made], require: Callable[[Task], object] = lambda task: None
-) -> Callable[..., Made]:
-    """Makes the factory of a curriculum over bins, which takes numbers of its own.
-
-    Args:
-        make: the curriculum.
-        require: refuses a task that it cannot do with, whatever is chosen from it.
-    """
-
-    def factory(parts: Parts, filter: Filter = None, **numbers: Any) -> Made:
-        require(parts.task)
-        return make(parts.task, choice=_choice(parts.task, filter), **numbers)
-
-    return factory
+def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculum:
+    """Train where success changes; see :class:`LearningProgressCurriculum` for the numbers."""
+    return LearningProgressCurriculum(parts.task.space, **numbers)
 
 
-first_order_gain = _of_bins(FirstOrderCurriculum, require_gradients)
-first_order_sampled = _of_bins(SampledFirstOrderCurriculum)
-learning_progress = _of_bins(LearningProgressCurriculum)
-currot = _of_bins(TransportCurriculum)
-
-
-def _choice(task: Task, filter: Filter) -> Choice | None:
-    """Which of more levels are trained on.
-
-    ``filter`` has ``score``, ``source`` and ``rollouts`` of :class:`Scorer`, ``times`` and
-    ``temperature`` of :class:`Choice`; None for all.
+def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
+    """Train on the way to the target; see :class:`TransportCurriculum` for the numbers.
 
     Raises:
-        ValueError: if it has not these, or a value is wrong.
+        TypeError: if the task does not say where its target lies.
     """
-    if filter is None:
-        return None
-    scored, drawn = ("score", "source", "rollouts"), ("times", "temperature")
-    if not isinstance(filter, Mapping) or {*filter} != {*scored, *drawn}:
-        keys = ", ".join((*drawn, *scored))
-        raise ValueError(f"filter must be null or have {keys}, and nothing else, got {filter!r}")
-    try:
-        scorer = Scorer(task, *(filter[name] for name in scored))
-        return Choice(scorer, **{name: filter[name] for name in drawn})
-    except ValueError as error:
-        raise ValueError(f"filter.{error}") from error
+    if not isinstance(parts.task, LocatedTarget):
+        raise TypeError(
+            f"currot moves towards the target: {type(parts.task).__name__} must define "
+            "target_shares, the target as shares of the space's bins"
+        )
+    return TransportCurriculum(parts.task.space, parts.task.target_shares, **numbers)
+
+
+def first_order_gain(parts: Parts, **numbers: Any) -> FirstOrderCurriculum:
+    """Train on aligned bins; see :class:`FirstOrderCurriculum` for the numbers."""
+    return FirstOrderCurriculum(parts.task.space, parts.task.target, **numbers)
+
+
+def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurriculum:
+    """The same from episodes; see :class:`SampledFirstOrderCurriculum` for the numbers."""
+    return SampledFirstOrderCurriculum(parts.task.space, parts.task.target, **numbers)
 
 
 def replay(
@@ -296,13 +283,13 @@ def replay(
     rule = ReplayRule(
         prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
     )
-    scorer = Scorer(parts.task, score, source, rollouts)
-    space = parts.task.space
+    space, edit = parts.task.space, getattr(parts.task, "edit", None)
     try:
         new = space if new_levels is None else SomeBins(space, new_levels)
     except ValueError as error:
         raise ValueError(f"new_levels: {error}") from error
-    curriculum = ReplayCurriculum(scorer, rule, new, **numbers)
+    scorer = Scorer(score, source, rollouts)
+    curriculum = ReplayCurriculum(new, scorer, rule, edit=edit, **numbers)
     curriculum.check(len(parts.seeds))
     return curriculum
 
@@ -314,69 +301,64 @@ def learnability(
 
     The scorer as for :func:`replay`; further numbers: see :class:`SelectionCurriculum`.
     """
-    return SelectionCurriculum(Scorer(parts.task, score, source, rollouts), **numbers)
+    return SelectionCurriculum(parts.task.space, Scorer(score, source, rollouts), **numbers)
 
 
 def first_order_proposer(
     parts: Parts,
-    target_levels: int,
+    target_levels: int = 256,
     step: float = 1.0,
     measure: str = "log_success",
-    copies: int = 0,
-    filter: Filter = None,
     **numbers: Any,
 ) -> FirstOrderProposer:
-    """Train on the draws of a policy that is paid for each problem, to first order.
+    """Train on the draws of a policy that is rewarded for each problem, to first order.
 
     Args:
-        parts: the task, whose performance must have gradients, and the Proposer's settings: of
-            them the probes, the network, of PPO how far a step goes (``adam_eps``,
-            ``clip_epsilon``, ``max_grad_norm``), and with copies the length of their episode.
+        parts: the task, and the Proposer's settings: of them the probes, the network, and of PPO
+            how far a step goes (``adam_eps``, ``clip_epsilon``, ``max_grad_norm``).
         target_levels: see :class:`FirstOrderProposer`.
         step: the same.
         measure: the same.
-        copies: the same.
-        filter: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
-    require_gradients(parts.task)
     agent, settings = _problem_policy(parts, **numbers)
     return FirstOrderProposer(
-        parts.task,
+        parts.task.space,
+        parts.task.target,
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        choice=_choice(parts.task, filter),
         target_levels=target_levels,
         step=step,
         measure=measure,
-        copies=copies,
-        copy_updates=parts.proposer.meta_episode_length,
-        on_update=parts.on_update or (lambda done: None),
     )
 
 
-def paired(parts: Parts, filter: Filter = None, **numbers: Any) -> PairedProposer:
-    """Train on the draws of a policy that is paid the regret against a second Solver.
+def paired(parts: Parts, **numbers: Any) -> PairedProposer:
+    """Train on the draws of a policy that is rewarded for the regret against a second Solver.
 
     Args:
         parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
-        filter: see :func:`_choice`.
         numbers: see :func:`_problem_policy`.
     """
     agent, settings = _problem_policy(parts, **numbers)
+    task = parts.task
     return PairedProposer(
-        parts.task,
+        task.space,
+        task.target,
         agent,
         settings,
         probe_levels=parts.proposer.probe_levels,
-        choice=_choice(parts.task, filter),
-        streams=Streams(parts.seeds[0], "antagonist"),
+        antagonist=TaskStudent(task, task.learner([Streams(parts.seeds[0], "antagonist")])),
     )
 
 
 def _problem_policy(
-    parts: Parts, epochs: int, learning_rate: float, entropy_coeff: float
+    parts: Parts,
+    epochs: int,
+    learning_rate: float,
+    entropy_coeff: float,
+    checkpoint: str | None = None,
 ) -> tuple[ActorCritic, PPOSettings]:
     """A policy that draws each problem by itself, and how it learns.
 
@@ -385,6 +367,7 @@ def _problem_policy(
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
         entropy_coeff: of the policy.
+        checkpoint: of such a policy that has learnt; None to begin anew.
     """
     _one_solver(parts)
     task, chosen = parts.task, parts.proposer
@@ -392,9 +375,11 @@ def _problem_policy(
     if isinstance(chosen.action, ProblemSettings):
         action = chosen.action
     if action.ratio == "joint":
-        raise ValueError("proposer.action.ratio=joint: here each draw is paid by itself")
+        raise ValueError("proposer.action.ratio=joint: here each draw is rewarded by itself")
     with Streams(parts.seeds[0], "proposer").as_default("weights"):
         agent = proposer_agent(task, replace(chosen, observes=[], action=action))
+    if checkpoint:
+        _load(agent, checkpoint, [])
     numbers = replace(
         chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
@@ -406,6 +391,28 @@ def _one_solver(parts: Parts) -> None:
         raise ValueError(
             f"seeds={list(parts.seeds)}: a Proposer proposes to one Solver at a time; "
             "give one run for each, as in -m seed=0,1,2"
+        )
+
+
+def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
+    """Give a Proposer the weights of one that has learnt with the same network.
+
+    Raises:
+        ValueError: if the checkpoint holds no such Proposer.
+        CheckpointError: if it cannot be read.
+    """
+    learnt = _curriculum_state(Path(checkpoint))
+    try:
+        observed = [name for name in learnt["observed"] if name != "probes"]
+        load_agent(agent, TensorDict(learnt["proposer"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
+        ) from error
+    if observed != list(observes):
+        raise ValueError(
+            f"proposer.observes={list(observes)}: the Proposer of checkpoint={checkpoint} has "
+            f"learnt with {observed}"
         )
 
 

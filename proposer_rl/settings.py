@@ -394,6 +394,25 @@ class PoolSettings:
 
 
 @settings
+class FilterSettings:
+    """Which of more levels than are trained on are kept.
+
+    Attributes:
+        times: levels that are drawn for each that is kept.
+        score: of a level; see :mod:`proposer_rl.curricula.scores`.
+        source: of the score.
+        rollouts: on each level, from episodes.
+        temperature: of the draws among them, in units of the score.
+    """
+
+    times: Annotated[int, Ge(2)] = 4
+    score: str = "learnability"
+    source: Literal["exact", "episodes"] = "exact"
+    rollouts: Annotated[int, Ge(1)] = 8
+    temperature: Annotated[float, Gt(0)] = 0.05
+
+
+@settings
 class LoggerSettings:
     """Where rows of metrics go besides the run's folder.
 

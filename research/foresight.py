@@ -18,7 +18,7 @@ from scipy.stats import bootstrap, linregress, rankdata
 from torch import Tensor
 
 from proposer_rl.cli.arguments import number
-from proposer_rl.curricula import require_gradients
+from proposer_rl.cli.config import ConfigError
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -26,6 +26,7 @@ from proposer_rl.meta.first_order import bin_scores, exact_alignment, exact_dire
 from proposer_rl.meta.rewards import log_success, log_success_gain
 from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
+from proposer_rl.task import DifferentiableTask
 from research.common import Checkpoint, Rows, answer, checkpoints, parser_of
 from research.signal import performance_at, uneven_shares
 
@@ -45,7 +46,11 @@ def _measure(checkpoint: Checkpoint, options: argparse.Namespace) -> Iterator[di
     """A row for every number of updates ahead of a checkpoint."""
     run, stage = checkpoint
     task = run.task
-    require_gradients(task)
+    if not isinstance(task, DifferentiableTask):
+        raise ConfigError(
+            f"first-order gain needs gradients: {type(task).__name__} must define "
+            "differentiable_performance(agent, levels)"
+        )
     streams = Streams(options.seed, "foresight", run.folder.name, stage.step)
     levels = task.target.sample(options.levels, streams.generator("levels"))
     learner = task.learner([Streams(0)])

@@ -159,6 +159,7 @@ def _play(arguments: list[str]) -> None:
         with urllib.request.urlopen(address) as page:
             assert b"<html" in page.read()
         served.send_signal(signal.SIGINT)
+        served.communicate()  # it says that it has ended
     assert served.returncode == 0
 
 

@@ -296,24 +296,16 @@ WRONG_COMMANDS = [
         "+method: must come before +filter, or it would undo it",
     ),
     (
-        ["+method=plr", *SMOKE, "+filter=learnability"],
-        "unexpected keyword argument 'filter'",
+        ["+method=target", *SMOKE, "+filter=learnability", "filter.times=1"],
+        "filter.times=1: input should be greater than or equal to 2",
     ),
     (
-        ["+method=target", *SMOKE, "curriculum.filter={times: 4}"],
-        "curriculum: filter must be null or have times, temperature, score, source, rollouts",
-    ),
-    (
-        ["+method=target", *SMOKE, "+filter=learnability", "curriculum.filter.times=1"],
-        "curriculum: filter.times must be a whole number from 2 to 1,000,000, got 1",
-    ),
-    (
-        ["+method=target", *SMOKE, "+filter=learnability", "curriculum.filter.score=luck"],
-        "curriculum: filter.score='luck': from source=exact there are",
+        ["+method=target", *SMOKE, "+filter=learnability", "filter.score=luck"],
+        "filter.score='luck': from source=exact there are",
     ),
     (
         ["task=cartpole", "+method=target", "+filter=learnability"],
-        "curriculum: filter.source=exact: GymnasiumTask tells performance by playing",
+        "method=target needs a student with exact_performance: GymnasiumTask tells performance by",
     ),
     (["+score=sampled", "+method=sfl"], "+method: must come before +score, or it would undo it"),
     (

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from torch.utils import backend_registration
 
-from proposer_rl.curricula import Curriculum, SamplingCurriculum
-from proposer_rl.learning import PPO, Update
+from proposer_rl.curricula import Batch, Curriculum, SamplingCurriculum, Student
 from proposer_rl.methods import Parts
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
@@ -28,7 +28,7 @@ QUIET = ["+scale=smoke", *FEW, *SHORT]
 CALLED = {
     **{method: [f"+method={method}", *QUIET] for method in METHODS if "frozen" not in method},
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
-    "with_a_choice": ["+method=hand_designed", "+filter=learnability", *QUIET],
+    "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT],
     "gymnasium": ["+method=perf_gain", "task=cartpole", *TINY],
@@ -87,8 +87,8 @@ def test_what_is_computed_there_is_what_is_computed_here(
 class Careless(SamplingCurriculum):
     """Forgets that a Solver's numbers may lie elsewhere."""
 
-    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
-        rewards = update.rollout["next", "reward"]
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        rewards = outcome["rollout"]["next", "reward"]
         torch.zeros(rewards.shape).add_(rewards)
 
 

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
+from proposer_rl.curricula import TaskStudent, outcome_of
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
@@ -94,13 +95,15 @@ def failures(probability: float, example: Load) -> tuple[Level, Tensor, Level]:
     solver = task.learner([Streams(0, "solver")])
     make = example("own_curriculum").Again
     curriculum = make(task.target, probability)
-    levels = curriculum.propose(solver, 0, [Streams(0)]).levels
+    student = TaskStudent(task, solver)
+    batch = curriculum.propose(student, 32, [Streams(0)])
+    levels = batch.levels
     solver.env.set_levels(levels)
     update = solver.update([torch.Generator().manual_seed(0)])
-    curriculum.observe(solver, levels, update)
+    curriculum.observe(student, batch, outcome_of(update.rollout))
     resumed = make(task.target, probability)
     resumed.load_state_dict(curriculum.state_dict())
-    following = [c.propose(solver, 1, [Streams(1)]).levels for c in (curriculum, resumed)]
+    following = [c.propose(student, 32, [Streams(1)]).levels for c in (curriculum, resumed)]
     assert (following[0] == following[1]).all()
     ends = update.rollout["next"]
     first = ends["done"].squeeze(-1).int().argmax(-1, keepdim=True)  # the first end's step
@@ -122,6 +125,31 @@ def test_a_solver_is_trained_with_it(
 ) -> None:
     example(name).main(10)
     assert len(numbers(capsys.readouterr().out, r"success (\S+)")) == 2
+
+
+def test_learners_of_ones_own_train_in_the_meta_environment(example: Load) -> None:
+    own = example("own_learner")
+    check_env_specs(own.meta_environment())
+    env = own.meta_environment()
+    env.fork(env.solvers.snapshot()[0], Streams(0))
+    before = env.reset()["return"]
+    gains = []
+    for number in (0.0, -20.0):  # all classes alike; the first one alone
+        env.reset()
+        step = env.step(TensorDict({"action": torch.full((4, 1), number)}, [4]))["next"]
+        torch.testing.assert_close(step["reward"], step["return"] - before)
+        gains.append(float(step["reward"].mean()))
+    assert gains[0] > gains[1] + 0.1 > 0.1
+    numbers = own.MEANS.new_tensor([1.0, -1.0, -1.0])  # by hand: a step of one learner
+    learner = own.SoftmaxRegression(1, 1, rate=0.3)
+    point = TensorDict(
+        {"point": torch.tensor([[[1.0, 2.0]]]), "label": torch.tensor([[0]])}, [1, 1]
+    )
+    learner.env.set_levels(point)
+    learner.update([])
+    error = (numbers + 1) / 2 - 1 / 3
+    expected = 0.3 * torch.tensor([1.0, 2.0]).unsqueeze(1) * error
+    torch.testing.assert_close(learner.agent[0], expected)
 
 
 def test_the_network_learns_and_acts_in_larger_mazes(

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 import torch
 
-from proposer_rl.curricula import Advance, Curriculum, Improvement, Proposal, SamplingCurriculum
+from proposer_rl.curricula import (
+    Advance,
+    Batch,
+    Curriculum,
+    Improvement,
+    LearnedCurriculum,
+    SamplingCurriculum,
+    UnfitStudentError,
+)
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
@@ -23,7 +31,7 @@ from proposer_rl.settings import Schedule
 from proposer_rl.streams import Streams
 from tests.same_run import assert_same_run
 from tests.stops import StopAt
-from tests.tiny import TASK
+from tests.tiny import TASK, mountain_cars
 
 LENGTHS = {"updates": 5, "cycle_length": 2, "evaluate_every": 2, "checkpoint_every": 3}
 P, T = 4, 8
@@ -97,25 +105,39 @@ def test_the_paths_that_are_recorded_are_legal(tmp_path: Path) -> None:
             assert ends == "G" or len(path) == 9
 
 
-class Costly(SamplingCurriculum):
+class Costly(LearnedCurriculum):
     """Notes what it is called for, and says that all of it has a price."""
 
     def __init__(self) -> None:
-        super().__init__(TASK.target)
         self.events: list[tuple] = []
+        self.target = SamplingCurriculum(TASK.target)
+        self.observed = 0
 
-    def propose(self, learner, updates, streams) -> Proposal:
-        self.events.append(("propose", updates))
-        return super().propose(learner, updates, streams)._replace(frames=10, evaluations=1)
+    def propose(self, student, count, streams) -> Batch:
+        self.events.append(("propose", count))
+        student.spend(frames=10, evaluations=1)
+        return self.target.propose(student, count, streams)
 
-    def observe(self, learner, levels, update) -> None:
-        assert levels.batch_size == (1, P) and update.rollout.batch_size == (1, P, T)
-        assert "grad_norm" in update.metrics.keys()
+    def observe(self, student, batch, outcome) -> None:
+        assert batch.levels.batch_size == (1, P) == outcome.batch_size
+        assert outcome["rollout"].batch_size == (1, P, T)
         self.events.append(("observe",))
+        self.observed += 1
 
-    def improve(self, learner, updates, streams) -> Improvement:
-        self.events.append(("improve", updates))
-        return Improvement({"own": [updates]}, frames=1000, evaluations=100)
+    def improve(self, student, streams) -> Improvement:
+        self.events.append(("improve",))
+        student.spend(frames=1000, evaluations=100)
+        return Improvement({"own": ["improved"]})
+
+    def log(self) -> dict:
+        observed, self.observed = self.observed, 0
+        return {"observed": observed} if observed else {}
+
+    def state_dict(self) -> dict:
+        return {"observed": self.observed}
+
+    def load_state_dict(self, state) -> None:
+        self.observed = state["observed"]
 
 
 def test_the_curriculum_is_improved_once_per_cycle_and_sees_every_update(tmp_path: Path) -> None:
@@ -123,29 +145,48 @@ def test_the_curriculum_is_improved_once_per_cycle_and_sees_every_update(tmp_pat
     experiment(tmp_path, 0, curriculum=curriculum).run()
     expected = []
     for update in range(5):
-        expected += [("improve", update)] * (update % 2 == 0)
-        expected += [("propose", update), ("observe",)]
+        expected += [("improve",)] * (update % 2 == 0)
+        expected += [("propose", P), ("observe",)]
     assert curriculum.events == expected
+
+
+def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    class Demanding(SamplingCurriculum):
+        needs = ("episode_law",)
+
+    cars = mountain_cars()
+    with pytest.raises(UnfitStudentError, match="Demanding needs a student with episode_law"):
+        Experiment(
+            cars,
+            cars.learner([Streams(0)]),
+            Demanding(cars.space),
+            schedule=Schedule(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
+            seeds=[0],
+            folder=RunFolder(tmp_path / "run"),
+        )
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> None:
     class Silent(Costly):
         crashes = False
 
-        def improve(self, learner, updates, streams) -> Improvement:
-            return replace(super().improve(learner, updates, streams), metrics={})
+        def improve(self, student, streams) -> Improvement:
+            return replace(super().improve(student, streams), metrics={})
 
-        def propose(self, learner, updates, streams) -> Proposal:
+        def propose(self, student, count, streams) -> Batch:
             if self.crashes:
                 raise RuntimeError("the machine is switched off")
-            return super().propose(learner, updates, streams)
+            return super().propose(student, count, streams)
 
     first, again = Silent(), Silent()
     first.crashes = True
     with pytest.raises(RuntimeError, match="switched off"):
         experiment(tmp_path, 0, curriculum=first).run()
     experiment(tmp_path, 0, curriculum=again).run()
-    assert (first.events[0], again.events[0]) == (("improve", 0), ("propose", 0))
+    assert (first.events[0], again.events[0]) == (("improve",), ("propose", P))
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
@@ -163,21 +204,44 @@ def test_what_a_curriculum_costs_is_counted_written_and_survives(
     assert told == costs
     assert (summary["curriculum_frames"], summary["evaluations"]) == costs[5]
     cycles = read_jsonl(tmp_path / "cycles.jsonl")
-    begun = [(0, 0, 1000, 100), (1, 2, 2020, 202), (2, 4, 3040, 304)]
-    keys = ("cycle", "updates", "curriculum_frames", "evaluations", "own")
-    assert cycles == [dict(zip(keys, (*place, [place[1]]), strict=True)) for place in begun]
+    # Each cycle as it begins, with what the one before has to tell; then the last one's word.
+    places = [(0, 0, 1000, 100), (1, 2, 2020, 202), (2, 4, 3040, 304), (3, 5, 3050, 305)]
+    keys = ("cycle", "updates", "curriculum_frames", "evaluations")
+    expected = [dict(zip(keys, place, strict=True)) for place in places]
+    for row in expected[:3]:
+        row["own"] = ["improved"]
+    for row, observed in zip(expected[1:], (2, 2, 1), strict=True):
+        row["observed"] = observed
+    assert cycles == expected
 
 
-class Jumps(SamplingCurriculum):
+def test_a_longer_schedule_goes_on_as_if_it_had_been_so_long_from_the_start(
+    tmp_path: Path,
+) -> None:
+    experiment(tmp_path / "whole", 0, curriculum=Costly(), updates=7).run()
+    experiment(tmp_path / "run", 0, curriculum=Costly(), updates=5).run()
+    experiment(tmp_path / "run", 0, curriculum=Costly(), updates=7).run()
+    rows = [read_jsonl(tmp_path / name / "cycles.jsonl") for name in ("whole", "run")]
+    assert rows[0] == rows[1]
+
+
+def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:
+    class Shows(SamplingCurriculum):
+        def log(self) -> dict:
+            return {"levels": {"some": TASK.target.sample(2, Streams(0).generator())}}
+
+    experiment(tmp_path, 0, curriculum=Shows(TASK.target)).run()
+    for row in read_jsonl(tmp_path / "cycles.jsonl"):
+        assert len(row["levels"]["some"]) == 2 and "picture" in row["levels"]["some"][0]
+
+
+class Jumps(LearnedCurriculum):
     """Trains the Solver itself: an update of its own takes the cycle's place."""
 
-    def __init__(self) -> None:
-        super().__init__(TASK.target)
-
-    def improve(self, learner, updates, streams) -> Improvement:
-        levels = self.propose(learner, updates, streams).levels
-        learner.env.set_levels(levels)
-        update = learner.update([streams[0].generator("actions")])
+    def improve(self, student, streams) -> Improvement:
+        levels = TASK.target.sample(P, streams[0].generator("levels"))[None]
+        student._learner.env.set_levels(levels)
+        update = student._learner.update([streams[0].generator("actions")])
         return Improvement({}, advance=Advance(2, levels, update))
 
 
@@ -198,20 +262,21 @@ class Stopped(Costly):
         self.signals = signals
         self.begun = torch.zeros(())
 
-    def improve(self, learner, updates, streams) -> Improvement:
+    def improve(self, student, streams) -> Improvement:
         # What is begun here must be undone, also what has changed in place.
         self.begun += 1
-        learner.env.set_levels(TASK.target.sample(P, streams[0].generator("levels"))[None])
-        learner.update([streams[0].generator("actions")])
-        if updates == 2 and self.signals is not None:
+        levels = TASK.target.sample(P, streams[0].generator("levels"))[None]
+        student.train(levels, [streams[0].generator("actions")])
+        if self.begun == 2 and self.signals is not None:
             os.kill(os.getpid(), SIGTERM)
             self.signals.check()
-        return super().improve(learner, updates, streams)
+        return super().improve(student, streams)
 
     def state_dict(self) -> dict:
-        return {"begun": self.begun}
+        return {**super().state_dict(), "begun": self.begun}
 
     def load_state_dict(self, state) -> None:
+        super().load_state_dict(state)
         self.begun = state["begun"]
 
 

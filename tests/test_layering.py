@@ -13,9 +13,9 @@ import pytest
 PACKAGE = "proposer_rl"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
-# Only the command line composes configurations; everything else takes plain arguments. What is
-# read back from a run's folder is checked with pydantic, too, and what a browser asks.
-CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"cli", "play", "report"}}
+# Only the command line composes configurations; everything else takes plain arguments. The
+# one validator is pydantic's; so are the checks of a run's files and of what a browser asks.
+CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"settings", "play", "report"}}
 # What reads runs must start at once.
 HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")

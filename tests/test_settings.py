@@ -11,7 +11,7 @@ import pytest
 
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import CONFIG_FOLDER
-from proposer_rl.curricula import ProposerCurriculum
+from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import (
     ComputeSettings,
@@ -44,18 +44,19 @@ def test_the_papers_values_are_the_defaults_of_the_code() -> None:
 def first_cycle(*overrides: str) -> str:
     """The numbers of a first cycle: what is written of it, what came of Solver and Proposer."""
     config = composed("+method=perf_gain", "+scale=smoke", "compute.progress=false", *overrides)
-    learner, curriculum = parts(config, StopSignals())[1:]
+    task, learner, curriculum = parts(config, StopSignals())
+    student = TaskStudent(task, learner)
     assert isinstance(curriculum, ProposerCurriculum) and curriculum.trainer is not None
-    outcome = curriculum.improve(learner, 0, [Streams(0, "cycle", 0)])
+    outcome = curriculum.improve(student, [Streams(0, "cycle", 0)])
     levels = [
-        curriculum.propose(learner, update, [Streams(0, "update", update)]).levels.to_text()
+        curriculum.propose(student, 4, [Streams(0, "update", update)]).levels.to_text()
         for update in range(2)
     ]
     learnt: list[Any] = [
         [entry.double().sum().item() for entry in ppo.snapshot().values(True, True)]
         for ppo in (learner, curriculum.trainer.learner)
     ]
-    return json.dumps([outcome.metrics, outcome.evaluations, levels, learnt])
+    return json.dumps([outcome.metrics, student.evaluations, levels, learnt])
 
 
 def test_the_same_settings_give_the_same_numbers() -> None:
@@ -149,7 +150,8 @@ def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
     costs = {}
     for options in ((), ("+score=sampled",)):
         config = composed(f"+method={method}", "+scale=smoke", *options)
-        learner, curriculum = parts(config, StopSignals())[1:]
-        proposal = curriculum.propose(learner, 0, [Streams(0, "update", 0)])
-        costs[options] = (proposal.frames > 0, proposal.evaluations > 0)
+        task, learner, curriculum = parts(config, StopSignals())
+        student = TaskStudent(task, learner)
+        curriculum.propose(student, task.batch_size, [Streams(0, "update", 0)])
+        costs[options] = (student.frames > 0, student.evaluations > 0)
     assert costs == {(): (False, True), ("+score=sampled",): (True, False)}

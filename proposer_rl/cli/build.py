@@ -13,13 +13,13 @@ from proposer_rl.cli.config import ConfigError, Maker, RunConfig, curriculum_mak
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import make_log, require_logger
 from proposer_rl.cli.outcome import run_name
-from proposer_rl.curricula import Curriculum
+from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Parts, Workers
+from proposer_rl.methods import Parts, Workers, filtered
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
@@ -53,7 +53,12 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
         task = make_task(config)
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
         check_headline(task, config.schedule)
-        return Made(task, learner, _curriculum(config, task, signals, status))
+        curriculum = _curriculum(config, task, signals, status)
+        try:
+            require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
+        except TypeError as error:
+            raise ConfigError(f"curriculum: {one_line(error)}") from error
+        return Made(task, learner, curriculum)
     except ConfigError:
         raise
     except ValueError as error:
@@ -137,14 +142,15 @@ def _curriculum(
     if not isinstance(curriculum, Curriculum):
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
-    if chosen.workers is not None and not curriculum.trains_copies:
+    learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
+    if chosen.workers is not None and not learned:
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no copies of the "
             "Solver that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)
-    return curriculum
+    return filtered(curriculum, config.filter)
 
 
 def _check_cycle(config: RunConfig) -> None:

@@ -22,6 +22,7 @@ from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ArgumentError,
     ComputeSettings,
+    FilterSettings,
     HandDesignedSettings,
     LoggerSettings,
     PoolSettings,
@@ -64,6 +65,7 @@ class RunConfig:
     scale: str
     ablation: str
     curriculum: dict[str, Any]
+    filter: FilterSettings | None
     task: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]
@@ -110,7 +112,7 @@ def read_config(config: DictConfig) -> RunConfig:
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
             f"checkpoint={checked.checkpoint}: method={checked.method} takes none; "
-            "frozen_proposer does, and a run goes on with hydra.run.dir=FOLDER"
+            "those with a Proposer do, and a run goes on with hydra.run.dir=FOLDER"
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
@@ -118,7 +120,7 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(settings: Mapping[str, Any]) -> Maker:
-    """What makes the task, called with ``solver`` and ``place`` besides.
+    """What makes the task, called with ``solver`` and ``context`` besides.
 
     Args:
         settings: ``task`` of the configuration.

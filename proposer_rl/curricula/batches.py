@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.streams import Streams
@@ -66,3 +68,31 @@ def fresh_levels(
 def levels_at(levels: Levels, index: Tensor) -> Levels:
     """Levels [K, P] out of [K, N], by their places int64 [K, P]."""
     return levels[torch.arange(len(index)).unsqueeze(-1), index]
+
+
+def packed(entries: TensorDictBase) -> dict[str, Any]:
+    """A tensordict as a state holds it: a copy, in nested dicts."""
+    state: dict[str, Any] = entries.clone().to_dict(convert_tensors=False)
+    return state
+
+
+def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
+    """What :func:`packed` made a state of, batch [K, m]; ``level`` is of that level's kind."""
+    shape = next(entry.shape[:2] for entry in state.values() if isinstance(entry, Tensor))
+    entries = TensorDict.from_dict(dict(state), batch_size=shape)
+    if "level" in entries and not isinstance(like, Tensor):
+        entries["level"] = of_kind(like, state["level"], shape)
+    return entries.clone()
+
+
+def of_kind(like: Levels, state: Mapping[str, Any], shape: Sequence[int]) -> Levels:
+    """Levels of a kind from the nested dicts of their entries."""
+    return type(like).from_dict(state, batch_size=shape)
+
+
+def device_of(levels: Levels) -> torch.device:
+    """Where levels are, be they a tensordict or a tensor."""
+    if isinstance(levels, Tensor):
+        return levels.device
+    device: torch.device = next(iter(levels.values(True, True))).device
+    return device

@@ -1,4 +1,4 @@
-"""What curricula share that draw each Solver's batch from the bins of the task's space."""
+"""What curricula share that draw each student's batch from the bins of a space."""
 
 from __future__ import annotations
 
@@ -7,90 +7,131 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
 from proposer_rl.curricula.checks import whole
-from proposer_rl.curricula.choice import Choice
-from proposer_rl.learning import PPO
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import Space
+
+
+class BinCounts:
+    """How many levels of each bin have come back since they were last asked for.
+
+    Args:
+        space: that has the bins.
+    """
+
+    def __init__(self, space: Space) -> None:
+        self._shape = [len(values) for values in space.axes.values()]
+        self.counts = torch.zeros(space.size, dtype=torch.int64)
+
+    def add(self, bins: Tensor) -> None:
+        """Count levels of these bins, int64 of any shape."""
+        self.counts = self.counts + bins.flatten().bincount(minlength=len(self.counts))
+
+    def histogram(self) -> list[Any]:
+        """The counts along the axes of the space; they begin anew."""
+        counts, self.counts = self.counts, torch.zeros_like(self.counts)
+        return list(counts.view(self._shape).tolist())
 
 
 class BinCurriculum(Curriculum):
-    """Looks at the Solvers now and then, and draws the batches between two looks from shares.
+    """Draws its batches from shares of the bins, which it renews now and then in a scoring pass.
 
-    A subclass says what a look is and what the shares are made of.
+    A subclass says what a scoring pass is, what the shares are made of, and what is learnt from
+    outcomes.
 
     Args:
-        task: whose space has the bins.
-        every: updates between two looks at the Solvers.
-        choice: of the levels that are trained on, among several times as many; None for all.
+        space: that has the bins.
+        every: batches between two scoring passes.
 
     Raises:
         ValueError: if a number is out of range.
     """
 
-    told: ClassVar[Sequence[str]] = ("score",)
-    """Scores that are told of each cycle."""
+    shown: ClassVar[Sequence[str]] = ("score",)
+    """Scores that are logged."""
 
-    def __init__(self, task: Task, *, every: int, choice: Choice | None = None) -> None:
-        self.task = task
-        self._choice = choice
+    def __init__(self, space: Space, *, every: int) -> None:
+        self.space = space
         self._every = whole("every", every, 1)
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget the last Solver's scores."""
+        self._proposed = 0
+        self._counts = BinCounts(space)
+        self._inbox = Inbox()
         self.scores: dict[str, Tensor] = {}  # what the shares come from, each [K, N], on the CPU
-        self._proposed = torch.zeros(self.task.space.size, dtype=torch.int64)
 
     @abstractmethod
-    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
-        """Look at the Solvers; return the frames and evaluations that it took for each."""
+    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
+        """Renew :attr:`scores` for batches of ``count`` levels."""
 
     @abstractmethod
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]; they add up to one."""
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P], drawn systematically from the shares, or chosen among such."""
-        first = not self.scores
-        cost = self.look(learner, streams) if first or updates % self._every == 0 else (0, 0)
-        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
-        count = self.task.batch_size * (self._choice.times if self._choice else 1)
-        self._choices = systematic_draw(self.shares(), count, draws)
-        proposal = Proposal(self.task.space.generate(self._choices, levels), *cost)
-        if self._choice:
-            index, proposal = self._choice(learner, proposal, streams)
-            self._choices = self._choices.gather(1, index)
-        self._proposed += self._choices.flatten().bincount(minlength=len(self._proposed))
-        return proposal
+    def evidence(
+        self, student: Student, batch: Batch, outcome: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """What is learnt from an outcome, [K, n] each, beside the levels' ``bins``."""
+        return {}
 
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Tell of the last cycle: counts, and of each Solver scores and how even its shares are."""
+    def learn(self, evidence: TensorDict) -> None:
+        """Take in the evidence of one batch, [K, m]."""
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [K, n], drawn systematically from the shares."""
+        self._take_in()
+        if not self.scores or self._proposed % self._every == 0:
+            self.score(student, count, streams)
+        self._proposed += 1
+        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
+        bins = systematic_draw(self.shares(), count, draws)
+        return self._inbox.batch(self.space.generate(bins, levels), bins=bins)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Count the levels, and put what can be learnt from them aside."""
+        self._inbox.check(batch, outcome)
+        evidence = self.evidence(student, batch, outcome)
+        self._counts.add(batch.notes["bins"])
+        if evidence:
+            self._inbox.put(batch, bins=batch.notes["bins"], **evidence)
+
+    def log(self) -> dict[str, Any]:
+        """Counts, and of each student the scores and how even its shares are."""
+        self._take_in()
         if not self.scores:
-            return Improvement()
-        shape = [len(values) for values in self.task.space.axes.values()]
+            return {}
+        shape = [len(values) for values in self.space.axes.values()]
         shares = self.shares()
-        metrics = {
-            "histogram": self._proposed.view(shape).tolist(),
-            **{name: self.scores[name].unflatten(-1, shape).tolist() for name in self.told},
+        return {
+            "histogram": self._counts.histogram(),
+            **{name: self.scores[name].unflatten(-1, shape).tolist() for name in self.shown},
             "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
             "effective_bins": (1 / shares.square().sum(-1)).tolist(),
         }
-        self._proposed = torch.zeros_like(self._proposed)
-        return Improvement(metrics)
 
     def state_dict(self) -> dict[str, Any]:
-        """The scores, and how often each bin was proposed in the cycle."""
-        return {"scores": dict(self.scores), "proposed": self._proposed.clone()}
+        """The scores, the counts and the clock."""
+        return {
+            "scores": dict(self.scores),
+            "counts": self._counts.counts,
+            "proposed": self._proposed,
+            "inbox": self._inbox.state_dict(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with them."""
         self.scores = dict(state["scores"])
-        self._proposed = state["proposed"].clone()
+        self._counts.counts = state["counts"]
+        self._proposed = int(state["proposed"])
+        self._inbox.load_state_dict(state["inbox"])
+
+    def _take_in(self) -> None:
+        for evidence in self._inbox.take():
+            self.learn(evidence)
 
 
 def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, Tensor]:

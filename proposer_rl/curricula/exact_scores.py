@@ -1,4 +1,4 @@
-"""Scores that a task tells without any episode, each by what it asks of the task.
+"""Scores of levels without any episode, each by what it asks of the student.
 
 Those of an :class:`~proposer_rl.task.EpisodeLaw` are expectations of what episodes tell: over ever
 more of them the mean of the score from episodes is this number.
@@ -8,26 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from proposer_rl.learning import PPO
-from proposer_rl.meta.gradient_norms import squared_gradients
-from proposer_rl.task import (
-    DifferentiableTask,
-    EnumerableTask,
-    EpisodeLaw,
-    ExactTask,
-    Levels,
-    NoSuccessError,
-    OptimalTask,
-    Task,
-)
+from proposer_rl.curricula.student import Student
+from proposer_rl.task import EpisodeLaw, Levels, NoSuccessError
 
-Asks = Callable[[PPO, Levels, torch.Generator], Tensor]
-"""Of a learner of K Solvers, levels [K, n] and what a task draws from: float [K, n]."""
+
+class ExactScore(NamedTuple):
+    """How a score is asked for.
+
+    Attributes:
+        needs: of the student, names of its methods.
+        ask: of a student, levels [K, n] and the episodes of which ``max_mc`` takes the expected
+            highest return: float [K, n].
+    """
+
+    needs: tuple[str, ...]
+    ask: Callable[[Student, Levels, int], Tensor]
 
 
 def return_variance(law: EpisodeLaw, gamma: float, episodes: int) -> Tensor:
@@ -58,73 +58,47 @@ def expected_best(law: EpisodeLaw, episodes: int) -> Tensor:
     return (law.outcome.gather(-1, order) * chance).sum(-1)
 
 
-OF_THE_LAW = {score.__name__: score for score in (return_variance, max_mc, one_step_td_error)}
-EXACT = ("learnability", "regret", "gradient_norm", *OF_THE_LAW)
-
-
-def exact_score(task: Task, name: str, episodes: int) -> Asks:
-    """Makes what asks a task for one of the scores in :data:`EXACT`.
-
-    Args:
-        task: whose levels are scored.
-        name: of the score.
-        episodes: of which ``max_mc`` takes the expected highest return.
+def learnability(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """P (1 - p) of the probability p of success.
 
     Raises:
-        TypeError: if the task lacks what the score needs.
-        ValueError: if it tells by playing what the score needs exactly.
+        NoSuccessError: if there is no success.
     """
-    kind = type(task).__name__
-    if name in OF_THE_LAW:
-        if not isinstance(task, EnumerableTask):
-            raise TypeError(
-                f"score={name} from source=exact needs the law of an episode: {kind} must define "
-                "episode_law(agent, levels); source=episodes needs nothing"
-            )
-        return partial(_by_law, task, OF_THE_LAW[name], episodes)
-    if name == "gradient_norm":
-        if not isinstance(task, DifferentiableTask):
-            raise TypeError(
-                f"score=gradient_norm needs gradients: {kind} must define "
-                "differentiable_performance(agent, levels)"
-            )
-        norms = squared_gradients(cast(ExactTask, task))
-        return lambda learner, levels, _: norms(learner, levels)
-    if name == "regret" and not isinstance(task, OptimalTask):
-        raise TypeError(
-            f"{kind} does not know the largest return (optimal_return), which "
-            "score=regret from source=exact needs; source=episodes takes the best that was seen"
-        )
-    if not task.exact_performance:
-        raise ValueError(
-            f"source=exact: {kind} tells performance by playing, which is not exact; give "
-            "source=episodes, as +score=sampled and +filter=learnability_sampled do"
-        )
-    return partial(_regret if name == "regret" else _learnability, task)
-
-
-def _by_law(
-    task: EnumerableTask,
-    score: Callable[[EpisodeLaw, float, int], Tensor],
-    episodes: int,
-    learner: PPO,
-    levels: Levels,
-    generator: torch.Generator,
-) -> Tensor:
-    return score(task.episode_law(learner.agent, levels), learner.settings.gamma, episodes)
-
-
-def _learnability(task: Task, learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
-    performance = task.performance(learner.agent, levels, generator)
+    performance = student.exact_performance(levels)
     if "success" not in performance.keys():
         raise NoSuccessError(
-            f"learnability: {type(task).__name__} tells no success, only the return; of the scores "
-            "regret and gradient norms take that"
+            "learnability: this task tells no success, only the return; of the scores regret and "
+            "gradient norms take that"
         )
     success = performance["success"]
     return success * (1 - success)
 
 
-def _regret(task: Task, learner: PPO, levels: Levels, generator: torch.Generator) -> Tensor:
-    reached = task.performance(learner.agent, levels, generator)["return"]
-    return cast(OptimalTask, task).optimal_return(levels) - reached
+def regret(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """The largest return that any policy reaches, minus the student's."""
+    return student.optimal_return(levels) - student.exact_performance(levels)["return"]
+
+
+def gradient_norm(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """Squared length of the gradient of the return."""
+    return student.gradient_norms(levels)
+
+
+def _by_law(
+    score: Callable[[EpisodeLaw, float, int], Tensor],
+    student: Student,
+    levels: Levels,
+    episodes: int,
+) -> Tensor:
+    return score(student.episode_law(levels), student.gamma, episodes)
+
+
+EXACT = {
+    "learnability": ExactScore(("exact_performance",), learnability),
+    "regret": ExactScore(("optimal_return", "exact_performance"), regret),
+    "gradient_norm": ExactScore(("gradient_norms",), gradient_norm),
+    **{
+        score.__name__: ExactScore(("episode_law",), partial(_by_law, score))
+        for score in (return_variance, max_mc, one_step_td_error)
+    },
+}

@@ -1,4 +1,4 @@
-"""A bandit that trains each Solver on the bins in which it gets better, or worse, fastest."""
+"""A bandit that trains each student on the bins in which it gets better, or worse, fastest."""
 
 from __future__ import annotations
 
@@ -6,56 +6,56 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.checks import one_of, part
-from proposer_rl.curricula.choice import Choice
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.probes import Probes
-from proposer_rl.learning import PPO, Update, first_episode_return, first_episode_success
+from proposer_rl.curricula.student import Student
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import Space
 
 Q = 0.1  # the success that is stretched to one half
 SOURCES = ("exact", "episodes")
 
 
 class LearningProgressCurriculum(BinCurriculum):
-    """Draws each Solver's batch from bins by their bidirectional learning progress.
+    """Draws each student's batch from bins by their bidirectional learning progress.
 
-    With p the Solver's success in a bin at a look, f and s a fast and a slow average of it and g
-    the function :func:`stretched`,
+    With p the student's success in a bin at a scoring pass, f and s a fast and a slow average of it
+    and g the function :func:`stretched`,
 
         f <- fast f + (1 - fast) p,    s <- slow s + (1 - slow) f,    LP = |g(f) - g(s)|,
         share of a bin = (1 - exploration) LP / (sum of all LP) + exploration / N,
 
-    and even shares where there is no progress at all. Both averages begin with the first p
+    and uniform shares where there is no progress at all. Both averages begin with the first p
     (Kanitscheider et al. 2021, arXiv 2106.14876, section on learning progress; Zhang et al. 2023,
     OMNI, arXiv 2306.01711).
 
     Args:
-        task: whose space has the bins.
-        every: updates between two looks at the Solvers.
+        space: that has the bins.
+        every: batches between two scoring passes.
         source: of p: ``"exact"`` for fixed levels of every bin, which is exact where the task's
-            performance is and costs evaluations; ``"episodes"`` for the first episodes of the
-            Solver's own training on the bin since the last look, which cost nothing. Of a bin
-            without one, the averages stay.
+            performance is and costs evaluations; ``"episodes"`` for what came of training on the
+            bin since the last scoring pass, which costs nothing. Of a bin without any, the
+            averages stay.
         probes: levels of each bin.
         measure: ``"success"``; or ``"return"``, for tasks without success, and then without g,
             which is of probabilities.
         fast, slow: share of the old in either average.
-        exploration: part of each batch that is drawn evenly.
-        choice: see :class:`BinCurriculum`.
+        exploration: part of each batch that is drawn uniformly.
 
     Raises:
         ValueError: if a value is out of range.
     """
 
-    told = ("score", "performance")
+    shown = ("score", "performance")
 
     def __init__(
         self,
-        task: Task,
+        space: Space,
         *,
         every: int = 1,
         source: str = "exact",
@@ -64,32 +64,30 @@ class LearningProgressCurriculum(BinCurriculum):
         fast: float = 0.9,
         slow: float = 0.9,
         exploration: float = 0.2,
-        choice: Choice | None = None,
     ) -> None:
+        super().__init__(space, every=every)
         self._source = one_of("source", source, SOURCES)
-        self._probes = Probes(task, probes, measure)
+        self._probes = Probes(space, probes, measure)
         self._fast = part("fast", fast, below_one=True)
         self._slow = part("slow", slow, below_one=True)
         self._exploration = part("exploration", exploration)
-        super().__init__(task, every=every, choice=choice)
+        # Sum and number of what came of each bin since the last scoring pass, [K, N].
+        self._episodes: list[Tensor] = []
 
-    def begin(self) -> None:
-        """Forget the last Solver: its averages, its episodes and its probes."""
-        super().begin()
-        self._probes.forget()
-        self._episodes: list[Tensor] = []  # sum and number in each bin since the last look, [K, N]
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The performance on its probes, where progress is read from them."""
+        return ("performance",) if self._source == "exact" else ()
 
-    def look(self, learner: PPO, streams: Sequence[Streams]) -> tuple[int, int]:
+    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Move the averages by the performance on the probes, or in the episodes since."""
-        shape = (len(streams), self.task.space.size)
-        seen, evaluations = torch.full(shape, torch.nan), 0
+        seen = torch.full((len(streams), self.space.size), torch.nan)
         if self._source == "exact":
-            seen, evaluations = self._probes.performance(learner, streams)
+            seen = self._probes.performance(student, streams)
         elif self._episodes:
             seen = self._episodes[0] / self._episodes[1]
         self._episodes = []
         self._average(seen)
-        return 0, evaluations
 
     def _average(self, seen: Tensor) -> None:
         """Take in what was seen in each bin, [K, N], NaN where nothing was."""
@@ -109,13 +107,24 @@ class LearningProgressCurriculum(BinCurriculum):
             "slow": slow,
         }
 
-    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
-        """Remember the episodes, where they are what progress is read from."""
+    def evidence(
+        self, student: Student, batch: Batch, outcome: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """What the episodes reached, where they are what progress is read from.
+
+        Raises:
+            ValueError: if the outcome tells no success and success is the measure.
+        """
+        measure = self._probes.measure
         if self._source == "exact":
-            return
-        first = {"success": first_episode_success, "return": first_episode_return}
-        reached = first[self._probes.measure](update.rollout).float().cpu()  # [K, P]
-        means, counts = means_of_bins(self._choices, reached, self.task.space.size)
+            return {}
+        if measure not in outcome.keys():
+            raise ValueError(f"measure={measure}: the outcome has no success")
+        return {"reached": outcome[measure].float().cpu()}
+
+    def learn(self, evidence: TensorDict) -> None:
+        """Add it to what is known of the bins."""
+        means, counts = means_of_bins(evidence["bins"], evidence["reached"], self.space.size)
         totals = [(means * counts).nan_to_num(0.0), counts]
         before = self._episodes or [torch.zeros_like(total) for total in totals]
         self._episodes = [one + other for one, other in zip(before, totals, strict=True)]
@@ -125,7 +134,7 @@ class LearningProgressCurriculum(BinCurriculum):
         return progress_shares(self.scores["score"], self._exploration)
 
     def state_dict(self) -> dict[str, Any]:
-        """The episodes since the last look and the probes too."""
+        """What came since the last scoring pass and the probes, too."""
         more = {"episodes": list(self._episodes), "probes": self._probes.state_dict()}
         return {**super().state_dict(), **more}
 
@@ -154,11 +163,11 @@ def stretched(success: Tensor, q: float = Q) -> Tensor:
 
 
 def progress_shares(progress: Tensor, exploration: float) -> Tensor:
-    """Shares [K, N] in proportion to progress [K, N], a part of them even.
+    """Shares [K, N] in proportion to progress [K, N], a part of them uniform.
 
     Args:
         progress: not negative.
-        exploration: the part that is even; all of it for a Solver without any progress.
+        exploration: the part that is uniform; all of it for a student without any progress.
 
     Example:
         >>> progress_shares(torch.tensor([[3.0, 1.0], [0.0, 0.0]]), 0.2)

@@ -1,89 +1,101 @@
-"""A Proposer that is paid the regret between two students: PAIRED."""
+"""A Proposer that is rewarded for the regret between two students: PAIRED."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
-from proposer_rl.curricula.choice import Choice
-from proposer_rl.curricula.problem_proposer import ProblemProposer, Worth
-from proposer_rl.learning import PPO, Update
+from proposer_rl.curricula.contract import Batch, Inbox
+from proposer_rl.curricula.problem_proposer import ProblemProposer
+from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Task
+from proposer_rl.task import Distribution, Levels, Space
 
 
 class PairedProposer(ProblemProposer):
-    """A problem is worth what another Solver, the antagonist, gets more on it.
+    """A problem's reward is what another student, the antagonist, gets more on it.
 
     PAIRED (Dennis et al. 2020, arXiv 2012.02096, algorithm 1): protagonist and antagonist train on
-    the same levels, and the generator is paid
+    the same levels, and the generator is rewarded
 
         max(0, J(antagonist, level) - J(protagonist, level)).
 
-    Of the task's performance, which may be exact; published are the antagonist's best and the
+    Of the students' performance, which may be exact; published are the antagonist's best and the
     protagonist's mean episode. The levels are draws from the space's bins rather than built cell by
-    cell, each paid by itself.
+    cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back.
 
     Args:
-        task: whose performance is compared, and who makes the antagonist.
-        agent: see :class:`ProblemProposer`.
+        space: see :class:`ProblemProposer`.
+        target: the same.
+        agent: the same.
         settings: the same.
+        antagonist: the second student.
         probe_levels: probes C.
-        choice: see :class:`ProblemProposer`.
-        streams: that the antagonist's weights are drawn from.
     """
 
     def __init__(
         self,
-        task: Task,
+        space: Space,
+        target: Distribution,
         agent: ActorCritic,
         settings: PPOSettings,
         *,
-        streams: Streams,
+        antagonist: TaskStudent,
         probe_levels: int = 16,
-        choice: Choice | None = None,
     ) -> None:
-        self.antagonist = task.learner([streams])
-        self._newborn = self.antagonist.snapshot()
-        super().__init__(task, agent, settings, probe_levels=probe_levels, choice=choice)
+        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
+        self.antagonist = antagonist
+        self._inbox = Inbox(target.sample(1, torch.Generator())[0])
 
-    def begin(self) -> None:
-        """The antagonist begins anew, too, always with the same weights."""
-        super().begin()
-        self.antagonist.restore(self._newborn)
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Performance, too."""
+        return (*super().needs, "performance")
 
-    def worth(self, learner: PPO, levels: Levels, streams: Sequence[Streams]) -> Worth:
-        """The regret of each level; and what the antagonist's training on them will cost."""
-        task, both = self.task, (self.antagonist, learner)
-        (stream,) = streams
-        with torch.no_grad():
-            returns = [
-                task.performance(student.agent, levels, stream.generator("regret"))["return"]
-                for student in both
-            ]
-        regret = (returns[0] - returns[1]).clamp_min(0)
-        told = {"regret": float(regret.mean()), "regret_sd": float(regret.std(correction=0))}
-        self._draws = stream.generator("antagonist")
-        frames = task.batch_size * self.antagonist.settings.horizon
-        return Worth(regret, told, frames=frames, evaluations=2 * regret.shape[1])
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The regret of each level."""
+        antagonist, protagonist = (
+            each.performance(levels, stream.generator("regret"))["return"]
+            for each in (self.antagonist, student)
+        )
+        student.spend(evaluations=levels.shape[1])  # of the antagonist
+        regret = (antagonist - protagonist).clamp_min(0)
+        return regret, {
+            "regret": float(regret.mean()),
+            "regret_sd": float(regret.std(correction=0)),
+        }
 
-    def observe(self, learner: PPO, levels: Levels, update: Update) -> None:
-        """Train the antagonist on the same levels.
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Put the levels aside for the antagonist; it takes as many steps on them."""
+        super().observe(student, batch, outcome)
+        student.spend(frames=int(outcome["steps"][0].sum()))
+        self._inbox.put(batch, level=batch.levels, seed=batch.notes["seed"])
+
+    def _numbered(self, levels: Levels, bins: Tensor, stream: Streams) -> Batch:
+        """The seed of the antagonist's actions travels with the levels."""
+        seed = stream.generator("antagonist").initial_seed()
+        return self._inbox.batch(levels, bins=bins, seed=torch.full(bins.shape, seed))
+
+    def _take_in(self) -> None:
+        """Train the antagonist on the batches that are complete.
 
         Raises:
             DivergedError: if a number of it is not finite.
         """
-        self.antagonist.env.set_levels(levels)
-        self.antagonist.update([self._draws])
-        self.antagonist.check()
+        for evidence in self._inbox.take(whole=True):
+            generator = torch.Generator().manual_seed(int(evidence["seed"][0, 0]))
+            self.antagonist.train(evidence["level"], [generator])
 
     def state_dict(self) -> dict[str, Any]:
-        """The antagonist too."""
+        """The antagonist, too."""
         return {**super().state_dict(), "antagonist": self.antagonist.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""How good Solvers are in each bin: what they reach on fixed levels of it."""
+"""How good students are in each bin: what they reach on fixed levels of it."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import torch
 from torch import Tensor
 
 from proposer_rl.curricula.checks import one_of, whole
-from proposer_rl.learning import PPO
+from proposer_rl.curricula.student import Student
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError, Task
+from proposer_rl.task import NoSuccessError, Space
 
 MEASURES = ("success", "return")
 
 
 class Probes:
-    """Fixed levels of every bin, each Solver's own, on which its performance is looked at.
+    """Fixed levels of every bin, each student's own, on which its performance is measured.
 
-    The levels are drawn at the first look at a Solver, from the streams of that update, and stay
-    for its life. What is measured is exact where the task's performance is; otherwise all Solvers
-    of a population draw from the streams of the first, so that then one of several does not do what
-    it would do alone.
+    The levels are drawn at the first time, from the streams of that proposal, and stay. What is
+    measured is exact where the student's performance is; otherwise all students of a population
+    draw from the streams of the first, so that then one of several does not do what it would do
+    alone.
 
     Args:
-        task: whose space has the bins.
+        space: that has the bins.
         count: levels of each bin.
         measure: ``"success"`` or ``"return"``.
 
@@ -33,46 +33,38 @@ class Probes:
         ValueError: if a value is out of range.
     """
 
-    def __init__(self, task: Task, count: int, measure: str) -> None:
-        self._task = task
+    def __init__(self, space: Space, count: int, measure: str) -> None:
+        self._space = space
         self._count = whole("probes", count, 1)
         self.measure = one_of("measure", measure, MEASURES)
-        self.forget()
-
-    def forget(self) -> None:
-        """Draw new levels at the next look."""
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 
-    @torch.no_grad()
-    def performance(self, learner: PPO, streams: Sequence[Streams]) -> tuple[Tensor, int]:
-        """Mean performance of K Solvers in each bin, and the evaluations that it took for each.
+    def performance(self, student: Student, streams: Sequence[Streams]) -> Tensor:
+        """Mean performance of K students in each bin: float32 [K, N], on the CPU.
 
         Args:
-            learner: of the Solvers.
-            streams: of the update.
-
-        Returns:
-            float32 [K, N], on the CPU; the number of levels.
+            student: that is measured.
+            streams: of the proposal.
 
         Raises:
             NoSuccessError: if success is to be measured and the task tells none.
         """
-        size = self._task.space.size
+        size = self._space.size
         if self._levels is None:
             self._drawn_from = self._drawn_from or [s.address for s in streams]
             bins = torch.arange(size).repeat_interleave(self._count)
             own = [Streams(*address).generator("probes") for address in self._drawn_from]
-            self._levels = self._task.space.generate(bins.expand(len(own), -1), own)
+            self._levels = self._space.generate(bins.expand(len(own), -1), own)
         draws = streams[0].generator("probe_episodes")
-        found = self._task.performance(learner.agent, self._levels, draws)
-        if self.measure not in found.keys():
+        performance = student.performance(self._levels, draws)
+        if self.measure not in performance.keys():
             raise NoSuccessError(
-                f"measure={self.measure}: {type(self._task).__name__} tells no success, only the "
-                "return; give curriculum.measure=return"
+                f"measure={self.measure}: this task tells no success, only the return; give "
+                "measure=return"
             )
-        reached = found[self.measure].unflatten(-1, (size, self._count)).mean(-1)  # [K, N]
-        return reached.float().cpu(), size * self._count
+        reached = performance[self.measure].unflatten(-1, (size, self._count)).mean(-1)  # [K, N]
+        return reached.float().cpu()
 
     def state_dict(self) -> dict[str, Any]:
         """Which streams the levels were drawn from, so that they can be drawn again."""
@@ -80,5 +72,5 @@ class Probes:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the levels of a state."""
-        self.forget()
+        self._levels = None
         self._drawn_from = [list(address) for address in state["drawn_from"]]

@@ -1,61 +1,46 @@
-"""The paper's Proposer, paid for each problem by itself."""
+"""The paper's Proposer, rewarded for each problem by itself."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
-from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
+from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.bins import BinCounts
 from proposer_rl.curricula.checks import real, whole
-from proposer_rl.curricula.choice import Choice
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.proposer import learnt_proposer
-from proposer_rl.learning import PPO
+from proposer_rl.curricula.student import Student
 from proposer_rl.learning.divergence import located, require_finite
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Task
-
-
-class Worth(NamedTuple):
-    """What problems are worth.
-
-    Attributes:
-        paid: for each, float [K, E].
-        told: of all of them, by name.
-        frames: environment steps that it cost each Solver.
-        evaluations: of a policy on a level, for each Solver.
-    """
-
-    paid: Tensor
-    told: dict[str, float]
-    frames: int = 0
-    evaluations: int = 0
+from proposer_rl.task import Distribution, Levels, Space
 
 
 class ProblemProposer(Curriculum):
     """Draws each of P problems from a policy over probes, and learns what each was worth.
 
-    At every update the policy sees what the Solver would do on probe levels of the target, draws
-    the bin of each problem, and is paid for each, standardised over all that it drew. A few
+    At every proposal the policy sees what the student would do on probe levels of the target, draws
+    the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
     gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7),
-    with no critic. What problems are worth is known before anybody trains on them: where the Solver
-    trains on a choice among more of them, the policy learns from all that it drew.
+    with no critic. The rewards are known before anybody trains: where the levels are filtered, the
+    policy learns from all that it drew.
 
     Args:
-        task: whose target is seen, and whose space has the bins.
+        space: that has the bins.
+        target: the distribution through whose levels the student is seen.
         agent: from ``probes`` [K, C, ...] to logits [K, P, N] of independent categoricals, as
             :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
-        choice: of the levels that are trained on, among several times as many draws; None for all.
 
     Raises:
         ValueError: if a number is out of range.
@@ -63,19 +48,18 @@ class ProblemProposer(Curriculum):
 
     def __init__(
         self,
-        task: Task,
+        space: Space,
+        target: Distribution,
         agent: ActorCritic,
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
-        choice: Choice | None = None,
     ) -> None:
-        self.agent, self.task = agent, task
+        self.agent, self.space, self.target = agent, space, target
         whole("epochs", settings.epochs, 1)
         real("learning_rate", settings.learning_rate, above=0)
         real("entropy_coeff", settings.entropy_coeff, least=0)
         self._settings = settings
-        self._choice = choice
         self._probe_levels = probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
@@ -85,85 +69,84 @@ class ProblemProposer(Curriculum):
             entropy_coeff=settings.entropy_coeff,
             normalize_advantage=True,
             functional=False,
-        ).to(task.device)  # its numbers are tensors
+        ).to(device_of(target.sample(1, torch.Generator())))  # its numbers are tensors
         self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
         self._parameters = [p for p in agent.parameters() if p.requires_grad]
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
-        self.begin()
+        self._inbox = Inbox()
+        self._counts = BinCounts(space)
+        self._metrics: dict[str, float] = {}
 
-    def begin(self) -> None:
-        """Nothing of the last Solver's cycle is told of the next one."""
-        self._proposed = torch.zeros(self.task.space.size, dtype=torch.int64)
-        self._told: dict[str, float] = {}
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the student would do on the probes."""
+        return ("probe",)
 
     @abstractmethod
-    def worth(self, learner: PPO, levels: Levels, streams: Sequence[Streams]) -> Worth:
-        """What each of the levels [K, E] is worth to its Solver, who has not trained on it yet."""
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Of each of the levels [1, E], on which nobody has trained: float [1, E]; and metrics."""
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [1, P] of the policy's draws, from all of which it has learnt already.
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [1, n] of the policy's draws, from all of which it has learnt already.
+
+        The policy draws P problems at once: as many times as it takes for n.
 
         Raises:
-            ValueError: for several Solvers: a Proposer learns from one.
+            ValueError: for several students: a Proposer learns from one.
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
-        bins, proposal = self.draw_and_learn(learner, streams)
-        self._proposed += bins.flatten().bincount(minlength=len(self._proposed))
-        return proposal
-
-    def draw_and_learn(self, learner: PPO, streams: Sequence[Streams]) -> tuple[Tensor, Proposal]:
-        """Draw for K Solvers that are all seen through the same probes, and learn from all draws.
-
-        Returns:
-            The bins of their levels, int64 [K, P], and the levels [K, P].
-        """
-        task, agent = self.task, self.agent
-        probes = task.target.sample(self._probe_levels, streams[0].generator("probes"))
+        self._take_in()
+        (stream,), agent = streams, self.agent
+        probes = self.target.sample(self._probe_levels, stream.generator("probes"))
         with torch.no_grad():
-            seen = TensorDict({"probes": task.probe(learner.agent, probes)}, [len(streams)])
+            seen = TensorDict({"probes": student.probe(probes)}, [1])
             policy = agent.distribution(agent(seen.copy()))
-            shape = (self._choice.times if self._choice else 1, task.batch_size)
-            noise = [torch.rand(shape, generator=s.generator("choices")) for s in streams]
-            choices = draw(policy, torch.stack(noise, 1).to(task.device))  # [times, K, P]
+            problems = policy.batch_shape[1]
+            shape = (-(-count // problems), 1, problems)
+            noise = torch.rand(shape, generator=stream.generator("choices"))
+            choices = draw(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
-        bins = choices.transpose(0, 1).flatten(1).cpu()  # [K, times * P]
-        levels = task.space.generate(bins, [stream.generator("levels") for stream in streams])
-        worth = self.worth(learner, levels, streams)
-        paid = worth.paid.unflatten(1, shape).transpose(0, 1)
+        bins = choices.view(1, -1).cpu()  # [1, times * P]
+        levels = self.space.generate(bins, [stream.generator("levels")])
+        reward, metrics = self.reward(student, levels, stream)
         played = TensorDict(
             {
                 agent.action_key: choices,
                 agent.log_prob_key: log_prob,
-                "advantage": paid.unsqueeze(-1),
+                "advantage": reward.view(*choices.shape, 1),
             },
             choices.shape,
         )
         self._learn(seen, played)
-        self._told |= worth.told
-        proposal = Proposal(levels, worth.frames, worth.evaluations)
-        if self._choice:
-            index, proposal = self._choice(learner, proposal, streams)
-            bins = bins.gather(1, index)
-        return bins, proposal
+        self._metrics |= metrics
+        return self._numbered(levels[:, :count], bins[:, :count], stream)
 
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Tell of the last cycle."""
-        if not self._told:
-            return Improvement()
-        shape = [len(values) for values in self.task.space.axes.values()]
-        metrics = {**self._told, "histogram": self._proposed.view(shape).tolist()}
-        self._proposed = torch.zeros_like(self._proposed)
-        return Improvement(metrics)
+    def _numbered(self, levels: Levels, bins: Tensor, stream: Streams) -> Batch:
+        return self._inbox.batch(levels, bins=bins)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Count the levels."""
+        self._inbox.check(batch, outcome)
+        self._counts.add(batch.notes["bins"])
+
+    def log(self) -> dict[str, Any]:
+        """The last metrics of the policy, and counts."""
+        self._take_in()
+        if not self._metrics:
+            return {}
+        return {**self._metrics, "histogram": self._counts.histogram()}
 
     def learnt(self) -> dict[str, Any]:
         """The Proposer, without its optimiser."""
         return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights and Adam's state, and what is told of the cycle."""
+        """Weights and Adam's state, and what is logged."""
         moments = {
             name: self._adam.state[parameter]
             for name, parameter in self.agent.named_parameters()
@@ -176,8 +159,9 @@ class ProblemProposer(Curriculum):
                 for name, parameter in self.agent.named_parameters()
             },
             "observed": self.agent.in_keys,
-            "proposed": self._proposed.clone(),
-            "told": dict(self._told),
+            "counts": self._counts.counts,
+            "metrics": dict(self._metrics),
+            "inbox": self._inbox.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -190,8 +174,12 @@ class ProblemProposer(Curriculum):
                 key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
                 for key, value in entry.items()
             }
-        self._proposed = state["proposed"].clone()
-        self._told = dict(state["told"])
+        self._counts.counts = state["counts"]
+        self._metrics = dict(state["metrics"])
+        self._inbox.load_state_dict(state["inbox"])
+
+    def _take_in(self) -> None:
+        """Take in what came of the levels; here, nothing."""
 
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
         """A few steps on all draws: the clipped objective of each problem, with its advantage.
@@ -211,8 +199,8 @@ class ProblemProposer(Curriculum):
             terms = losses.select("loss_objective", "loss_entropy").detach()
             steps.append(terms.set("grad_norm", norm))
             with located("the Proposer"):  # before it draws from weights that are no numbers
-                weights, paid = dict(self.agent.named_parameters()), played["advantage"]
-                require_finite(paid.transpose(0, 1), TensorDict.stack(steps), weights, None)
-        self._told |= {
+                weights, reward = dict(self.agent.named_parameters()), played["advantage"]
+                require_finite(reward.transpose(0, 1), TensorDict.stack(steps), weights, None)
+        self._metrics |= {
             key: float(losses[key].detach()) for key in ("entropy", "kl_approx", "clip_fraction")
         }

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Advance, Curriculum, Improvement, Proposal
-from proposer_rl.curricula.choice import Choice
+from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedCurriculum
+from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.copies import Copies, CopiesHere
@@ -20,25 +20,23 @@ from proposer_rl.models import ActorCritic, draw
 from proposer_rl.streams import Streams
 
 
-class ProposerCurriculum(Curriculum):
-    """The Solver trains on the proposals of an agent, which learns from copies of the Solver.
+class ProposerCurriculum(LearnedCurriculum):
+    """The student trains on the proposals of an agent, which learns from replicas of the student.
 
-    With a trainer, before each cycle K copies of the Solver go through one episode of the
+    With a trainer, before each cycle K replicas of the student go through one episode of the
     meta-environment, and the Proposer's PPO learns from them. Without one it is frozen. Then the
-    Solver itself trains on the Proposer's proposals.
+    student itself trains on the Proposer's proposals.
 
     Args:
         agent: the Proposer.
-        view: what it sees of the Solver; new levels at every cycle.
+        view: what it sees of the student; new levels at every cycle.
         actions: the levels that its actions stand for.
         meta_episode_length: updates L of the episodes in which it learns or has learnt, from which
             it knows how far a cycle has gone.
-        action_repeat: updates for which an action holds.
-        own_action: the action for the Solver itself: a ``"sample"`` of the policy, or its
+        action_repeat: batches for which an action holds.
+        own_action: the action for the student itself: a ``"sample"`` of the policy, or its
             ``"mode"``, without exploration.
         trainer: how it learns; None to leave it as it is.
-        choice: of the levels that the Solver trains on, among several times as many; None for all.
-            Copies train on all.
     """
 
     def __init__(
@@ -51,7 +49,6 @@ class ProposerCurriculum(Curriculum):
         action_repeat: int,
         own_action: Literal["sample", "mode"],
         trainer: ProposerTrainer | None = None,
-        choice: Choice | None = None,
     ) -> None:
         self.agent = agent
         self.view = view
@@ -60,38 +57,40 @@ class ProposerCurriculum(Curriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
-        self.choice = choice
-        self.trains_copies = trainer is not None
-        self._began = 0  # the Solver's updates at the start of this cycle
+        self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
-    def begin(self) -> None:
-        """Forget the last Solver's cycle."""
-        self._began, self._action = 0, None
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What it sees; and while it learns, what becomes of replicas."""
+        seen = ("performance", "probe")
+        return seen if self.trainer is None else (*seen, "snapshot", "restore")
 
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Look at the Solver through new levels, and let the trainer train."""
+    @property
+    def trains_replicas(self) -> bool:
+        """While it learns."""
+        return self.trainer is not None
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Draw the levels through which the student is seen, and let the trainer train."""
         (stream,) = streams
-        self._began = updates
+        self._proposed = 0
         if self.trainer is not None:
-            return self.trainer.train(learner, stream)
+            return self.trainer.train(student, stream)
         self.view.draw_levels(stream)
         return Improvement()
 
     @torch.no_grad()
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [1, P] of the Proposer's policy, given what it sees of the Solver."""
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [1, n] of the Proposer's policy, given what it sees of the student."""
         (stream,) = streams
-        evaluations = 0
-        if self._action is None:  # the first update of a stage can come within a cycle
-            self._began = updates
-        if self._action is None or (updates - self._began) % self.action_repeat == 0:
-            self._action = self._act(learner, updates - self._began, stream)
-            evaluations = self.view.validation_levels
-        count = learner.env.batch_size[1:].numel() * (self.choice.times if self.choice else 1)
+        if self._action is None:  # the first batch can come within a cycle
+            self._proposed = 0
+        if self._action is None or self._proposed % self.action_repeat == 0:
+            self._action = self._act(student, stream)
+        self._proposed += 1
         levels, _ = self.actions.levels(self._action, count, [stream])
-        proposal = Proposal(levels, evaluations=evaluations)
-        return self.choice(learner, proposal, streams)[1] if self.choice else proposal
+        return Batch(levels, TensorDict({}, (1, count)))
 
     def learnt(self) -> dict[str, Any]:
         """The Proposer, without its optimiser; nothing if it is frozen: others have it then."""
@@ -104,7 +103,7 @@ class ProposerCurriculum(Curriculum):
         )
         return {
             "streams": self.view.streams.address,
-            "began": self._began,
+            "proposed": self._proposed,
             "action": self._action,
             "proposer": agent.to_dict(),
             "observed": self.agent.in_keys,
@@ -113,7 +112,7 @@ class ProposerCurriculum(Curriculum):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on within a cycle."""
         self.view.draw_levels(Streams(*state["streams"]))
-        self._began = int(state["began"])
+        self._proposed = int(state["proposed"])
         action = state["action"]
         self._action = None if action is None else action.to(self.view.task.device)
         agent = TensorDict(state["proposer"], batch_size=[])
@@ -123,15 +122,17 @@ class ProposerCurriculum(Curriculum):
             self.trainer.learner.restore(agent)
 
     def close(self) -> None:
-        """Let go of the copies that are elsewhere."""
+        """Let go of the replicas that are elsewhere."""
         if self.trainer is not None:
             self.trainer.copies.close()
 
-    def _act(self, learner: PPO, updates: int, stream: Streams) -> Tensor:
+    def _act(self, student: Student, stream: Streams) -> Tensor:
         # A cycle may be longer than the episodes that it learnt in: then another one begins.
-        progress = updates % self.meta_episode_length / self.meta_episode_length
-        # -1: before all episodes of the copies, whose numbers begin at 0.
-        state = self.view.observe(learner.agent, progress, -1, updates)
+        progress = self._proposed % self.meta_episode_length / self.meta_episode_length
+        # -1: before all episodes of the replicas, whose numbers begin at 0.
+        draws = self.view.streams.generator("evaluation", -1, self._proposed)
+        performance = student.performance(self.view.validation, draws)
+        state = self.view.observation(performance, student.probe(self.view.probes), progress)
         distribution = self.agent.distribution(self.agent(state))
         if self.own_action == "mode":
             return distribution.mode
@@ -141,15 +142,15 @@ class ProposerCurriculum(Curriculum):
 
 
 class ProposerTrainer:
-    """Trains a Proposer on what its proposals do to K copies of the Solver.
+    """Trains a Proposer on what its proposals do to K replicas of the student.
 
     Args:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
             horizon is the number of steps of that environment's episodes.
-        copies: where the copies are rolled out; None for the learner's own environment, in this
+        copies: where the replicas are rolled out; None for the learner's own environment, in this
             process.
-        advance: ``"train"``: the Solver trains on new proposals; ``"best"`` or ``"random"``: it
-            becomes the copy with the greatest total reward, or any, with its optimiser.
+        advance: ``"train"``: the student trains on new proposals; ``"best"`` or ``"random"``: it
+            becomes the replica with the greatest total reward, or any, with its optimiser.
 
     Raises:
         ValueError: for an environment of another kind, or a horizon other than the episode's.
@@ -187,27 +188,26 @@ class ProposerTrainer:
             trainer=self,
         )
 
-    def train(self, solver: PPO, stream: Streams) -> Improvement:
-        """Roll K copies of the Solver out and train the Proposer on their rewards."""
+    def train(self, student: Student, stream: Streams) -> Improvement:
+        """Roll K replicas of the student out and train the Proposer on their rewards."""
         env = self.env
-        rollout = self.copies.roll_out(solver.snapshot()[0], stream)
+        rollout = self.copies.roll_out(student.snapshot()[0], stream)
         with located("the Proposer"):
             training = self.learner.optimise(rollout)
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         copies = len(rewards)
-        # A copy that the Solver becomes is the Solver's own training.
+        # A replica that the student becomes is the student's own training.
         trained = copies - (self.advance != "train")
-        frames = trained * env.batch_of_levels * env.solvers.settings.horizon
-        return Improvement(
-            self._metrics(rollout, rewards, training),
-            frames * env.meta_episode_length,
-            # Every copy after each of its actions, and all of them once at the start.
-            copies * (env.steps + 1) * env.view.validation_levels,
-            self._advance(solver, rewards, stream),
+        student.spend(
+            frames=trained * env.frames_per_update * env.meta_episode_length,
+            # Every replica after each of its actions, and all of them once at the start.
+            evaluations=copies * (env.steps + 1) * env.view.validation_levels,
         )
+        metrics = self._metrics(rollout, rewards, training)
+        return Improvement(metrics, self._advance(student, rewards, stream))
 
-    def _advance(self, solver: PPO, rewards: Tensor, stream: Streams) -> Advance | None:
+    def _advance(self, student: Student, rewards: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
             return None
         chosen = int(rewards.argmax())
@@ -215,7 +215,7 @@ class ProposerTrainer:
             generator = stream.generator("advance")
             chosen = int(torch.randint(len(rewards), (), generator=generator))
         trained = self.copies.trained(chosen)
-        solver.restore(trained.solver)
+        student.restore(trained.solver)
         return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 
     def _metrics(

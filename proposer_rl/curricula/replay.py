@@ -16,15 +16,14 @@ One loop with options, which is what the methods differ in:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.base import Curriculum, Improvement, Proposal
-from proposer_rl.curricula.batches import fresh_levels, levels_at
+from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, packed, unpacked
 from proposer_rl.curricula.buffer import (
     SEEN,
     ReplayRule,
@@ -36,28 +35,35 @@ from proposer_rl.curricula.buffer import (
     rescore,
 )
 from proposer_rl.curricula.checks import flag, one_of, part, real, whole
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
-from proposer_rl.learning import PPO, DivergedError, Update
+from proposer_rl.curricula.student import Student
+from proposer_rl.learning import DivergedError
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, EditableTask, Levels
+from proposer_rl.task import Distribution, Levels
+
+Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
+"""Levels [K, n] after so many small random edits each, student k's from generator k."""
 
 EASY = 4  # parents of a batch of edits, where they are not all of the batch
 SHOWN = 6  # levels of each kind that a reader is shown
 
 
 class ReplayCurriculum(Curriculum):
-    """Draws each Solver's batch from a buffer of levels by their scores.
+    """Draws each student's batch from a buffer of levels by their scores.
 
     Args:
-        scorer: which knows the task, and scores its levels.
-        rule: how levels are drawn, and which one makes room for another.
         new_levels: where levels come from that are not edited.
+        scorer: of levels.
+        rule: how levels are drawn, and which one makes room for another.
         capacity: levels N of the buffer.
         fill: share of the capacity that must have been scored before any is replayed.
-        replay_probability: q; of no use where ``synchronous``.
-        train_on_new: whether Solvers also train on new levels.
-        synchronous: whether each update has one new batch that is scored, and one that is replayed.
+        replay_probability: q; has no effect where ``synchronous``.
+        train_on_new: whether students also train on new levels.
+        synchronous: whether each proposal has one new batch that is scored, and one that is
+            replayed; None for yes, unless new levels are trained on.
         edits: of each child; 0 for no children.
+        edit: makes children; see :data:`Edit`.
         parents: of a batch of children: what was trained on (``batch``), or the four of it with the
             lowest difference of mean return and mean absolute advantage (``easy``).
         renew: whether all scores are renewed before each draw, instead of those of what was trained
@@ -68,26 +74,28 @@ class ReplayCurriculum(Curriculum):
     Raises:
         DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
             replayed.
-        TypeError: if there are to be edits and the task has none.
+        TypeError: if there are to be edits and nothing makes them.
         ValueError: if a number is out of range, or the numbers do not go together.
     """
 
     def __init__(
         self,
-        scorer: Scorer,
-        rule: ReplayRule,
         new_levels: Distribution,
+        scorer: Scorer,
+        rule: ReplayRule | None = None,
         *,
         capacity: int = 4000,
         fill: float = 0.5,
         replay_probability: float = 0.5,
         train_on_new: bool = False,
-        synchronous: bool = True,
+        synchronous: bool | None = None,
         edits: int = 0,
+        edit: Edit | None = None,
         parents: Literal["batch", "easy"] = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
     ) -> None:
+        synchronous = not train_on_new if synchronous is None else synchronous
         for name, value in (
             ("synchronous", synchronous), ("train_on_new", train_on_new), ("renew", renew)
         ):  # fmt: skip
@@ -98,47 +106,41 @@ class ReplayCurriculum(Curriculum):
                 "scored, beside every update"
             )
         one_of("parents", parents, ("batch", "easy"))
-        self.scorer, self.task = scorer, scorer.task
         self._capacity = whole("capacity", capacity, 1)
-        if whole("edits", edits, 0) and not isinstance(self.task, EditableTask):
+        if whole("edits", edits, 0) and edit is None:
             raise TypeError(
-                f"edits={edits}: {type(self.task).__name__} has no edit(levels, count, generators) "
-                "of its levels; set edits=0, as robust_plr does"
-            )
-        if parents == "easy" and self.task.batch_size % EASY:
-            raise ValueError(
-                f"parents=easy: {EASY} parents have as many children each, so the levels of an "
-                f"update must be a multiple of {EASY}; there are {self.task.batch_size}"
+                f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
+                "set edits=0"
             )
         if renew and co_learnability:
             raise ValueError(
                 f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
                 "before each draw, what is added to them is lost"
             )
-        if renew and scorer.from_episodes and capacity % self.task.batch_size:
-            raise ValueError(
-                f"capacity={capacity} must be a multiple of the {self.task.batch_size} levels of "
-                "an update, where all of them are played on"
-            )
-        self._rule, self._new_levels = rule, new_levels
+        self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
         self._warm = real("fill", fill, above=0) * capacity
         self._probability = part("replay_probability", replay_probability, above_zero=True)
         self._synchronous, self._train_on_new = synchronous, train_on_new
-        self._edits, self._parents, self._renew = edits, parents, renew
+        self._edits, self._edit, self._parents, self._renew = edits, edit, parents, renew
         self._co_learnability = real("co_learnability", co_learnability)
-        self._template = new_levels.sample(1, torch.Generator()).cpu()[0]
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget the last Solver's levels."""
+        self._template = new_levels.sample(1, torch.Generator())[0]
+        self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, 0, self._capacity)
-        self._last: TensorDict | None = None  # [K, P]: "level", "replayed", of which the "slot"
-        self._before: TensorDict | None = None  # [K, P]: "slot" and "key", the time before
-        self._scored = 0  # new levels of each Solver
-        self._told = {"updates": 0, "replayed": 0}
+        self._inbox = Inbox(self._template)
+        # Evidence [K, m] whose children, or exact scores, are due at the next proposal.
+        self._due: list[TensorDict] = []
+        self._last: TensorDict | None = None  # "level" [K, m] of the evidence before
+        self._before: TensorDict | None = None  # [K, m]: "slot" and "key", the time before
+        self._scored = 0  # new levels of each student
+        self._came_back = {"levels": 0, "replayed": 0}
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the scores of levels need that nobody trains on."""
+        return self.scorer.needs
 
     def check(self, copies: int) -> None:
-        """Refuse several Solvers, if each would decide by itself how much to play on new levels.
+        """Refuse several students, if each would decide by itself how many new levels to score.
 
         Raises:
             ValueError: if so.
@@ -149,51 +151,140 @@ class ReplayCurriculum(Curriculum):
                 "synchronous=true, or give one run for each"
             )
 
-    def propose(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Proposal:
-        """Levels [K, P], replayed or new.
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [K, n], replayed or new.
 
         Raises:
             ValueError: as :meth:`check`.
         """
-        copies, count = len(streams), self.task.batch_size
+        copies = len(streams)
         self.check(copies)
         if not len(self.buffer):
             self.buffer = empty_buffer(self._template, copies, self._capacity)
-        self._cost = [0, 0]
-        if self._last is not None:
-            self._finish(learner, streams)
-        replayed = self._explore(learner, streams)
+        self._take_in()
+        self._finish(student, streams)
+        replayed = self._explore(student, count, streams)
         slots = torch.zeros(copies, count, dtype=torch.int64)
         if bool(replayed.any()):
             if self._renew:
-                self._score_all(learner, streams)
+                self._score_all(student, streams)
             draws = [s.generator("slots") for s in streams]
             slots, drawn = draw_slots(self.buffer, count, self._rule, draws)
             self.buffer[replayed] = drawn[replayed]
         levels = levels_at(self.buffer["level"], slots)
         if not bool(replayed.all()):
-            levels[~replayed] = self._fresh(streams, "new")[~replayed]
-        self._last = TensorDict(
-            {"level": levels, "slot": slots, "replayed": replayed[:, None].expand(copies, count)},
-            (copies, count),
+            levels[~replayed] = self._fresh(count, streams, "new")[~replayed]
+        each = replayed.unsqueeze(-1)
+        known = {name: self.buffer[name].gather(1, slots) for name in (*SEEN, "key")}
+        return self._inbox.batch(
+            levels.to(self._device),
+            slot=slots,
+            replayed=each.expand(copies, count),
+            key=known["key"],
+            best=known["best"].where(each, -torch.inf),
+            solved=known["solved"] & each,
         )
-        self._told["updates"] += copies
-        self._told["replayed"] += int(replayed.sum())
-        return Proposal(levels.to(self.task.device), *self._cost)
 
-    def observe(self, learner: PPO, levels: Any, update: Update) -> None:
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Score what was trained on, where its own episodes do."""
-        last = self._last
-        assert last is not None  # propose comes before
+        self._inbox.check(batch, outcome)
+        notes = batch.notes
+        evidence = {"level": batch.levels.cpu(), **notes.select("slot", "replayed", "key")}
         if self.scorer.from_episodes:
-            best, solved = (self.buffer[name].gather(1, last["slot"]) for name in SEEN)
-            best = best.where(last["replayed"], -torch.inf)
-            solved &= last["replayed"]
-            self._take(last, self.scorer.of_rollouts(learner, [update.rollout], best, solved))
+            scored = self.scorer.of_outcome(student, outcome, notes["best"], notes["solved"])
+            evidence |= scored._asdict()
         if self._edits and self._parents == "easy":
-            last["easy"] = _easiness(self.scorer, learner, update)
+            evidence["easy"] = _easiness(student, outcome)
+        self._came_back["levels"] += notes.batch_size.numel()
+        self._came_back["replayed"] += int(notes["replayed"].sum())
+        self._inbox.put(batch, **evidence)
 
-    def _explore(self, learner: PPO, streams: Sequence[Streams]) -> Tensor:
+    def log(self) -> dict[str, Any]:
+        """How much was replayed, and what the buffers are like."""
+        self._take_in()
+        buffer, filled = self.buffer, self.buffer["filled"]
+        if not len(buffer) or not bool(filled.any()):
+            return {}
+        age = buffer["clock"] - buffer["touched"]
+        shares = replay_weights(buffer["score"], age, filled, self._rule)
+        count = filled.sum(-1)
+        told = {
+            "replayed": self._came_back["replayed"] / max(self._came_back["levels"], 1),
+            "filled": count.tolist(),
+            "effective_levels": (1 / shares.square().sum(-1)).tolist(),
+            "mean_score": (buffer["score"].where(filled, 0).sum(-1) / count).tolist(),
+            "mean_generation": (buffer["generation"].where(filled, 0).sum(-1) / count).tolist(),
+            "levels": self._shown(),
+        }
+        if self._last is not None:
+            keys = level_keys(self._last["level"])
+            told["distinct_levels"] = [len(own.unique()) for own in keys]
+        self._came_back = {"levels": 0, "replayed": 0}
+        return told
+
+    def state_dict(self) -> dict[str, Any]:
+        """The buffers, and what is known of the levels that were trained on."""
+        optional = {"last": self._last, "before": self._before}
+        return {
+            "buffer": packed(self.buffer),
+            **{name: None if td is None else packed(td) for name, td in optional.items()},
+            "due": [packed(evidence) for evidence in self._due],
+            "scored": self._scored,
+            "came_back": dict(self._came_back),
+            "inbox": self._inbox.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        self.buffer = unpacked(state["buffer"], self._template)
+        self._last, self._before = (
+            None if state[name] is None else unpacked(state[name], self._template)
+            for name in ("last", "before")
+        )
+        self._due = [unpacked(evidence, self._template) for evidence in state["due"]]
+        self._scored, self._came_back = state["scored"], dict(state["came_back"])
+        self._inbox.load_state_dict(state["inbox"])
+
+    def _take_in(self) -> None:
+        """Take in what episodes on levels have shown, and note what remains to be done."""
+        for evidence in self._inbox.take(whole=self._edits > 0 and self._parents == "easy"):
+            self._last = evidence.select("level", "place")
+            if self.scorer.from_episodes:
+                self._take(evidence, Scored(*(evidence[name] for name in Scored._fields)))
+            if self._edits or not self.scorer.from_episodes:
+                self._due.append(evidence)
+
+    def _finish(self, student: Student, streams: Sequence[Streams]) -> None:
+        """Do what is due for the levels that were trained on: exact scores, and children."""
+        due, self._due = self._due, []
+        for i, evidence in enumerate(due):
+            which = (i,) if i else ()
+            replayed = evidence["replayed"][:, 0]
+            # Where all scores are renewed, those of levels of the buffer need not be taken.
+            known = self._renew and bool(replayed.all())
+            if not self.scorer.from_episodes and not known:
+                scored = self._score(student, evidence["level"], streams, "trained", *which)
+                self._take(evidence, scored)
+            if self._edit is None or not self._edits or not bool(replayed.any()):
+                continue
+            count = evidence.shape[1]
+            some = torch.arange(count).expand(evidence.shape)
+            if self._parents == "easy":
+                easiest = evidence["easy"].topk(min(EASY, count), -1).indices
+                some = easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
+            slot = evidence["slot"].gather(1, some)
+            parents = levels_at(evidence["level"], some)
+            origin = {
+                "parent": level_keys(parents),
+                "generation": self.buffer["generation"].gather(1, slot) + 1,
+            }
+            children = self._edit(
+                parents, self._edits, [s.generator("edits", *which) for s in streams]
+            )
+            scored = self._score(student, children, streams, "children", *which)
+            self._add(children, scored, origin, replayed)
+
+    def _explore(self, student: Student, count: int, streams: Sequence[Streams]) -> Tensor:
         """Score new levels as long as it takes; whether the next batch is replayed, bool [K]."""
         batches = 0
         while True:
@@ -205,126 +296,83 @@ class ReplayCurriculum(Curriculum):
             replayed &= self._scored >= self._warm
             if bool((replayed & ~self.buffer["filled"].any(-1)).any()):
                 raise DivergedError(
-                    f"solver.ppo.horizon={learner.settings.horizon}: on none of {self._scored} new "
-                    "levels did an episode end within it, so that none has a score"
+                    f"on none of {self._scored} new levels did an episode end within a rollout, so "
+                    "that none has a score; longer rollouts (the horizon) may"
                 )
             if self._train_on_new or bool(replayed.all()):
                 return replayed
-            self._add(learner, self._fresh(streams, "explore", batches), streams, batches)
+            levels = self._fresh(count, streams, "explore", batches)
+            self._add(levels, self._score(student, levels, streams, batches))
             batches += 1
 
     def _add(
         self,
-        learner: PPO,
         levels: Levels,
-        streams: Sequence[Streams],
-        purpose: str | int,
-        parents: Mapping[str, Tensor] | None = None,
+        scored: Scored,
+        origin: Mapping[str, Tensor] | None = None,
         wanted: Tensor | None = None,
     ) -> None:
-        """Score levels [K, P] that nobody trains on, and keep the better ones."""
-        scored = self._score(learner, levels, streams, purpose)
-        new = {"level": levels, **scored._asdict(), **(parents or {})}
-        self.buffer = insert(self.buffer, TensorDict(new, scored.score.shape), self._rule, wanted)
-        self._scored += scored.score.shape[1]
+        """Keep the better ones of new levels [K, n]."""
+        new = TensorDict({"level": levels, **scored._asdict(), **(origin or {})}, levels.shape[:2])
+        self.buffer = insert(self.buffer, new, self._rule, wanted)
+        self._scored += new.shape[1]
 
     def _score(
-        self, learner: PPO, levels: Levels, streams: Sequence[Streams], purpose: str | int
+        self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
     ) -> Scored:
-        """Score levels [K, n] that nobody trains on, and note what it cost."""
-        scored, *cost = self.scorer(learner, levels.to(self.task.device), streams, purpose)
-        self._cost = [so_far + more for so_far, more in zip(self._cost, cost, strict=True)]
-        return scored
+        """Score levels [K, n] that nobody trains on."""
+        return self.scorer(student, levels.to(self._device), streams, *purpose)
 
-    def _score_all(self, learner: PPO, streams: Sequence[Streams]) -> None:
+    def _score_all(self, student: Student, streams: Sequence[Streams]) -> None:
         """Renew all scores."""
         filled, place = self.buffer["filled"], torch.arange(self._capacity)
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
-        scored = self._score(learner, levels_at(self.buffer["level"], slots), streams, "all")
+        scored = self._score(student, levels_at(self.buffer["level"], slots), streams, "all")
         self.buffer = rescore(self.buffer, slots, *scored)
 
-    def _finish(self, learner: PPO, streams: Sequence[Streams]) -> None:
-        """Do what is left to be done of the last update: exact scores, and children."""
-        last, self._last = self._last, None
-        assert last is not None
-        # Where all scores are renewed, those of levels of the buffer need not be taken.
-        known = self._renew and bool(last["replayed"].all())
-        if not self.scorer.from_episodes and not known:
-            self._take(last, self._score(learner, last["level"], streams, "trained"))
-        replayed = last["replayed"][:, 0]
-        if self._edits and bool(replayed.any()):
-            count = last.shape[1]
-            some = torch.arange(count).expand(last.shape)
-            if self._parents == "easy":
-                some = last["easy"].topk(EASY, -1).indices.repeat_interleave(count // EASY, -1)
-            slot = last["slot"].gather(1, some)
-            generators = [s.generator("edits") for s in streams]
-            parents, edit = levels_at(last["level"], some), self.task.edit  # type: ignore[attr-defined]
-            told = {
-                "parent": level_keys(parents),
-                "generation": self.buffer["generation"].gather(1, slot) + 1,
-            }
-            children = edit(parents, self._edits, generators)
-            self._add(learner, children, streams, "children", told, replayed)
-
-    def _take(self, last: TensorDictBase, scored: Scored) -> None:
+    def _take(self, evidence: TensorDictBase, scored: Scored) -> None:
         """Take the scores of levels that were trained on: new ones go into the buffer."""
-        replayed = last["replayed"][:, 0]
-        slots, old = last["slot"], self.buffer
+        replayed = evidence["replayed"][:, 0]
+        slots, old = evidence["slot"], self.buffer
         if bool(replayed.any()):
-            after = rescore(old, slots, *scored)
+            # Another level may have taken the place of one that was long on its way.
+            there = old["key"].gather(1, slots) == evidence["key"]
+            after = rescore(
+                old,
+                slots,
+                scored.score.where(there, -torch.inf),
+                scored.best.where(there, -torch.inf),
+                scored.solved & there,
+            )
             if self._co_learnability:
                 after = self._credit(old, after, slots, replayed)
             self.buffer = old.clone()
             self.buffer[replayed] = after[replayed]
         if not bool(replayed.all()):
-            new = TensorDict({"level": last["level"], **scored._asdict()}, slots.shape)
-            self.buffer = insert(self.buffer, new, self._rule, ~replayed)
-            self._scored += slots.shape[1]
+            self._add(evidence["level"], scored, wanted=~replayed)
 
     def _credit(
         self, old: TensorDictBase, after: TensorDict, slots: Tensor, replayed: Tensor
     ) -> TensorDict:
         """Credit the levels that were trained on before with how far the present scores fell."""
         fell = (old["score"] - after["score"]).gather(1, slots).mean(1, keepdim=True)
-        now = {"slot": slots, "key": after["key"].gather(1, slots)}
-        none = {"slot": torch.zeros_like(slots), "key": torch.full_like(slots, -1)}
-        before = TensorDict(none, slots.shape) if self._before is None else self._before
+        now = TensorDict({"slot": slots, "key": after["key"].gather(1, slots)}, slots.shape)
+        before = self._before
+        if before is None or before.shape != now.shape:
+            before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
         there = after["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
         credited = torch.zeros_like(after["filled"]).scatter(1, before["slot"], there)
         after["score"] = after["score"] + self._co_learnability * fell * credited
-        self._before = TensorDict(now, slots.shape).where(replayed.unsqueeze(-1), before)
+        self._before = now.where(replayed.unsqueeze(-1), before)
         return after
 
-    def _fresh(self, streams: Sequence[Streams], *purpose: str | int) -> Levels:
-        """New levels [K, P] on the CPU."""
-        return fresh_levels(self._new_levels, self.task.batch_size, streams, *purpose).cpu()
+    def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
+        """New levels [K, count] on the CPU."""
+        return fresh_levels(self._new_levels, count, streams, *purpose).cpu()
 
-    def improve(self, learner: PPO, updates: int, streams: Sequence[Streams]) -> Improvement:
-        """Tell of the last cycle: how much was replayed, and what the buffers are like."""
-        if not len(self.buffer) or not bool(self.buffer["filled"].any()):
-            return Improvement()
-        buffer, filled = self.buffer, self.buffer["filled"]
-        age = buffer["clock"] - buffer["touched"]
-        shares = replay_weights(buffer["score"], age, filled, self._rule)
-        count = filled.sum(-1)
-        metrics = {
-            "replayed": self._told["replayed"] / max(self._told["updates"], 1),
-            "filled": count.tolist(),
-            "effective_levels": (1 / shares.square().sum(-1)).tolist(),
-            "mean_score": (buffer["score"].where(filled, 0).sum(-1) / count).tolist(),
-            "mean_generation": (buffer["generation"].where(filled, 0).sum(-1) / count).tolist(),
-            "levels": self._pictures(),
-        }
-        if self._last is not None:
-            keys = level_keys(self._last["level"])
-            metrics["distinct_levels"] = [len(own.unique()) for own in keys]
-        self._told = {"updates": 0, "replayed": 0}
-        return Improvement(metrics)
-
-    def _pictures(self) -> dict[str, Any]:
-        """Levels of the first Solver's buffer, to be looked at."""
+    def _shown(self) -> dict[str, Levels]:
+        """Levels of the first student's buffer, to be looked at."""
         buffer = self.buffer[0][self.buffer["filled"][0]]
         shown = {
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
@@ -332,51 +380,21 @@ class ReplayCurriculum(Curriculum):
         }
         if self._edits:
             shown["the longest line of edits in the buffer"] = _lineage(buffer)
-        return {
-            caption: self.task.record(buffer["level"][which], None)
-            for caption, which in shown.items()
-        }
-
-    def state_dict(self) -> dict[str, Any]:
-        """The buffers, and what is known of the last update."""
-        state = {"buffer": self.buffer, "last": self._last, "before": self._before}
-        return {
-            **{
-                name: None if td is None else td.clone().to_dict(convert_tensors=False)
-                for name, td in state.items()
-            },
-            "scored": self._scored,
-            "told": dict(self._told),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        buffer, last, before = (
-            None if state[name] is None else self._restored(state[name])
-            for name in ("buffer", "last", "before")
-        )
-        assert buffer is not None
-        self.buffer, self._last, self._before = buffer, last, before
-        self._scored, self._told = state["scored"], dict(state["told"])
-
-    def _restored(self, entries: Mapping[str, Any]) -> TensorDict:
-        shape = entries["slot" if "slot" in entries else "filled"].shape
-        restored = TensorDict.from_dict(dict(entries), batch_size=shape)
-        if "level" in entries:
-            kind = type(self._template)
-            restored["level"] = kind.from_dict(entries["level"], batch_size=shape)
-        return restored.clone()
+        return {caption: buffer["level"][which] for caption, which in shown.items()}
 
 
-def _easiness(scorer: Scorer, learner: PPO, update: Update) -> Tensor:
-    """Mean absolute advantage minus mean return of levels [K, P]: what "easy" parents have most of.
+def _easiness(student: Student, outcome: TensorDictBase) -> Tensor:
+    """Mean absolute advantage minus mean return of levels [K, n]: what "easy" parents have most of.
 
     Of the published ones, those with the lowest return minus value loss (the authors' code, dcd).
     """
-    found = episodes(update.rollout)
-    loss = Scorer(scorer.task, "l1_value_loss", "episodes")
-    lost = loss.of_rollouts(learner, [update.rollout], *unseen(found.ended.shape)).score
-    return lost - (found.total / found.ended.clamp(1)).cpu()
+    if "rollout" not in outcome.keys():
+        raise ValueError("parents=easy: the outcome has no rollout")
+    rollout = outcome["rollout"]
+    ended = episodes(rollout)
+    loss = Scorer("l1_value_loss", "episodes")
+    lost = loss.of_rollouts(student, [rollout], *unseen(ended.ended.shape)).score
+    return lost - (ended.total / ended.ended.clamp(1)).cpu()
 
 
 def _lineage(buffer: TensorDictBase) -> Tensor:

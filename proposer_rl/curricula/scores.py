@@ -1,9 +1,9 @@
-"""How much there is to learn on a level, by what a Solver did there or by what it would do.
+"""How much there is to learn on a level, by what a student did there or by what it would do.
 
 A score from episodes reads a rollout [K, P, T], of which only episodes count that end in it: it is
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
-none ends (``gradient_norm``: over all steps). A score from evaluation asks the task instead, and
-needs no episode.
+none ends (``gradient_norm``: over all steps). A score from evaluation asks the student
+instead, and needs no episode.
 
 With A_t the generalised advantage, delta_t the error of one step, V the critic, p the probability
 of success, J the expected return, J* the largest that any policy reaches, and R the highest return
@@ -40,12 +40,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.checks import one_of, whole
-from proposer_rl.curricula.exact_scores import EXACT, exact_score
-from proposer_rl.curricula.stepwise import STEPWISE, advantages
-from proposer_rl.learning import PPO, succeeded
-from proposer_rl.meta.gradient_norms import squared_policy_gradients
+from proposer_rl.curricula.exact_scores import EXACT
+from proposer_rl.curricula.stepwise import STEPWISE
+from proposer_rl.curricula.student import Student
+from proposer_rl.learning import succeeded
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Task
+from proposer_rl.task import Levels
 
 Source = Literal["episodes", "exact"]
 
@@ -117,47 +117,75 @@ class Scorer:
     """One of the scores, from one of its sources.
 
     Args:
-        task: whose levels are scored.
         name: of the score; see the table above.
-        source: whether it is read off episodes or asked of the task.
+        source: whether it is read off episodes or asked of the student.
         rollouts: played on each level that is scored without training on it, from episodes;
             from evaluation, the episodes of which ``max_mc`` takes the expected highest return.
 
     Attributes:
         from_episodes: whether levels are scored by playing on them.
+        needs: what scoring levels asks of a student, that nobody trains on.
 
     Raises:
-        TypeError: if the task lacks what the score needs.
         ValueError: if there is no such score, or not from this source.
     """
 
-    def __init__(self, task: Task, name: str, source: Source, rollouts: int = 1) -> None:
-        self.task = task
+    def __init__(self, name: str, source: Source, rollouts: int = 1) -> None:
         self.rollouts = whole("rollouts", rollouts, 1)
         self.from_episodes = one_of("source", source, ("episodes", "exact")) == "episodes"
         self._name = name
-        there_are = {
+        available = {
             "episodes": [*STEPWISE, "learnability", "return_variance", "regret", "gradient_norm"],
-            "exact": list(EXACT),
-        }
-        if name not in there_are[source]:
-            raise ValueError(f"score={name!r}: from source={source} there are {there_are[source]}")
-        if not self.from_episodes:
-            self._exact = exact_score(task, name, self.rollouts)
-        elif name == "gradient_norm":
-            self._policy_gradients = squared_policy_gradients(task)
+            "exact": [*EXACT],
+        }[source]
+        if name not in available:
+            raise ValueError(f"score={name!r}: from source={source} there are {available}")
+        self.needs = EXACT[name].needs if source == "exact" else ("play",)
+        if self.from_episodes and name == "gradient_norm":
+            self.needs += ("policy_gradient_norms",)
 
-    def of_rollouts(
-        self, learner: PPO, rollouts: Sequence[TensorDictBase], best: Tensor, solved: Tensor
+    def of_outcome(
+        self, student: Student, outcome: TensorDictBase, best: Tensor, solved: Tensor
     ) -> Scored:
-        """Score levels [K, P] by rollouts on them, [K, P, T] each.
+        """Score levels [K, n] by what came of training on them.
 
         Args:
-            learner: whose critic and discount count.
-            rollouts: with values, as :meth:`PPO.collect` returns them.
-            best: the highest returns seen on these levels before, float [K, P]; minus infinity
+            student: whose critic and discount count.
+            outcome: with a rollout; without one, learnability and regret take what it says of
+                success and return.
+            best: see :meth:`of_rollouts`.
+            solved: the same.
+
+        Raises:
+            ValueError: if there is no rollout where the score needs one.
+        """
+        if "rollout" in outcome.keys():
+            return self.of_rollouts(student, [outcome["rollout"]], best, solved)
+        reached, success = outcome["return"].cpu().double(), outcome.get("success", None)
+        best = torch.maximum(best.double(), reached)
+        if success is not None:
+            success = success.cpu().double()
+            solved = solved | (success > 0)
+        if self._name == "regret":
+            score = best - reached
+        elif self._name == "learnability" and success is not None:
+            score = success * (1 - success)
+        else:
+            needed = "success" if self._name == "learnability" else "rollout"
+            raise ValueError(f"score={self._name}: the outcome has no {needed}")
+        return Scored(score, best.float(), solved)
+
+    def of_rollouts(
+        self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor, solved: Tensor
+    ) -> Scored:
+        """Score levels [K, n] by rollouts on them, [K, n, T] each.
+
+        Args:
+            student: whose critic and discount count.
+            rollouts: with values, as :meth:`Student.play` returns them.
+            best: the highest returns seen on these levels before, float [K, n]; minus infinity
                 where there was none.
-            solved: whether an episode was a success before, bool [K, P].
+            solved: whether an episode was a success before, bool [K, n].
         """
         found = [episodes(rollout) for rollout in rollouts]
         _, *numbers = zip(*found, strict=True)  # weights may be of several lengths
@@ -167,15 +195,12 @@ class Scorer:
         solved = solved.to(count.device) | (successes.sum(0) > 0)
         mean = total.sum(0) / some
         if self._name == "gradient_norm":
-            lengths = [
-                self._policy_gradients(learner, rollout, advantages(learner, rollout).float())
-                for rollout in rollouts
-            ]
+            lengths = [student.policy_gradient_norms(rollout) for rollout in rollouts]
             score = torch.stack(lengths).mean(0)
         elif self._name in STEPWISE:
             step_score = STEPWISE[self._name]
             each = [
-                (step_score(learner, rollout, best) * f.weight).sum(-1)
+                (step_score(student, rollout, best) * f.weight).sum(-1)
                 for rollout, f in zip(rollouts, found, strict=True)
             ]
             score = torch.stack(each).sum(0) / some
@@ -192,45 +217,29 @@ class Scorer:
         return Scored(score.cpu(), best.float().cpu(), solved.cpu())
 
     def __call__(
-        self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
-    ) -> tuple[Scored, int, int]:
-        """Score levels [K, n] that nobody trains on; from episodes n is a multiple of P.
+        self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
+    ) -> Scored:
+        """Score levels [K, n] that nobody trains on; the student counts what that costs.
 
         Args:
-            learner: the Solvers.
+            student: that would be trained.
             levels: of each.
-            streams: of the present update.
-            purpose: below which is drawn what actions, or a task's performance, draw at random.
-
-        Returns:
-            The scores, and the frames and evaluations that they cost each Solver.
+            streams: of the present proposal.
+            purpose: below which is drawn what actions draw at random.
         """
-        if self.from_episodes:
-            return *self._play(learner, levels, streams, *purpose), 0
-        scored = self._ask(learner, levels, streams, *purpose)
-        return scored, 0, levels.shape[1]
-
-    def _play(
-        self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
-    ) -> tuple[Scored, int]:
-        scored, frames = [], 0
-        for batch, some in enumerate(levels.split(self.task.batch_size, 1)):
-            played = []
-            for again in range(self.rollouts):
-                learner.env.set_levels(some)
-                draws = [s.generator("score", *purpose, batch, again) for s in streams]
-                played.append(learner.collect(draws))
-                frames += played[-1][0].numel()
-            scored.append(self.of_rollouts(learner, played, *unseen(some.batch_size)))
-        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True))), frames
-
-    @torch.no_grad()
-    def _ask(
-        self, learner: PPO, levels: Levels, streams: Sequence[Streams], *purpose: str | int
-    ) -> Scored:
-        found = []
-        for batch, some in enumerate(levels.split(AT_ONCE, 1)):
-            generator = streams[0].generator("score", *purpose, batch)
-            found.append(self._exact(learner, some, generator).double().cpu())
-        score = torch.cat(found, 1)
-        return Scored(score, *unseen(score.shape))
+        size = student.batch_size if self.from_episodes else AT_ONCE
+        scored = []
+        for batch, some in enumerate(levels.split(size or levels.shape[1], 1)):
+            if self.from_episodes:
+                played = [
+                    student.play(
+                        some, [s.generator("score", *purpose, batch, again) for s in streams]
+                    )
+                    for again in range(self.rollouts)
+                ]
+                scored.append(self.of_rollouts(student, played, *unseen(some.shape[:2])))
+            else:
+                with torch.no_grad():
+                    score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
+                scored.append(Scored(score, *unseen(score.shape)))
+        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))

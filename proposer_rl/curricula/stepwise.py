@@ -1,6 +1,6 @@
 """Scores of levels that are read off every single step of a rollout.
 
-With the critic V, discount gamma and trace decay lambda of the learner, and the error of one step
+With the critic V, discount gamma and trace decay lambda of the student, and the error of one step
 
     delta_t = r_t + gamma V(s_(t+1)) - V(s_t),    V = 0 where the episode terminated,
 
@@ -18,46 +18,31 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import PPO
-from proposer_rl.learning.advantages import gae
+from proposer_rl.curricula.student import VALUE, Student, advantages
 
 
-def advantages(learner: PPO, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
-    """A_t with the learner's numbers, not standardised: float64 [K, P, T].
-
-    Args:
-        learner: whose critic and discount count.
-        rollout: with values, [K, P, T].
-        lmbda: in place of the learner's lambda; 0 for delta_t.
-    """
-    settings = learner.settings
-    decay = settings.lmbda if lmbda is None else lmbda
-    estimate = gae(settings.gamma, decay, learner.agent.value_key)
-    return estimate(rollout.copy())["advantage"].squeeze(-1).double()
+def positive_value_loss(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """max(A_t, 0): where the student does better than its critic expects."""
+    return advantages(student, rollout).clamp_min(0)
 
 
-def positive_value_loss(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
-    """max(A_t, 0): where the Solver does better than it thought."""
-    return advantages(learner, rollout).clamp_min(0)
+def l1_value_loss(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """abs(A_t): where it does otherwise than its critic expects."""
+    return advantages(student, rollout).abs()
 
 
-def l1_value_loss(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
-    """abs(A_t): where it does otherwise than it thought."""
-    return advantages(learner, rollout).abs()
-
-
-def one_step_td_error(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+def one_step_td_error(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
     """abs(delta_t)."""
-    return advantages(learner, rollout, lmbda=0.0).abs()
+    return advantages(student, rollout, lmbda=0.0).abs()
 
 
-def max_mc(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
+def max_mc(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
     """R - V(s_t), with the highest return R [K, P] ever seen on the level."""
-    return best.unsqueeze(-1) - rollout[learner.agent.value_key].squeeze(-1).double()
+    return best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double()
 
 
-def mean_negative_advantage(learner: PPO, rollout: TensorDictBase, best: Tensor) -> Tensor:
-    """How far the Solver falls behind what it thought, whatever it gains before or afterwards.
+def mean_negative_advantage(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
+    """How far the student falls behind what its critic expects, whatever it gains otherwise.
 
     In the sum of lambda-weighted i-step errors that A_t is, each error is cut off at zero at every
     step that is added to it:
@@ -67,8 +52,8 @@ def mean_negative_advantage(learner: PPO, rollout: TensorDictBase, best: Tensor)
 
     where the last step of the episode has the weight lambda^i.
     """
-    gamma, lmbda = learner.settings.gamma, learner.settings.lmbda
-    delta = advantages(learner, rollout, lmbda=0.0)
+    gamma, lmbda = student.gamma, student.lmbda
+    delta = advantages(student, rollout, lmbda=0.0)
     goes_on = 1 - rollout["next", "done"].squeeze(-1).double()
     lost, behind, playing = torch.zeros_like(delta), torch.zeros_like(delta), torch.ones_like(delta)
     steps = delta.shape[-1]

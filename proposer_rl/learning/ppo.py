@@ -111,6 +111,16 @@ class PPO:
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
 
+    @property
+    def copies(self) -> int | None:
+        """The number K of copies; None without."""
+        return self.agent.copies
+
+    @property
+    def horizon(self) -> int:
+        """Steps T of a rollout."""
+        return self.settings.horizon
+
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
         rollout = self.collect(generators)

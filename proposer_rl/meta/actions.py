@@ -80,8 +80,8 @@ class ProblemChoices(Actions):
     def draw(
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """The action itself, as often as it goes into the batch: nothing is left to chance."""
-        return action.repeat(1, batch_size // action.shape[1])
+        """The action itself, as often as it takes for the batch: nothing is left to chance."""
+        return action.repeat(1, -(-batch_size // action.shape[1]))[:, :batch_size]
 
 
 class Mixture(Actions):

@@ -10,8 +10,9 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO, located
+from proposer_rl.learning import located
 from proposer_rl.meta.actions import Actions
+from proposer_rl.meta.learner import Learner
 from proposer_rl.meta.rewards import Reward, TrainingStep
 from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
@@ -25,7 +26,7 @@ class SolverTrainingEnv(EnvBase):
     that all start as the one given to :meth:`fork`. Nothing here knows what a level is.
 
     An action may be repeated for several updates, each on fresh levels. The episode then has fewer
-    steps, the Solvers are looked at only between them, and what an action led to is more easily
+    steps, the Solvers are evaluated only between them, and what an action led to is more easily
     told from chance.
 
     Observations: those of :meth:`~proposer_rl.meta.view.SolverView.observation`, and ``proposed``
@@ -33,7 +34,7 @@ class SolverTrainingEnv(EnvBase):
     ``actions`` defines them. Episodes end by ``terminated``.
 
     Args:
-        solvers: PPO of K Solvers, whose environment [K, P] has a method ``set_levels``.
+        solvers: K of them; see :class:`~proposer_rl.meta.learner.Learner`.
         view: what is seen of the Solvers, and the validation levels that the gain is measured on.
         actions: the levels that an action stands for.
         reward: what an update is worth; a step is worth the sum of its updates.
@@ -42,8 +43,7 @@ class SolverTrainingEnv(EnvBase):
         first_copy: number of the first of these Solvers, where others are trained elsewhere: a
             copy's random numbers belong to its number.
         on_update: called after every update with the number of those that the episode has had,
-            e.g. by a progress bar; what it raises ends the
-            episode.
+            e.g. by a progress bar; what it raises ends the episode.
 
     Attributes:
         last_training: levels [K, P] of the last update, and what came of it.
@@ -54,7 +54,7 @@ class SolverTrainingEnv(EnvBase):
 
     def __init__(
         self,
-        solvers: PPO,
+        solvers: Learner,
         *,
         view: SolverView,
         actions: Actions,
@@ -64,14 +64,14 @@ class SolverTrainingEnv(EnvBase):
         first_copy: int = 0,
         on_update: Callable[[int], None] | None = None,
     ) -> None:
-        if solvers.agent.copies is None:
+        if solvers.copies is None:
             raise ValueError("the Solvers must be a population: their agent has no copies")
         if min(meta_episode_length, action_repeat) < 1 or meta_episode_length % action_repeat:
             raise ValueError(
                 f"action_repeat={action_repeat} must divide "
                 f"meta_episode_length={meta_episode_length}"
             )
-        self._copies = range(first_copy, first_copy + solvers.agent.copies)
+        self._copies = range(first_copy, first_copy + solvers.copies)
         super().__init__(device=solvers.env.device, batch_size=[len(self._copies)])
         self.solvers = solvers
         self.view = view
@@ -91,7 +91,12 @@ class SolverTrainingEnv(EnvBase):
     @property
     def batch_of_levels(self) -> int:
         """Levels P of an update."""
-        return self.solvers.env.batch_size[1:].numel()
+        return int(self.solvers.env.batch_size[1:].numel())
+
+    @property
+    def frames_per_update(self) -> int:
+        """Environment steps of one Solver's update."""
+        return self.batch_of_levels * self.solvers.horizon
 
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
         """Start the next episodes from copies of one Solver, on new validation and probe levels.

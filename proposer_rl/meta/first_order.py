@@ -233,12 +233,17 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
         rollout: what they played, [K, P, T].
         advantage: of every step, float [K, P, T].
     """
+    return (advantage * log_probabilities(agent, rollout)).mean(-1)
+
+
+def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
+    """Log pi(a_t | s_t) of what K Solvers played, rollout [K, P, T]: float [K, P, T]."""
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
     with set_recurrent_mode(True):
         steps = agent.decode(rollout.select(*agent.step_keys), context)
     log_prob = agent.distribution(steps).log_prob(rollout[agent.action_key])
     # An action of several parts has one log-probability for each of them.
-    return (advantage * log_prob.reshape(*advantage.shape, -1).sum(-1)).mean(-1)
+    return log_prob.reshape(*rollout.batch_size, -1).sum(-1)
 
 
 def bin_scores(values: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from proposer_rl.cli.build import Made, parts
 from proposer_rl.cli.config import saved_config
+from proposer_rl.curricula import LearnedCurriculum, TaskStudent, outcome_of
 from proposer_rl.report.reading import UnreadableRun, find_runs
 from proposer_rl.report.studies import Group, Study, read_studies
 from proposer_rl.runs.signals import StopSignals
@@ -122,7 +123,8 @@ class Training:
     """A Solver on a curriculum, as in a run but for measurements and checkpoints."""
 
     def __init__(self, made: Made) -> None:
-        _, self.learner, self.curriculum = made
+        task, self.learner, self.curriculum = made
+        self.student = TaskStudent(task, self.learner)
         self.count = 0
 
     def cycle(self, length: int) -> None:
@@ -134,16 +136,20 @@ class Training:
     def improve(self) -> None:
         """What comes before a cycle; the Solver may have become a copy that made its updates."""
         streams = [Streams(0, "cycle", self.count)]
-        advance = self.curriculum.improve(self.learner, self.count, streams).advance
+        advance = None
+        if isinstance(self.curriculum, LearnedCurriculum):
+            advance = self.curriculum.improve(self.student, streams).advance
+        self.curriculum.log()
         self.count += 0 if advance is None else advance.updates
 
     def updates(self, count: int = STRETCH) -> None:
         """The next updates."""
         for _ in range(count):
             stream = Streams(0, "update", self.count)
-            levels = self.curriculum.propose(self.learner, self.count, [stream]).levels
-            self.learner.env.set_levels(levels)
+            size = self.learner.env.batch_size[1:].numel()
+            batch = self.curriculum.propose(self.student, size, [stream])
+            self.learner.env.set_levels(batch.levels)
             update = self.learner.update([stream.generator("actions")])
             self.learner.check()
-            self.curriculum.observe(self.learner, levels, update)
+            self.curriculum.observe(self.student, batch, outcome_of(update.rollout))
             self.count += 1

@@ -17,7 +17,7 @@ from proposer_rl.curricula import alp_gmm
 from proposer_rl.curricula.alp_gmm import MixtureCurriculum, absolute_progress, nearest
 from proposer_rl.curricula.mixtures import TaskMixture, draw, fit
 from proposer_rl.streams import Streams
-from tests.curricula.scripted import Scripted, played, step
+from tests.curricula.scripted import Scripted, reached, step
 
 TASKS = torch.tensor([[0.1], [0.2], [0.4], [0.6], [0.8], [0.9]])
 REWARDS = torch.tensor([0.2, 0.0, 0.5, 0.5, 0.1, 0.3])
@@ -118,13 +118,14 @@ def test_without_progress_all_gaussians_are_alike() -> None:
 
 
 def small(task: Scripted, **options: Any) -> MixtureCurriculum:
-    return MixtureCurriculum(task, **{"warmup": 64, "refit": 64, "components": 4, **options})
+    return MixtureCurriculum(task.space, **{"warmup": 64, "refit": 64, "components": 4, **options})
 
 
 def test_a_warm_up_is_even_and_its_draws_are_rounded() -> None:
     task = Scripted(torch.zeros(1, 5), batch_size=4000)
     curriculum = small(task, warmup=4000, refit=4000)
     bins = step(curriculum, task, 0)[0].bincount(minlength=5) / 4000
+    curriculum.log()
     # The bins are half a unit apart, so that half of an outermost one lies outside of the box.
     np.testing.assert_allclose(bins, [1 / 8, 1 / 4, 1 / 4, 1 / 4, 1 / 8], atol=0.03)
     history = curriculum.state_dict()["history"]
@@ -140,9 +141,9 @@ def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> 
     curriculum = small(task, source=source)
     shares = []
     for update in range(60):
-        task.agent.skills = torch.zeros(1, 8)
-        task.agent.skills[0, 5:] = 0.7
-        task.agent.skills[0, :2] = min(max(update - 9, 0) / 20, 1.0)
+        task.skills = torch.zeros(1, 8)
+        task.skills[0, 5:] = 0.7
+        task.skills[0, :2] = min(max(update - 9, 0) / 20, 1.0)
         shares.append(float((step(curriculum, task, update) <= 1).double().mean()))
     even = 1.5 / 7  # of the box
     assert np.mean(shares[:8]) == pytest.approx(even, abs=0.15)
@@ -155,6 +156,7 @@ def test_a_difference_between_bins_is_no_progress() -> None:
     curriculum = small(task)
     for update in range(3):
         step(curriculum, task, update)
+    curriculum.log()
     history = curriculum.state_dict()["history"]
     assert len(history["tasks"][0, :64].unique()) == 4  # all have been played
     assert history["progress"].abs().max() == 0
@@ -167,11 +169,12 @@ def test_a_return_changes_the_record_of_its_own_task_only() -> None:
         curriculum = small(task)
         for update in range(3):
             streams = [Streams(seed, update) for seed in (0, 1)]
-            levels = curriculum.propose(task, update, streams).levels
-            returns = task.agent.skills.gather(1, levels)
+            batch = curriculum.propose(task, 16, streams)
+            returns = task.skills.gather(1, batch.levels)
             if changed and update == 2:
                 returns[1, 3] += 5
-            curriculum.observe(task, levels, played(returns))
+            curriculum.observe(task, batch, reached(returns))
+        curriculum.log()  # what was observed is taken in
         histories.append(curriculum.state_dict()["history"])
     assert torch.equal(histories[0]["points"], histories[1]["points"])
     for name in ("returns", "progress"):
@@ -183,8 +186,9 @@ def test_progress_is_against_earlier_updates_alone() -> None:
     curriculum = small(task)
     returns = torch.rand(4, 1, 8, generator=torch.Generator().manual_seed(6)).double()
     for update in range(4):
-        levels = curriculum.propose(task, update, [Streams(0, update)]).levels
-        curriculum.observe(task, levels, played(returns[update]))
+        batch = curriculum.propose(task, 8, [Streams(0, update)])
+        curriculum.observe(task, batch, reached(returns[update]))
+    curriculum.log()
     history = curriculum.state_dict()["history"]
     # Seven steps between eight bins: a bin's number.
     bins = ((history["tasks"][0, :, 0] + 1) * 3.5).round()
@@ -234,7 +238,7 @@ def test_draws_beyond_the_box_are_clipped_and_told() -> None:
     ]
     curriculum.load_state_dict(state)
     step(curriculum, task, 0)
-    told = json.loads(json.dumps(curriculum.improve(task, 1, []).metrics))
+    told = json.loads(json.dumps(curriculum.log()))
     beyond = 0.5 * math.erfc(1 / math.sqrt(2))  # of a Gaussian, more than one deviation up
     assert told["clipped"] == pytest.approx(beyond, abs=0.02)
     points = curriculum.state_dict()["history"]["points"][0, :, 0]
@@ -242,21 +246,23 @@ def test_draws_beyond_the_box_are_clipped_and_told() -> None:
     assert told["components"] == [1] and told["means"] == [[[pytest.approx(0.9), 0.5]]]
     assert sum(told["histogram"]) == 5000
     step(curriculum, task, 1)
-    assert sum(curriculum.improve(task, 2, []).metrics["histogram"]) == 5000
+    assert sum(curriculum.log()["histogram"]) == 5000
 
 
 def test_performance_is_that_before_the_update_and_counted() -> None:
     task = Scripted(torch.rand(2, 8), batch_size=16)
     curriculum = small(task, source="exact")
     streams = [Streams(0), Streams(1)]
-    proposal = curriculum.propose(task, 0, streams)
-    assert proposal[1:] == (0, 16)
-    expected = task.agent.skills.gather(1, proposal.levels)
-    task.agent.skills = torch.rand(2, 8)
-    curriculum.observe(task, proposal.levels, played(torch.rand(2, 16)))
+    batch = curriculum.propose(task, 16, streams)
+    assert task.evaluations == 16
+    expected = task.skills.gather(1, batch.levels)
+    task.skills = torch.rand(2, 8)
+    curriculum.observe(task, batch, reached(torch.rand(2, 16)))
+    curriculum.log()
     history = curriculum.state_dict()["history"]
     torch.testing.assert_close(history["returns"], expected.double())
-    assert small(task).propose(task, 0, streams)[1:] == (0, 0)
+    small(task).propose(task, 16, streams)
+    assert task.evaluations == 16
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.transport import step_towards
+from proposer_rl.methods import Parts, currot
+from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
@@ -113,7 +115,9 @@ def test_it_is_solved_whatever_the_shares(part: int) -> None:
 
 
 def curriculum(task: Any, **options: Any) -> TransportCurriculum:
-    return TransportCurriculum(task, **{"every": 1, "probes": 2, **options})
+    return TransportCurriculum(
+        task.space, task.target_shares, **{"every": 1, "probes": 2, **options}
+    )
 
 
 def test_a_long_reach_and_nothing_to_master_give_the_target_at_once() -> None:
@@ -132,7 +136,7 @@ def test_a_master_is_led_to_the_target_step_by_step() -> None:
         step(found, task, update)
         now = found.shares()[0].numpy()
         assert squared(now, before, places) <= 0.3**2 + 1e-6
-        told = found.improve(task, update, [Streams(0)]).metrics
+        told = found.log()
         assert told["target_distance"] == [
             pytest.approx(squared(now, np.eye(5)[4], places) ** 0.5, abs=1e-6)
         ]
@@ -151,11 +155,11 @@ def test_only_bins_that_are_mastered_are_drawn_from_and_the_way_opens_with_them(
         assert (bins[0] <= 1).all()
         assert (bins[1] == 2).all()  # nothing is mastered: where it is best
     assert (bins[0] == 1).all()  # the nearest to the target
-    task.agent.skills[0, 2:4] = 0.7
+    task.skills[0, 2:4] = 0.7
     for update in range(8, 16):
         bins = step(found, task, update)
     assert (bins[0] == 3).all()
-    assert found.improve(task, 16, []).metrics["allowed_bins"] == [4, 1]
+    assert found.log()["allowed_bins"] == [4, 1]
 
 
 def test_where_all_fails_all_is_searched() -> None:
@@ -164,11 +168,15 @@ def test_where_all_fails_all_is_searched() -> None:
     assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [2] * 5
 
 
-def test_looks_are_counted() -> None:
+def test_scoring_passes_are_counted() -> None:
     task = Scripted(torch.ones(1, 5))
     found = curriculum(task, every=3, probes=4)
-    costs = [found.propose(task, u, [Streams(u)])[1:] for u in range(4)]
-    assert costs == [(0, 20), (0, 0), (0, 0), (0, 20)]
+    costs = []
+    for update in range(4):
+        task.evaluations = 0
+        found.propose(task, 8, [Streams(update)])
+        costs.append(task.evaluations)
+    assert costs == [20, 0, 0, 20]
 
 
 def test_the_mazes_target_is_rounded_to_bins() -> None:
@@ -190,8 +198,11 @@ def test_a_space_finds_its_own_bins() -> None:
 
 
 def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
+    parts = Parts(SimpleNamespace(), ProposerSettings(), [0])
     with pytest.raises(TypeError, match="SimpleNamespace must define target_shares"):
-        TransportCurriculum(SimpleNamespace())
+        currot(parts)
+    with pytest.raises(ValueError, match="target_shares must be one for each of 3 bins"):
+        TransportCurriculum(Scripted(torch.ones(1, 3)).space, torch.ones(4))
 
 
 @pytest.mark.parametrize(

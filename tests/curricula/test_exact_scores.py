@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.curricula.exact_scores import exact_score, expected_best, return_variance
+from proposer_rl.curricula import TaskStudent
+from proposer_rl.curricula.exact_scores import expected_best, return_variance
 from proposer_rl.curricula.scores import Scored, Scorer, unseen
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
@@ -70,12 +70,12 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
     draws = [Streams(0, number).generator() for number in range(EPISODES)]
     rollouts = [first_episodes(learner.collect([draw])) for draw in draws]
     for name in ("max_mc", "one_step_td_error", "return_variance"):
-        sampled: Scored = Scorer(task, name, "episodes").of_rollouts(
-            learner, rollouts, *unseen((1, 2 * COPIES))
+        sampled: Scored = Scorer(name, "episodes").of_rollouts(
+            TaskStudent(task, learner), rollouts, *unseen((1, 2 * COPIES))
         )
-        scorer = Scorer(task, name, "exact", EPISODES)
-        exact, _, cost = scorer(learner, two.unsqueeze(0), [Streams(0)])
-        assert cost == 2
+        taught = TaskStudent(task, learner)
+        exact = Scorer(name, "exact", EPISODES)(taught, two.unsqueeze(0), [Streams(0)])
+        assert taught.evaluations == 2
         shrunk = (EPISODES - 1) / EPISODES if name == "return_variance" else 1
         for each, expected in zip(sampled.score.view(2, -1), exact.score[0] * shrunk, strict=True):
             error = float(each.std()) / math.sqrt(COPIES)
@@ -83,9 +83,7 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
 
 
 def test_learnability_needs_a_task_that_tells_success() -> None:
-    task: Any = Scripted(torch.rand(1, 3), told="return")
-    task.exact_performance = True
-    ask = exact_score(task, "learnability", 1)
-    with pytest.raises(NoSuccessError, match="Scripted tells no success, only the return") as no:
-        ask(task, torch.tensor([[0, 1]]), torch.Generator())
+    blind = Scripted(torch.rand(1, 3), told="return")
+    with pytest.raises(NoSuccessError, match="this task tells no success, only the return") as no:
+        Scorer("learnability", "exact")(blind, torch.tensor([[0, 1]]), [Streams(0)])
     assert no.value.exit_code == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
-from proposer_rl.learning.ppo import PPO, Update
+from proposer_rl.curricula import (
+    FirstOrderCurriculum,
+    SampledFirstOrderCurriculum,
+    TaskStudent,
+    outcome_of,
+)
+from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, SpecificationSpace, shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution
@@ -29,7 +35,8 @@ class Skills:
         module = nn.Module()
         module.skills = nn.Parameter(torch.zeros(copies, len(wanted)))
         self.agent = module
-        self.settings = SimpleNamespace(learning_rate=0.01, adam_eps=0.0)
+        self.settings = SimpleNamespace(learning_rate=0.01, adam_eps=0.0, gamma=1.0, lmbda=1.0)
+        self.env = SimpleNamespace(batch_size=torch.Size([copies, P]))
         self.device, self.batch_size, self.distributions = torch.device("cpu"), P, {}
         self.target = SimpleNamespace(sample=lambda count, generator: torch.full((count,), -1))
         self.space = SimpleNamespace(
@@ -49,15 +56,16 @@ class Skills:
         target = (agent.skills @ self.wanted).unsqueeze(1)
         return TensorDict({"return": torch.where(levels < 0, target, of_bins)}, levels.shape)
 
-    performance = learner = measure = probe = probe_encoder = record = statistics = None
-    facts = None
+
+def taught(task: Any, learner: Any = None) -> TaskStudent:
+    return TaskStudent(task, learner or task)
 
 
 def test_shares_follow_the_known_alignments() -> None:
     wanted = [2.0, 1.0, 0.0, -1.0, 0.0, 0.5]
     task = Skills(3, wanted)
-    curriculum = FirstOrderCurriculum(task, measure="return", temperature=0.5)
-    levels = curriculum.propose(task, 0, [Streams(seed) for seed in range(3)]).levels
+    curriculum = FirstOrderCurriculum(task.space, task.target, measure="return", temperature=0.5)
+    levels = curriculum.propose(taught(task), P, [Streams(seed) for seed in range(3)]).levels
     # The direction is that of the wanted skills, and the alignment of bin n its n-th number.
     expected = (torch.tensor(wanted) / (0.5 * 2.0)).softmax(-1)
     torch.testing.assert_close(curriculum.shares(), expected.expand(3, -1), rtol=1e-4, atol=1e-6)
@@ -66,29 +74,23 @@ def test_shares_follow_the_known_alignments() -> None:
     assert not torch.equal(levels[0], levels[1])  # each has its own random order
 
 
-def test_scores_are_averaged_over_time_and_forgotten_by_a_fresh_solver() -> None:
+def test_scores_are_averaged_over_time() -> None:
     task = Skills(1, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum = FirstOrderCurriculum(task, measure="return", every=1, smoothing=0.75)
-    curriculum.propose(task, 0, [Streams(0)])
+    curriculum = FirstOrderCurriculum(
+        task.space, task.target, measure="return", every=1, smoothing=0.75
+    )
+    curriculum.propose(taught(task), P, [Streams(0)])
     first = curriculum.state_dict()["scores"]["score"]
     task.wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum.propose(task, 1, [Streams(0)])
+    curriculum.propose(taught(task), P, [Streams(0)])
     second = curriculum.state_dict()["scores"]["score"]
     torch.testing.assert_close(second[0, :2] / first[0, 0], torch.tensor([0.75, 0.25]))
-    curriculum.begin()
-    curriculum.propose(task, 0, [Streams(0)])
-    torch.testing.assert_close(curriculum.state_dict()["scores"]["score"], first.roll(1, -1))
 
 
-def test_bins_that_are_all_worth_nothing_are_drawn_evenly() -> None:
+def test_bins_without_any_score_are_drawn_uniformly() -> None:
     task = Skills(1, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum = FirstOrderCurriculum(task, measure="return")
-    curriculum.load_state_dict(
-        {
-            "scores": {"score": torch.zeros(1, BINS), "variance": torch.zeros(1, BINS)},
-            "proposed": torch.zeros(BINS, dtype=torch.int64),
-        }
-    )
+    curriculum = FirstOrderCurriculum(task.space, task.target, measure="return")
+    curriculum.scores = {"score": torch.zeros(1, BINS), "variance": torch.zeros(1, BINS)}
     torch.testing.assert_close(curriculum.shares(), torch.full((1, BINS), 1 / BINS))
 
 
@@ -109,7 +111,10 @@ class Mazes(Skills):
 
 
 def mazes(**options: Any) -> FirstOrderCurriculum:
-    return FirstOrderCurriculum(Mazes(), **{"target_levels": 8, "candidates": 3, **options})
+    task = Mazes()
+    return FirstOrderCurriculum(
+        task.space, task.target, **{"target_levels": 8, "candidates": 3, **options}
+    )
 
 
 def learner(copies: int = 2) -> PPO:
@@ -122,7 +127,7 @@ def streams(update: int, *seeds: int) -> list[Streams]:
 
 def test_scores_are_mean_inner_products_with_the_target_direction() -> None:
     task, solvers, curriculum = Mazes(), learner(), mazes()
-    curriculum.propose(solvers, 0, streams(0, 0, 1))
+    curriculum.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))
     found = curriculum.state_dict()["scores"]
     own = streams(0, 0, 1)
     target = torch.stack([task.target.sample(8, s.generator("target")) for s in own])
@@ -141,61 +146,32 @@ def test_scores_are_mean_inner_products_with_the_target_direction() -> None:
     torch.testing.assert_close(found["score"], each.mean(-1), rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(found["variance"], each.var(-1) / 3, rtol=1e-3, atol=1e-10)
     far = mazes(step=1000.0)  # differences, and no derivatives any more
-    far.propose(solvers, 0, streams(0, 0, 1))
+    far.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))
     assert not torch.allclose(far.state_dict()["scores"]["score"], each.mean(-1), rtol=0.05)
 
 
 def test_a_solvers_batch_depends_on_its_own_stream_alone() -> None:
     both, alone = learner(2), learner(1)
     alone.restore(both.snapshot()[1:])
-    together = mazes().propose(both, 0, streams(0, 5, 6)).levels
-    by_itself = mazes().propose(alone, 0, streams(0, 6)).levels
+    together = mazes().propose(taught(Mazes(), both), P, streams(0, 5, 6)).levels
+    by_itself = mazes().propose(taught(Mazes(), alone), P, streams(0, 6)).levels
     assert (together[1] == by_itself[0]).all()
     assert not (together[0] == together[1]).all()
 
 
-def test_choosing_leaves_the_solvers_as_they_are() -> None:
-    solvers = learner()
-    before = solvers.snapshot()
-    mazes().propose(solvers, 0, streams(0, 0, 1))
-    assert (solvers.snapshot() == before).all()
-
-
-def test_a_resumed_curriculum_goes_on_bit_by_bit() -> None:
-    def train(curriculum: FirstOrderCurriculum, solvers: PPO, updates: range) -> list[Any]:
-        done = []
-        for update in updates:
-            proposal = curriculum.propose(solvers, update, streams(update, 0, 1))
-            solvers.env.set_levels(proposal.levels)
-            solvers.update([s.generator("actions") for s in streams(update, 0, 1)])
-            done.append(proposal)
-        return done
-
-    straight, solvers = mazes(every=2), learner()
-    expected = train(straight, solvers, range(5))
-    interrupted, others = mazes(every=2), learner()
-    train(interrupted, others, range(3))
-    resumed, again = mazes(every=2), learner()
-    resumed.load_state_dict(interrupted.state_dict())
-    again.restore(others.snapshot())
-    found = train(resumed, again, range(3, 5))
-    for one, other in zip(found, expected[3:], strict=True):
-        assert (one.levels == other.levels).all()
-        assert one[1:] == other[1:]
-    assert [proposal.evaluations for proposal in expected] == [8 + 2 * 3 * BINS, 0] * 2 + [44]
-    assert all(proposal.frames == 0 for proposal in expected)
-    metrics = [c.improve(solvers, 5, streams(5, 0, 1)).metrics for c in (straight, resumed)]
-    assert metrics[0] == metrics[1]
-
-
-def test_a_cycle_is_told_in_json() -> None:
-    curriculum, solvers = mazes(), learner()
-    assert curriculum.improve(solvers, 0, streams(0, 0, 1)).metrics == {}
+def test_scoring_passes_are_counted() -> None:
+    curriculum, solvers, costs = mazes(every=2), learner(), []
     for update in range(3):
-        curriculum.propose(solvers, update, streams(update, 0, 1))
-    told = json.loads(json.dumps(curriculum.improve(solvers, 3, streams(3, 0, 1)).metrics))
-    histogram = torch.tensor(told["histogram"])
-    assert (histogram.shape, int(histogram.sum())) == ((3, 2), 3 * 2 * P)
+        student = taught(Mazes(), solvers)
+        curriculum.propose(student, P, streams(update, 0, 1))
+        costs.append((student.frames, student.evaluations))
+    assert costs == [(0, 8 + 2 * 3 * BINS), (0, 0), (0, 8 + 2 * 3 * BINS)]
+
+
+def test_the_log_has_standard_errors_and_how_even_the_shares_are() -> None:
+    curriculum, solvers = mazes(), learner()
+    curriculum.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))
+    told = json.loads(json.dumps(curriculum.log()))
     assert torch.tensor(told["score"]).shape == torch.tensor(told["score_error"]).shape == (2, 3, 2)
     shares = curriculum.shares()
     torch.testing.assert_close(
@@ -203,14 +179,6 @@ def test_a_cycle_is_told_in_json() -> None:
         torch.distributions.Categorical(shares).entropy(),
     )
     assert all(1 <= bins <= BINS for bins in told["effective_bins"])
-    curriculum.propose(solvers, 3, streams(3, 0, 1))
-    again = curriculum.improve(solvers, 4, streams(4, 0, 1)).metrics["histogram"]
-    assert int(torch.tensor(again).sum()) == 2 * P  # counted from the last time on
-
-
-def test_a_task_without_gradients_is_refused() -> None:
-    with pytest.raises(TypeError, match="SimpleNamespace must define differentiable_performance"):
-        FirstOrderCurriculum(SimpleNamespace())
 
 
 @pytest.mark.parametrize(
@@ -229,26 +197,23 @@ def test_numbers_out_of_range_are_refused(options: dict[str, float], message: st
 
 
 def sampled(**options: Any) -> SampledFirstOrderCurriculum:
-    return SampledFirstOrderCurriculum(Mazes(), **options)
+    task = Mazes()
+    return SampledFirstOrderCurriculum(task.space, task.target, **options)
 
 
-def train_on(curriculum: Any, solvers: PPO, update: int, *seeds: int) -> Any:
-    own = streams(update, *seeds)
-    proposal = curriculum.propose(solvers, update, own)
-    solvers.env.set_levels(proposal.levels)
-    trained = solvers.update([s.generator("actions") for s in own])
-    curriculum.observe(solvers, proposal.levels, trained)
-    return proposal
-
-
-def test_sampled_scores_are_inner_products_with_the_sampled_direction() -> None:
+@pytest.mark.parametrize("standardised", [False, True])
+def test_sampled_scores_are_inner_products_with_the_sampled_direction(standardised: bool) -> None:
     solvers, curriculum = learner(), sampled(smoothing=0.0)
+    solvers.settings = replace(solvers.settings, normalize_advantage=standardised)
     own = streams(0, 0, 1)
-    levels = curriculum.propose(solvers, 0, own).levels
+    student = taught(Mazes(), solvers)
+    batch = curriculum.propose(student, P, own)
+    levels = batch.levels
     direction = curriculum.state_dict()["direction"]
     solvers.env.set_levels(levels)
     rollout = solvers.collect([s.generator("actions") for s in own])
-    curriculum.observe(solvers, levels, Update(rollout, TensorDict()))
+    curriculum.observe(student, batch, outcome_of(rollout))
+    curriculum.log()
     found = curriculum.state_dict()["scores"]["score"]
     advantage = exact.ppo_advantages(solvers, rollout)
     fraction = levels.walls.double().mean((-2, -1))
@@ -270,7 +235,8 @@ def test_sampled_scores_are_inner_products_with_the_sampled_direction() -> None:
 def test_the_sampled_direction_is_the_policy_gradient_of_the_targets_episodes() -> None:
     solvers, curriculum = learner(), sampled()
     own = streams(0, 0, 1)
-    proposal = curriculum.propose(solvers, 0, own)
+    student = taught(Mazes(), solvers)
+    curriculum.propose(student, P, own)
     target = torch.stack([Mazes().target.sample(P, s.generator("target")) for s in own])
     solvers.env.set_levels(target)
     rollout = solvers.collect([s.generator("target_actions") for s in own])
@@ -279,28 +245,12 @@ def test_the_sampled_direction_is_the_policy_gradient_of_the_targets_episodes() 
     found = curriculum.state_dict()["direction"]
     for name, entry in expected.items():
         torch.testing.assert_close(found[name], entry)
-    assert (proposal.frames, proposal.evaluations) == (P * solvers.settings.horizon, 0)
-
-
-def test_a_resumed_sampled_curriculum_goes_on_bit_by_bit() -> None:
-    straight, solvers = sampled(every=2), learner()
-    interrupted, others = sampled(every=2), learner()
-    resumed, again = sampled(every=2), learner()
-    expected = [train_on(straight, solvers, update, 0, 1) for update in range(5)]
-    for update in range(3):
-        train_on(interrupted, others, update, 0, 1)
-    resumed.load_state_dict(interrupted.state_dict())
-    again.restore(others.snapshot())
-    for update in range(3, 5):
-        assert (train_on(resumed, again, update, 0, 1).levels == expected[update].levels).all()
-    told = [c.improve(solvers, 5, streams(5, 0, 1)).metrics for c in (straight, resumed)]
-    assert told[0] == told[1]
-    assert "score_error" not in told[0]
+    assert (student.frames, student.evaluations) == (P * solvers.settings.horizon, 0)
 
 
 def test_exploration_is_spread_over_all_bins() -> None:
     solvers, curriculum = learner(), sampled(exploration=0.3, temperature=1e-3)
-    curriculum.propose(solvers, 0, streams(0, 0, 1))
+    curriculum.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))
     state = curriculum.state_dict()
     state["scores"]["score"] = torch.eye(BINS)[:2]
     curriculum.load_state_dict(state)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ from tensordict import TensorDict
 
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import ConfigError
-from proposer_rl.curricula import ReplayCurriculum, Scorer
+from proposer_rl.curricula import ReplayCurriculum, Scorer, TaskStudent, outcome_of
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (
     ReplayRule,
@@ -21,41 +20,17 @@ from proposer_rl.curricula.buffer import (
     level_keys,
     score_weights,
 )
-from proposer_rl.curricula.replay import _lineage
+from proposer_rl.curricula.replay import _easiness, _lineage
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import planes
-from tests.curricula.living import (
-    check_a_new_life_begins,
-    check_each_lives_alone,
-    check_it_resumes,
-    live,
-    solvers,
-)
-from tests.tiny import TASK, composed, evaluate, mountain_cars
+from tests.curricula.living import live, solvers, student
+from tests.curricula.made import MADE, ncc, replay
+from tests.tiny import TASK, composed, evaluate
 
 P, T = 4, 8
-SMALL = {"capacity": 16, "fill": 0.5, "replay_probability": 0.6}
-
-
-def replay(
-    score: str = "positive_value_loss",
-    source: Any = "episodes",
-    *,
-    rule: ReplayRule | None = None,
-    rollouts: int = 1,
-    **options: Any,
-) -> ReplayCurriculum:
-    scorer = Scorer(TASK, score, source, rollouts)
-    return ReplayCurriculum(
-        scorer, rule or ReplayRule(temperature=1.0), TASK.space, **{**SMALL, **options}
-    )
-
-
-def plr() -> ReplayCurriculum:
-    return replay(train_on_new=True, synchronous=False)
 
 
 def robust(**options: Any) -> ReplayCurriculum:
@@ -66,55 +41,8 @@ def accel(**options: Any) -> ReplayCurriculum:
     return replay(edits=3, **options)
 
 
-def ncc() -> ReplayCurriculum:
-    rule = ReplayRule(prioritization="softmax", temperature=0.05, staleness=0.0)
-    return replay("learnability", "exact", rule=rule, renew=True)
-
-
-def traced() -> ReplayCurriculum:
-    return replay("regret", "exact", co_learnability=0.5, edits=2)
-
-
-MADE = {
-    "plr": plr,
-    "robust": robust,
-    "synchronous": replay,
-    "accel": accel,
-    "easy": lambda: accel(parents="easy"),
-    "regret": lambda: replay("regret", "exact"),
-    "plr of regret": lambda: replay("regret", "exact", train_on_new=True, synchronous=False),
-    "plr of regret, renewed": lambda: replay(
-        "regret", "exact", train_on_new=True, synchronous=False, renew=True
-    ),
-    "plr of regret, credited": lambda: replay(
-        "regret", "exact", train_on_new=True, synchronous=False, co_learnability=0.5
-    ),
-    "ncc": ncc,
-    "traced": traced,
-    "gradients": lambda: replay("gradient_norm", "exact"),
-    "policy gradients": lambda: replay("gradient_norm"),
-    "negative advantages": lambda: replay("mean_negative_advantage"),
-    "law": lambda: replay("max_mc", "exact"),
-}
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_it_resumes(name: str) -> None:
-    check_it_resumes(MADE[name])
-
-
-@pytest.mark.parametrize("name", [name for name in MADE if name != "robust"])
-def test_each_solver_lives_as_if_alone(name: str) -> None:
-    check_each_lives_alone(MADE[name])
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_a_new_life_begins(name: str) -> None:
-    check_a_new_life_begins(MADE[name])
-
-
 def test_every_step_of_training_is_on_the_proposed_level() -> None:
-    lived = live(plr(), solvers([0]), [0], range(6))
+    lived = live(MADE["plr"](), solvers([0]), [0], range(6))
     for levels, update in zip(lived.levels, lived.updates, strict=True):
         seen = update.rollout["planes"]
         assert (seen == planes(levels).unsqueeze(2)).all() and seen.shape[2] == T
@@ -146,21 +74,18 @@ def streams_of(number: int) -> Streams:
 
 def test_robust_plr_trains_on_replayed_levels_alone() -> None:
     curriculum, learner = robust(), solvers([0])
-    known: list[set[int]] = []
-    before = learner.snapshot()
     frames = []
     for number in range(8):
-        proposal = curriculum.propose(learner, number, [streams_of(number)])
-        assert (learner.snapshot() == before).all()  # whatever was played on
-        known.append(set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist()))
-        assert set(level_keys(proposal.levels)[0].tolist()) <= known[-1]
-        frames.append(proposal.frames)
-        learner.env.set_levels(proposal.levels)
+        taught = TaskStudent(TASK, learner)
+        batch = curriculum.propose(taught, P, [streams_of(number)])
+        known = set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist())
+        assert set(level_keys(batch.levels)[0].tolist()) <= known
+        frames.append(taught.frames)
+        learner.env.set_levels(batch.levels)
         update = learner.update([streams_of(number).generator("actions")])
-        curriculum.observe(learner, proposal.levels, update)
-        before = learner.snapshot()
+        curriculum.observe(taught, batch, outcome_of(update.rollout))
     assert frames[0] >= 2 * P * T and all(cost % (P * T) == 0 for cost in frames)
-    assert sum(frames) == P * T * curriculum._scored / P  # every new batch is one rollout
+    assert sum(frames) == T * curriculum.state_dict()["scored"]  # each new level is played once
     assert 0 in frames[1:] and max(frames[1:]) > 0  # q = 0.6
 
 
@@ -178,25 +103,39 @@ def test_what_is_exact_costs_evaluations_and_no_frames() -> None:
 
 
 def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
-    curriculum, learner = replay("regret", "exact"), solvers([0])
-    for number in range(6):
-        curriculum.improve(learner, number, [])
-        proposal = curriculum.propose(learner, number, [streams_of(number)])
-        assert curriculum._last is not None
-        fresh = ~torch.isin(torch.arange(16), curriculum._last["slot"][0])
-        learner.env.set_levels(proposal.levels)
-        update = learner.update([streams_of(number).generator("actions")])
-        curriculum.observe(learner, proposal.levels, update)
-        trained = curriculum._last["slot"][0]
-        curriculum._cost = [0, 0]
-        after = curriculum.buffer.clone()
-        curriculum._finish(learner, [streams_of(number)])
+    """Of levels that were trained on, at the next proposal; the others keep theirs."""
+    curriculum, learner = replay("regret", "exact", capacity=8), solvers([0])
+    for number in range(4):
+        live(curriculum, learner, [0], range(number, number + 1))
+        (evidence,) = (curriculum.log(), curriculum.state_dict()["due"])[1]
+        slots, keys = evidence["slot"][0], evidence["key"][0]
+        curriculum.propose(TaskStudent(TASK, learner), P, [streams_of(99)])
+        there = curriculum.buffer["key"][0, slots] == keys  # unless a new one took its place
         levels = curriculum.buffer["level"][0]
         regret = TASK.optimal_return(levels) - evaluate(learner.agent, levels)["return"][0]
+        assert bool(there.any())
         torch.testing.assert_close(
-            curriculum.buffer["score"][0, trained].float(), regret[trained], atol=1e-5, rtol=0
+            curriculum.buffer["score"][0, slots[there]].float(),
+            regret[slots[there]],
+            atol=1e-5,
+            rtol=0,
         )
-        assert curriculum.buffer["score"][0, fresh].equal(after["score"][0, fresh])
+
+
+def test_a_level_that_has_left_the_buffer_meanwhile_scores_no_other() -> None:
+    curriculum, taught = replay("regret", train_on_new=True, replay_probability=1.0), student(0)
+    for number in range(4):
+        batch = curriculum.propose(taught, P, [streams_of(number)])
+        outcome = TensorDict({"return": torch.rand(1, P)}, [1, P])
+        curriculum.observe(taught, batch, outcome)
+    batch = curriculum.propose(taught, P, [streams_of(4)])
+    assert bool(batch.notes["replayed"].all())
+    gone = batch.notes["slot"][0, 0]
+    curriculum.buffer["key"][0, gone] += 1
+    before = curriculum.buffer["score"][0, gone].clone()
+    curriculum.observe(taught, batch, TensorDict({"return": torch.full((1, P), -9.0)}, [1, P]))
+    curriculum.log()
+    assert curriculum.buffer["score"][0, gone] == before
 
 
 def test_children_differ_from_their_parents_by_their_edits() -> None:
@@ -227,12 +166,12 @@ def test_the_lineage_is_the_longest_line_of_edits() -> None:
 
 
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
-    curriculum, learner = accel(parents="easy"), solvers([0])
-    lived = live(curriculum, learner, [0], range(4))
-    rollout, last = lived.updates[-1].rollout, curriculum._last
-    assert last is not None
-    loss = Scorer(TASK, "l1_value_loss", "episodes")
-    lost = loss.of_rollouts(learner, [rollout], *unseen((1, P))).score[0]
+    learner = solvers([0])
+    lived = live(replay(), learner, [0], range(1))
+    rollout, taught = lived.updates[-1].rollout, TaskStudent(TASK, learner)
+    loss = Scorer("l1_value_loss", "episodes")
+    lost = loss.of_rollouts(taught, [rollout], *unseen((1, P))).score[0]
+    easy = _easiness(taught, outcome_of(rollout))
     after = rollout["next"][0]
     for p in range(P):
         total, count, reached = 0.0, 0, 0.0
@@ -240,7 +179,7 @@ def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
             total += float(step["reward"])
             if bool(step["done"]):
                 reached, count, total = reached + total, count + 1, 0.0
-        assert float(last["easy"][0, p]) == pytest.approx(float(lost[p]) - reached / count)
+        assert float(easy[0, p]) == pytest.approx(float(lost[p]) - reached / count)
 
 
 def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
@@ -251,7 +190,7 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
     curriculum, learner = ncc(), solvers([0])
     lived = live(curriculum, learner, [0], range(3))
     assert lived.evaluations == [2 * P + 16, P + 16, P + 16]
-    curriculum.propose(learner, 3, [streams_of(3)])
+    curriculum.propose(TaskStudent(TASK, learner), P, [streams_of(3)])
     filled = curriculum.buffer["filled"][0]
     chance = evaluate(learner.agent, curriculum.buffer["level"][0])["success"][0]
     expected = (chance * (1 - chance))[filled].double()
@@ -260,7 +199,7 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
 
 
 def test_credit_goes_to_the_levels_trained_on_before() -> None:
-    curriculum = traced()
+    curriculum = MADE["traced"]()
     live(curriculum, solvers([0]), [0], range(4))
     old = curriculum.buffer.clone()
     slots, before = torch.tensor([[0, 1, 2, 2]]), torch.tensor([[4, 5, 6, 7]])
@@ -278,11 +217,10 @@ def test_credit_goes_to_the_levels_trained_on_before() -> None:
     torch.testing.assert_close(credited["score"][0], expected)
 
 
-def test_what_is_told_is_json_and_shows_levels() -> None:
-    lived = live(accel(), solvers([0, 1]), [0, 1], range(7))
-    told = json.loads(json.dumps(lived.told))
+def test_what_is_logged_shows_levels() -> None:
+    told = live(accel(), solvers([0, 1]), [0, 1], range(7)).told
     assert told[0] == {} and set(told[-1]["levels"]) > {"highest scores", "most replayed"}
-    assert all("picture" in r for records in told[-1]["levels"].values() for r in records)
+    assert all(TASK.record(some, None) for some in told[-1]["levels"].values())
     assert told[-1]["replayed"] == 1 and len(told[-1]["effective_levels"]) == 2
     assert all(1 <= n <= 16 for n in told[-1]["effective_levels"])
 
@@ -321,10 +259,9 @@ def test_some_bins_are_those_of_the_values() -> None:
         ({"fill": 0.0}, "fill must be a finite number above 0, got 0.0"),
         ({"replay_probability": 1.5}, "replay_probability must be above 0 to 1, got 1.5"),
         ({"edits": -1}, "edits must be a whole number from 0"),
-        ({"train_on_new": True}, "train_on_new=true, synchronous=true"),
+        ({"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true"),
         ({"renew": "no"}, "renew must be true or false, got 'no'"),
         ({"parents": "hard"}, "parents must be batch or easy, got 'hard'"),
-        ({"renew": True, "capacity": 15}, "capacity=15 must be a multiple of the 4 levels"),
     ],
 )
 def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
@@ -348,7 +285,7 @@ def test_levels_with_nested_entries_are_restored() -> None:
             return TensorDict({"wall": {"height": numbers}, "goal": numbers[:, 0]}, [count])
 
     def made() -> ReplayCurriculum:
-        return ReplayCurriculum(Scorer(TASK, "regret", "exact"), ReplayRule(), Nested(), capacity=4)
+        return ReplayCurriculum(Nested(), Scorer("regret", "exact"), capacity=4)
 
     curriculum, again = made(), made()
     curriculum.buffer = empty_buffer(Nested().sample(1, torch.Generator())[0], 2, 4)
@@ -361,17 +298,17 @@ def test_levels_with_nested_entries_are_restored() -> None:
 def test_where_no_episode_ends_nothing_can_be_replayed() -> None:
     whole = solvers([0])
     learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
-    with pytest.raises(DivergedError, match=r"solver\.ppo\.horizon=1: on none of 8 new levels"):
+    with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
         live(robust(), learner, [0], range(1))
 
 
 def test_new_levels_are_trained_on_whether_they_have_scores_or_not() -> None:
     whole = solvers([0])
     learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
-    curriculum = replay(train_on_new=True, synchronous=False, replay_probability=1e-6)
+    curriculum = replay(train_on_new=True, replay_probability=1e-6)
     assert len(live(curriculum, learner, [0], range(4)).levels) == 4
-    curriculum = replay(train_on_new=True, synchronous=False, replay_probability=1.0)
-    with pytest.raises(DivergedError, match=r"solver\.ppo\.horizon=1: on none of 8 new levels"):
+    curriculum = replay(train_on_new=True, replay_probability=1.0)
+    with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
         live(curriculum, learner, [0], range(4))
 
 
@@ -389,8 +326,6 @@ def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:
 
 
 def test_a_task_without_edits_is_told_so() -> None:
-    cars = mountain_cars()
-    scorer = Scorer(cars, "positive_value_loss", "episodes")
-    with pytest.raises(TypeError, match="MountainCarTask has no edit"):
-        ReplayCurriculum(scorer, ReplayRule(), cars.space, edits=1)
-    ReplayCurriculum(scorer, ReplayRule(), cars.space, capacity=8)
+    scorer = Scorer("positive_value_loss", "episodes")
+    with pytest.raises(TypeError, match="edits=1: the task has no edit"):
+        ReplayCurriculum(TASK.space, scorer, edits=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,14 +11,13 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
+from proposer_rl.curricula import Student, TaskStudent
 from proposer_rl.curricula.scores import Scorer, episodes, unseen
 from proposer_rl.curricula.stepwise import STEPWISE
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
-LEARNER: Any = SimpleNamespace(
-    settings=SimpleNamespace(gamma=0.9, lmbda=0.5), agent=SimpleNamespace(value_key="state_value")
-)
+LEARNER = Student(gamma=0.9, lmbda=0.5)
 FIRST = ([-0.01, -0.01, 0.99], [0.7, 0.4, 0.9])
 SECOND = ([-0.01, -0.01, 0.99], [0.8, 0.9, 0.6])
 SHORT = ([0.99], [0.5])
@@ -59,7 +57,7 @@ def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int =
 def score(
     name: str, *rollouts: TensorDict, best: Tensor = NONE, solved: Tensor = UNSOLVED
 ) -> float:
-    scorer = Scorer(TASK, name, "episodes")
+    scorer = Scorer(name, "episodes")
     return float(scorer.of_rollouts(LEARNER, rollouts, best, solved).score)
 
 
@@ -91,7 +89,7 @@ def test_the_best_return_of_a_level_is_remembered() -> None:
     best = torch.tensor([[0.98]])
     assert score("max_mc", played(FIRST), best=best) == pytest.approx(0.313333, abs=1e-6)
     assert score("regret", played(FIRST), best=best) == pytest.approx(0.01, abs=1e-6)
-    scorer = Scorer(TASK, "max_mc", "episodes")
+    scorer = Scorer("max_mc", "episodes")
     failed = played(FAILED, success=False)
     found = scorer.of_rollouts(LEARNER, [failed], best, UNSOLVED)
     assert float(found.best) == pytest.approx(0.98) and not bool(found.solved)
@@ -99,7 +97,7 @@ def test_the_best_return_of_a_level_is_remembered() -> None:
 
 def test_a_level_once_solved_is_worth_failing_on() -> None:
     failed, name = played(FAILED, success=False), "mean_negative_advantage"
-    scorer = Scorer(TASK, name, "episodes")
+    scorer = Scorer(name, "episodes")
     solved = scorer.of_rollouts(LEARNER, [played(SHORT)], NONE, UNSOLVED).solved
     assert bool(solved) and score(name, failed) == 0 < score(name, failed, solved=solved)
     assert bool(scorer.of_rollouts(LEARNER, [failed], NONE, solved).solved)
@@ -147,11 +145,9 @@ def test_negative_advantages_are_those_of_the_definition(
         for i, error in enumerate(ahead):
             behind = min(behind + gamma**i * error, 0)
             lost -= (1 if i == len(ahead) - 1 else 1 - lmbda) * lmbda**i * behind
-    learner: Any = SimpleNamespace(
-        settings=SimpleNamespace(gamma=gamma, lmbda=lmbda), agent=LEARNER.agent
-    )
+    learner = Student(gamma=gamma, lmbda=lmbda)
     rollout = played((rewards, values), success=False, after=after)
-    scorer = Scorer(TASK, "mean_negative_advantage", "episodes")
+    scorer = Scorer("mean_negative_advantage", "episodes")
     found = scorer.of_rollouts(learner, [rollout], NONE, ~UNSOLVED).score
     assert float(found) == pytest.approx(lost / len(delta), abs=1e-5)
 
@@ -207,17 +203,19 @@ def test_exact_scores_are_those_of_the_definitions() -> None:
             ("learnability", chance * (1 - chance)),
             ("regret", best - known["return"][copy].double()),
         ):
-            found, _, cost = Scorer(TASK, name, "exact")(learner, levels, streams(2))
-            assert cost == 5
+            taught = TaskStudent(TASK, learner)
+            found = Scorer(name, "exact")(taught, levels, streams(2))
+            assert taught.evaluations == 5
             torch.testing.assert_close(found.score[copy], expected, atol=1e-6, rtol=0)
 
 
 def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
     learner = learners(2)
     levels = torch.stack([TASK.space.sample(8, torch.Generator().manual_seed(k)) for k in (0, 1)])
-    scorer = Scorer(TASK, "learnability", "episodes", rollouts=3)
-    found, frames, _ = scorer(learner, levels, streams(2), "why")
-    assert frames == 3 * 8 * 8
+    scorer = Scorer("learnability", "episodes", rollouts=3)
+    taught = TaskStudent(TASK, learner)
+    found = scorer(taught, levels, streams(2), "why")
+    assert taught.frames == 3 * 8 * 8
     for batch in range(2):
         some = levels[:, 4 * batch : 4 * batch + 4]
         won, ended = torch.zeros(2, 2, 4)
@@ -234,11 +232,19 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
 
 def test_what_cannot_be_scored_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match=r"score='luck': from source=exact there are \['learn"):
-        Scorer(TASK, "luck", "exact")
+        Scorer("luck", "exact")
     with pytest.raises(ValueError, match="source must be episodes or exact, got 'oracle'"):
-        Scorer(TASK, "regret", "oracle")  # type: ignore[arg-type]
-    blind: Any = SimpleNamespace()
-    with pytest.raises(TypeError, match="SimpleNamespace does not know the largest return"):
-        Scorer(blind, "regret", "exact")
-    with pytest.raises(TypeError, match=r"score=max_mc .* SimpleNamespace must define episode_law"):
-        Scorer(blind, "max_mc", "exact")
+        Scorer("regret", "oracle")  # type: ignore[arg-type]
+
+
+def test_without_a_rollout_success_and_return_are_what_a_level_is_scored_by() -> None:
+    outcome = TensorDict(
+        {"return": torch.tensor([[0.2]]), "success": torch.tensor([[0.25]])}, [1, 1]
+    )
+    best = torch.tensor([[0.5]])
+    for name, expected in (("learnability", 0.1875), ("regret", 0.3)):
+        found = Scorer(name, "episodes").of_outcome(LEARNER, outcome, best, UNSOLVED)
+        assert float(found.score) == pytest.approx(expected)
+        assert float(found.best) == 0.5 and bool(found.solved)
+    with pytest.raises(ValueError, match="score=max_mc: the outcome has no rollout"):
+        Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, best, UNSOLVED)

@@ -7,48 +7,32 @@ from typing import Any
 import pytest
 import torch
 
-from proposer_rl.curricula import Scorer, SelectionCurriculum
+from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.buffer import level_keys
 from proposer_rl.learning import DivergedError
 from proposer_rl.streams import Streams
-from tests.curricula.living import (
-    check_a_new_life_begins,
-    check_each_lives_alone,
-    check_it_resumes,
-    live,
-    solvers,
-)
+from tests.curricula.living import live, solvers, student
+from tests.curricula.made import selection
 from tests.curricula.scripted import GivenScores
 from tests.tiny import TASK, evaluate
 
 P, T = 4, 8
 
 
-def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> SelectionCurriculum:
-    numbers = {"candidates": 16, "keep": 6, "every": 3, "new": 0.5, **options}
-    return SelectionCurriculum(Scorer(TASK, "learnability", source, rollouts), **numbers)
-
-
-@pytest.mark.parametrize("source", ["exact", "episodes"])
-def test_it_lives_as_a_curriculum_should(source: str) -> None:
-    check_it_resumes(lambda: selection(source))
-    check_each_lives_alone(lambda: selection(source))
-    check_a_new_life_begins(lambda: selection(source))
-
-
 def test_the_best_are_kept_and_half_of_a_batch_is_drawn_from_them() -> None:
     curriculum, learner, stream = selection(), solvers([0]), Streams(0, "update", 0)
-    proposal = curriculum.propose(learner, 0, [stream])
+    taught = TaskStudent(TASK, learner)
+    batch = curriculum.propose(taught, P, [stream])
     candidates = fresh_levels(TASK.space, 16, [stream], "candidates")[0]
     chance = evaluate(learner.agent, candidates)["success"][0]
     worth = [float(p * (1 - p)) for p in chance]
     best = sorted(range(16), key=lambda i: -worth[i])[:6]
     keys = level_keys(candidates)
     assert level_keys(curriculum.kept)[0].tolist() == keys[best].tolist()
-    drawn = level_keys(proposal.levels)[0].tolist()
+    drawn = level_keys(batch.levels)[0].tolist()
     assert all(key in keys[best].tolist() for key in drawn[:2])
-    assert proposal[1:] == (0, 16)
+    assert (taught.frames, taught.evaluations) == (0, 16)
 
 
 def test_it_selects_every_few_updates_and_says_what_that_costs() -> None:
@@ -65,7 +49,7 @@ def test_what_is_mastered_or_hopeless_is_not_kept_while_there_is_else() -> None:
     curriculum = selection(keep=3)
     found = torch.tensor([[0.0, 0.25, 0.0, 0.2, 0.0, -torch.inf, 0.1] + [0.0] * 9])
     curriculum.scorer = GivenScores(found)
-    curriculum.propose(solvers([0]), 0, [Streams(0)])
+    curriculum.propose(student(0), P, [Streams(0)])
     assert curriculum.scores[0].tolist() == pytest.approx([0.25, 0.2, 0.1])
 
 
@@ -75,17 +59,17 @@ def test_fewer_scores_than_are_kept_are_told() -> None:
     found = torch.full((1, 16), -torch.inf)
     found[0, :2] = 0.1
     curriculum.scorer = GivenScores(found)
-    with pytest.raises(DivergedError, match=r"horizon=8: on 2 of 16 .* fewer than 3 have"):
-        curriculum.propose(solvers([0]), 0, [Streams(0)])
+    with pytest.raises(DivergedError, match=r"on 2 of 16 .* fewer than 3 have"):
+        curriculum.propose(student(0), P, [Streams(0)])
 
 
 @pytest.mark.parametrize(("new", "fresh"), [(0.0, 0), (1.0, 4), (0.25, 1)])
 def test_the_mixture_is_exact(new: float, fresh: int) -> None:
     curriculum = selection(new=new)
-    proposal = curriculum.propose(solvers([0]), 0, [Streams(0)])
-    keys = level_keys(proposal.levels)
+    batch = curriculum.propose(student(0), P, [Streams(0)])
+    keys = level_keys(batch.levels)
     kept = torch.isin(keys, level_keys(curriculum.kept))
-    assert bool(kept[0, : P - fresh].all()) and proposal.levels.batch_size == (1, P)
+    assert bool(kept[0, : P - fresh].all()) and batch.levels.batch_size == (1, P)
     if fresh:
         drawn = level_keys(fresh_levels(TASK.space, fresh, [Streams(0)], "levels"))
         assert torch.equal(keys[:, P - fresh :], drawn)
@@ -94,7 +78,6 @@ def test_the_mixture_is_exact(new: float, fresh: int) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"candidates": 10}, "candidates=10 must be a multiple of the 4 levels"),
         ({"every": 0}, "every must be a whole number from 1"),
         ({"keep": 17}, "keep=17 must be at most candidates=16"),
         ({"new": -0.1}, "new must be from 0 to 1, got -0.1"),

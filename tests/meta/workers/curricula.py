@@ -9,7 +9,7 @@ import torch
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, task_maker
-from proposer_rl.curricula import ProposerCurriculum
+from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Parts, Workers, proposer
@@ -61,10 +61,11 @@ def cycles(
     chosen: list[Any] = []
     numbers: list[float] = []
     for cycle in range(count):
-        outcome = curriculum.improve(solver, 3 * cycle, [Streams(0, "cycle", cycle)])
+        student = TaskStudent(task, solver)
+        outcome = curriculum.improve(student, [Streams(0, "cycle", cycle)])
         assert outcome.advance is not None
         metrics, levels, update = outcome.metrics, outcome.advance.levels, outcome.advance.update
-        chosen += [metrics.pop("histogram"), outcome.frames, outcome.evaluations, metrics.keys()]
+        chosen += [metrics.pop("histogram"), student.frames, student.evaluations, metrics.keys()]
         chosen += [levels.to_text(), update.rollout["action"].tolist()]
         for value in metrics.values():
             numbers += value if isinstance(value, list) else [] if value is None else [value]

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 
+from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.rewards import Reward, TrainingStep, performance_gain
 from proposer_rl.meta.workers import WorkersError, shares
@@ -94,7 +95,7 @@ def diverges(task: Any, curriculum: Any) -> None:
     next(iter(broken.values()))["value"].fill_(torch.nan)
     solver.restore(broken)
     with pytest.raises(DivergedError, match="update 0 of the episode of the So"):
-        curriculum.improve(solver, 0, [Streams(0, "cycle", 0)])
+        curriculum.improve(TaskStudent(task, solver), [Streams(0, "cycle", 0)])
 
 
 def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None:
@@ -113,7 +114,7 @@ def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None
         pytest.warns(RuntimeWarning, match="lost .it fell off.; it is replaced"),
         pytest.raises(WorkersError, match="lost 3 times in one cycle, last: it fell off; the same"),
     ):
-        curriculum.improve(solver, 0, [Streams(0, "cycle", 0)])
+        curriculum.improve(TaskStudent(task, solver), [Streams(0, "cycle", 0)])
     # Between two attempts a signal that has come with the loss is acted on.
     assert (len(started), checked) == (3, [0, 0])
 

@@ -287,11 +287,11 @@ def test_curricula_run_from_the_command_line(method: str, train: Any) -> None:
 @pytest.mark.parametrize(
     ("method", "message"),
     [
-        ("regret", "does not know the largest return"),
-        ("pace", "gradient_norm needs gradients"),
-        ("first_order_gain", "gradients"),
-        ("first_order_proposer", "gradients"),
-        ("accel", "GymnasiumTask has no edit("),
+        ("regret", "GymnasiumTask must define optimal_return"),
+        ("pace", "GymnasiumTask must define differentiable_performance"),
+        ("first_order_gain", "must define differentiable_performance"),
+        ("first_order_proposer", "must define differentiable_performance"),
+        ("accel", "the task has no edit("),
     ],
 )
 def test_what_the_task_cannot_tell_is_refused(

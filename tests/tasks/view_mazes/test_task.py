@@ -111,9 +111,9 @@ def test_a_run_is_trained_resumed_and_evaluated(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["+method=first_order_gain"], "needs gradients"),
-        (["+method=regret"], "source=exact: ViewMazeTask tells performance by playing"),
-        (["+method=sfl"], "+score=sampled"),
+        (["+method=first_order_gain"], "must define differentiable_performance"),
+        (["+method=regret"], "ViewMazeTask tells performance by playing, which is not exact"),
+        (["+method=sfl"], "ViewMazeTask tells performance by playing"),
         (["+method=target", "task.maze.height=4"], "distributions.ood: perfect mazes have odd"),
         (["+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23 walls"),
         (

@@ -1,0 +1,268 @@
+"""Curricula that are made of other curricula: filtered ones, one after another, several at once."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.checks import real, whole
+from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, LearnedCurriculum
+from proposer_rl.curricula.scores import Scorer
+from proposer_rl.curricula.student import Student
+from proposer_rl.streams import Streams
+
+
+class _Combinator(LearnedCurriculum):
+    """What all of them do alike: everything is passed on to the parts.
+
+    Args:
+        parts: the curricula.
+    """
+
+    def __init__(self, parts: Sequence[Curriculum]) -> None:
+        self.parts = list(parts)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What any of the parts needs."""
+        return tuple(dict.fromkeys(need for part in self.parts for need in part.needs))
+
+    @property
+    def trains_replicas(self) -> bool:
+        """Whether any of the parts does."""
+        return any(part.trains_replicas for part in self._learned())
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Improve the parts that train something; at most one of them may advance the student."""
+        improvements = [part.improve(student, streams) for part in self._learned()]
+        metrics = {k: value for each in improvements for k, value in each.metrics.items()}
+        advances = [each.advance for each in improvements if each.advance is not None]
+        return Improvement(metrics, advances[-1] if advances else None)
+
+    def log(self) -> dict[str, Any]:
+        """What the parts have to tell; of what several tell, the last one's word."""
+        return {key: value for part in self.parts for key, value in part.log().items()}
+
+    def learnt(self) -> dict[str, Any]:
+        """What the last part that has learnt something has learnt."""
+        return next(filter(None, (part.learnt() for part in reversed(self.parts))), {})
+
+    def state_dict(self) -> dict[str, Any]:
+        """Those of the parts."""
+        return {"parts": [part.state_dict() for part in self.parts]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put every part back."""
+        for part, own in zip(self.parts, state["parts"], strict=True):
+            part.load_state_dict(own)
+
+    def close(self) -> None:
+        """Close every part."""
+        for part in self.parts:
+            part.close()
+
+    def _learned(self) -> Iterator[LearnedCurriculum]:
+        return (part for part in self.parts if isinstance(part, LearnedCurriculum))
+
+
+class Filtered(_Combinator):
+    """Draws several times as many levels from a curriculum, and keeps some by their scores.
+
+    The n levels that are kept are drawn one after another, none of them twice, each in proportion
+    to
+
+        exp( score / temperature )
+
+    of those that are left. With learnability p (1 - p) as the score, what is mastered and what is
+    out of reach gets the smallest shares, wherever the levels come from: the idea of SFL
+    (arXiv 2408.15099) and NCC (arXiv 2505.20659), which keep their candidates in a buffer. The
+    curriculum observes the levels that are kept as if it had proposed these alone.
+
+    Args:
+        curriculum: that draws.
+        scorer: of its levels.
+        times: levels that are drawn for each that is kept.
+        temperature: of the draws among them, in units of the score.
+
+    Raises:
+        ValueError: if a number is out of range, or the curriculum is :class:`Mixed`.
+    """
+
+    def __init__(
+        self, curriculum: Curriculum, scorer: Scorer, *, times: int = 4, temperature: float = 0.05
+    ) -> None:
+        super().__init__([curriculum])
+        if _mixes(curriculum):
+            raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
+        self._scorer = scorer
+        self._times = whole("times", times, 2)
+        self._temperature = real("temperature", temperature, above=0)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the curriculum and the scores need."""
+        return tuple(dict.fromkeys((*super().needs, *self._scorer.needs)))
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """The levels that are kept, of a batch of the curriculum's."""
+        candidates = self.parts[0].propose(student, self._times * count, streams)
+        scored = self._scorer(student, candidates.levels, streams, "choice")
+        draws = [s.generator("choice") for s in streams]
+        return candidates.keep(
+            draw_without_replacement(scored.score / self._temperature, count, draws)
+        )
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Pass it on."""
+        self.parts[0].observe(student, batch, outcome)
+
+
+class Schedule(_Combinator):
+    """One curriculum after another, such as a hand-designed one.
+
+    Its clock are its own batches, so that it needs no count of the student's updates.
+
+    Args:
+        stages: curricula, in order.
+        until: number of batches after which each but the last ends, ascending.
+
+    Raises:
+        ValueError: if ``until`` is not ascending or does not fit the stages.
+    """
+
+    def __init__(self, stages: Sequence[Curriculum], until: Sequence[int]) -> None:
+        super().__init__(stages)
+        if len(until) != len(stages) - 1 or sorted({0, *until}) != [0, *until]:
+            raise ValueError(
+                f"{len(stages)} stages need {len(stages) - 1} ascending positive numbers of "
+                f"updates, got {list(until)}"
+            )
+        self._until = list(until)
+        self._proposed = 0
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """What the present stage proposes."""
+        stage = self._stage
+        batch = self.parts[stage].propose(student, count, streams)
+        self._proposed += 1
+        which = torch.full(batch.notes.batch_size, stage)
+        notes = {"stage": which, "notes": batch.notes}
+        return Batch(batch.levels, TensorDict(notes, batch.notes.batch_size))
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Pass it on to the stage that has proposed the levels."""
+        if batch.count:
+            stage = int(batch.notes["stage"][0, 0])
+            self.parts[stage].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Improve the stage that the cycle begins with."""
+        part = self.parts[self._stage]
+        if isinstance(part, LearnedCurriculum):
+            return part.improve(student, streams)
+        return Improvement()
+
+    def state_dict(self) -> dict[str, Any]:
+        """How many batches there were, too."""
+        return {**super().state_dict(), "proposed": self._proposed}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        super().load_state_dict(state)
+        self._proposed = int(state["proposed"])
+
+    @property
+    def _stage(self) -> int:
+        return bisect_right(self._until, self._proposed)
+
+
+class Mixed(_Combinator):
+    """Batches of which every curriculum has its share.
+
+    Args:
+        curricula: of one kind of levels.
+        shares: of the levels of a batch, not negative; rounded to whole levels so that they add up.
+
+    Raises:
+        ValueError: if a share is no such number, or there is not one for each curriculum.
+    """
+
+    def __init__(self, curricula: Sequence[Curriculum], shares: Sequence[float]) -> None:
+        super().__init__(curricula)
+        if len(shares) != len(curricula) or not curricula:
+            raise ValueError(f"{len(curricula)} curricula need as many shares, got {list(shares)}")
+        given = [real("shares", share, least=0) for share in shares]
+        total = real("sum of shares", sum(given), above=0)
+        self._ends = [sum(given[: i + 1]) / total for i in range(len(given))]
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [K, n], those of the first curriculum first."""
+        ends = [round(end * count) for end in self._ends]
+        counts = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+        proposed = {
+            i: self.parts[i].propose(student, some, [s.within("part", i) for s in streams])
+            for i, some in enumerate(counts)
+            if some
+        }
+        shape = (len(streams), count)
+        whose = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+        # Every level has an entry for each curriculum; of another one than its own, any.
+        place = torch.cat([torch.arange(some) for some in counts])
+        notes = {
+            str(i): batch.notes[:, place.clamp(max=batch.count - 1)]
+            for i, batch in proposed.items()
+        }
+        levels = torch.cat([batch.levels for batch in proposed.values()], 1)
+        return Batch(levels, TensorDict({"part": whose.expand(shape).clone(), **notes}, shape))
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Give every curriculum what it has proposed."""
+        whose = batch.notes["part"][0] if batch.count else torch.zeros(0)
+        for i in whose.unique().tolist():
+            own = (whose == i).nonzero().flatten()
+            part = Batch(batch.levels[:, own], batch.notes[str(i)][:, own])
+            self.parts[i].observe(student, part, outcome[:, own])
+
+    def log(self) -> dict[str, Any]:
+        """What each has to tell, by its number."""
+        told: dict[str, Any] = {}
+        levels: dict[str, Any] = {}
+        for i, part in enumerate(self.parts):
+            log = part.log()
+            levels |= {f"{i}: {caption}": some for caption, some in log.pop("levels", {}).items()}
+            told |= {f"{i}_{key}": value for key, value in log.items()}
+        return {**told, "levels": levels} if levels else told
+
+
+def _mixes(curriculum: Curriculum) -> bool:
+    parts = curriculum.parts if isinstance(curriculum, _Combinator) else []
+    return isinstance(curriculum, Mixed) or any(map(_mixes, parts))
+
+
+def draw_without_replacement(
+    logits: Tensor, count: int, generators: Sequence[torch.Generator]
+) -> Tensor:
+    """Draw places one after another, in proportion to exp(logit) of those that are left.
+
+    The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
+
+    Args:
+        logits: float [K, M]; minus infinity for places that are only drawn where no
+            other is left.
+        count: number n of draws.
+        generators: one for each row.
+
+    Returns:
+        int64 [K, n], no place twice.
+    """
+    uniform = torch.stack(
+        [torch.rand(logits.shape[1], generator=g, dtype=torch.float64) for g in generators]
+    )
+    gumbel = -(-uniform.log()).log()
+    # Lower than any score, but finite: noise decides among levels without one.
+    return (logits.double().nan_to_num(neginf=-1e9) + gumbel).topk(count).indices

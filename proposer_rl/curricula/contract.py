@@ -1,0 +1,311 @@
+"""The contract of a curriculum: all that its author reads.
+
+A curriculum proposes levels to a student and observes how the student fared on them:
+
+    batch = curriculum.propose(student, count, streams)
+    outcome = ...                                        # the student trains on batch.levels
+    curriculum.observe(student, batch, outcome)
+
+Nothing hides between the two calls. What a curriculum will need to recognise a level travels in
+``batch.notes``, so that any number of batches may be outstanding and may come back in any order, in
+parts (``batch[:, some]``), or not at all. Where the order could matter, an :class:`Inbox` puts what
+was observed aside and hands it out in the order of the proposals. Then two outstanding batches, the
+second of which comes back first, teach exactly what one after the other would.
+
+K are students that train side by side, each from random streams of its own, n levels of a batch,
+T steps, N bins. A loop that trains one student has K = 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.batches import levels_at, packed, unpacked
+from proposer_rl.curricula.student import Student
+from proposer_rl.learning import Update, first_episode_return, first_episode_success
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Levels that a curriculum has proposed, or a part of them, ``batch[:, some]``.
+
+    Attributes:
+        levels: [K, n], on the device of the task.
+        notes: a tensordict [K, n] on the CPU, by which the curriculum recognises the levels again.
+
+    Raises:
+        ValueError: if there is not one note for each level.
+    """
+
+    levels: Levels
+    notes: TensorDictBase
+
+    def __post_init__(self) -> None:
+        if self.levels.shape[:2] != self.notes.batch_size:
+            raise ValueError(
+                f"levels {list(self.levels.shape[:2])} and notes {list(self.notes.batch_size)} of "
+                "a batch must have one shape [K, n]"
+            )
+
+    @property
+    def count(self) -> int:
+        """Levels n of each student."""
+        return int(self.notes.batch_size[1])
+
+    def __getitem__(self, index: Any) -> Batch:
+        return Batch(self.levels[index], self.notes[index])
+
+    def keep(self, index: Tensor) -> Batch:
+        """The batch as it were if only these levels had been proposed.
+
+        Args:
+            index: places of the levels that are kept, in their new order, int64 [K, m].
+        """
+        notes = levels_at(self.notes, index)
+        _renumber(notes)
+        return Batch(levels_at(self.levels, index), notes)
+
+
+def outcome_of(rollout: TensorDictBase) -> TensorDict:
+    """What came of training on levels, from TorchRL's rollout [K, n, T] on them.
+
+    Every outcome is a tensordict [K, n] with
+
+    - ``return`` float: undiscounted, of the first episode on the level, or the mean of those that a
+      loop has played there;
+    - ``success`` float in [0, 1], where there is such a thing: likewise;
+    - ``episodes`` and ``steps`` int64: how many episodes ended, and how long all of it was;
+    - ``rollout`` [K, n, T], where there is one, with ``state_value`` where there is a critic.
+
+    Curricula without a use for an entry do not ask for it; ``return`` must be there.
+    """
+    done = rollout["next", "done"].squeeze(-1)
+    episodes = done.sum(-1)
+    return TensorDict(
+        {
+            "return": first_episode_return(rollout),
+            "success": first_episode_success(rollout).float(),
+            "episodes": episodes,
+            "steps": torch.full_like(episodes, done.shape[-1]),
+            "rollout": rollout,
+        },
+        rollout.batch_size[:2],
+    )
+
+
+class Curriculum:
+    """The interface of curricula; of its methods only :meth:`propose` must be defined.
+
+    ``streams`` are the random streams of the K students, for the present proposal.
+    """
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`."""
+        return ()
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels for the students to train on next.
+
+        Args:
+            student: as it is.
+            count: number n of levels of each; any number, and not always the same.
+            streams: of this proposal, K of them.
+        """
+        raise TypeError(f"{type(self).__name__} must define propose(student, count, streams)")
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Take notice of what came of a batch or a part of one.
+
+        Args:
+            student: after it has trained on the levels, or while it does.
+            batch: as it was proposed, or a part of it.
+            outcome: a tensordict [K, n]; see :func:`outcome_of`.
+
+        Raises:
+            ValueError: if the outcome does not fit the batch; then nothing has changed.
+        """
+
+    def log(self) -> dict[str, Any]:
+        """What there is to tell since the last call, ready for JSON; empty if there is nothing.
+
+        ``levels`` in it are levels [m] by their captions. It is called after every cycle.
+        """
+        return {}
+
+    def learnt(self) -> dict[str, Any]:
+        """What runs on other students can begin with, part of the state; empty if there is none."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put back what :meth:`state_dict` returned."""
+
+    def close(self) -> None:
+        """Let go of all that is held outside of this process."""
+
+
+@dataclass
+class Advance:
+    """Updates that the student has got from a curriculum itself, instead of the cycle's.
+
+    Attributes:
+        updates: how many.
+        levels: those of the last one, [K, P].
+        update: the last one's rollout, [K, P, T], and metrics.
+    """
+
+    updates: int
+    levels: Levels
+    update: Update
+
+
+@dataclass
+class Improvement:
+    """What a curriculum did before a cycle.
+
+    Attributes:
+        metrics: as :meth:`Curriculum.log` gives them.
+        advance: None if the student is as it was.
+    """
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+    advance: Advance | None = None
+
+
+class LearnedCurriculum(Curriculum):
+    """A curriculum that trains something before a cycle, such as a Proposer or one of its parts."""
+
+    @property
+    def trains_replicas(self) -> bool:
+        """Whether it trains replicas of the student, which other processes can do."""
+        return False
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Prepare for the next cycle, whose first proposal has not been made.
+
+        Whatever is raised in it may be followed by :meth:`load_state_dict` and a repeated call.
+
+        Args:
+            student: as it is before the cycle.
+            streams: of the cycle, K of them.
+        """
+        return Improvement()
+
+
+class Inbox:
+    """Evidence on levels, in the order in which they were proposed, however it comes in.
+
+    It numbers batches and the places of their levels in the notes (``number``, ``place``, and the
+    ``size`` n of the batch, each int64 [K, n]), keeps what curricula reduce an outcome to, and
+    hands it out sorted. A curriculum takes it at its next proposal and when it logs, so that
+    between two proposals the order of returns has no effect.
+
+    Args:
+        like: a level of the kind that ``level`` in the evidence holds; None if there is none.
+    """
+
+    def __init__(self, like: Levels | None = None) -> None:
+        self._like = like
+        self._next = 0
+        self._parts: list[TensorDict] = []  # [K, m]
+
+    def batch(self, levels: Levels, **notes: Tensor) -> Batch:
+        """A new batch [K, n], with the next number and these notes [K, n]."""
+        copies, count = levels.shape[:2]
+        number = torch.full((copies, count), self._next)
+        self._next += 1
+        every = {**notes, "number": number, **_places(copies, count)}
+        return Batch(levels, TensorDict(every, (copies, count)))
+
+    def check(self, batch: Batch, outcome: TensorDictBase) -> None:
+        """Check an outcome before anything is made of it; this waits for the device.
+
+        Raises:
+            ValueError: if it has another shape than the batch, a number in it is not finite, or the
+                batch is none of this curriculum's, or was observed before.
+        """
+        notes, shape = batch.notes, list(batch.notes.batch_size)
+        if list(outcome.batch_size) != shape:
+            raise ValueError(
+                f"the outcome has shape {list(outcome.batch_size)}, the batch {shape}: there must "
+                "be one entry for each level"
+            )
+        if "return" not in outcome.keys():
+            raise ValueError(f"the outcome has no return, only {sorted(map(str, outcome.keys()))}")
+        for name in ("return", "success"):
+            if name in outcome.keys() and not bool(outcome[name].isfinite().all()):
+                raise ValueError(f"the outcome's {name} is not finite on every level")
+        if not {"number", "place", "size"} <= {*notes.keys()}:
+            raise ValueError(f"the batch is of another curriculum: its notes are {[*notes.keys()]}")
+        if not batch.count:
+            return
+        number, places = int(notes["number"][0, 0]), set(notes["place"][0].tolist())
+        if bool((notes["number"] != number).any()) or not 0 <= number < self._next:
+            raise ValueError(
+                f"levels of batch {number}: an outcome is of one batch, and {self._next} have been "
+                "proposed"
+            )
+        waiting = [part for part in self._parts if int(part["number"][0, 0]) == number]
+        seen = [place for part in waiting for place in part["place"][0].tolist()]
+        if len(places) < shape[1] or places & {*seen}:
+            raise ValueError(f"levels of batch {number} have been observed before")
+
+    def put(self, batch: Batch, **evidence: Any) -> None:
+        """Put evidence [K, n] on a batch, or a part of one, aside."""
+        if batch.count:
+            where = batch.notes.select("number", "place", "size")
+            part = TensorDict({**where, **evidence}, batch.notes.batch_size, device="cpu")
+            self._parts.append(part)
+
+    def take(self, whole: bool = False) -> list[TensorDict]:
+        """The evidence that has come in: a tensordict [K, m] for each batch, in their order.
+
+        Args:
+            whole: whether parts stay until their batch is complete, and later batches with them.
+        """
+        batches: dict[int, list[TensorDict]] = {}
+        for part in self._parts:
+            batches.setdefault(int(part["number"][0, 0]), []).append(part)
+        taken, self._parts = [], []
+        for number in sorted(batches):
+            evidence: Any = torch.cat(batches[number], 1)
+            if self._parts or (whole and evidence.shape[1] < int(evidence["size"][0, 0])):
+                self._parts += batches[number]
+            else:
+                taken.append(levels_at(evidence, evidence["place"].argsort(1)))
+        return taken
+
+    def state_dict(self) -> dict[str, Any]:
+        """The next number, and what has not been taken."""
+        return {"next": self._next, "parts": [packed(part) for part in self._parts]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        self._next = int(state["next"])
+        self._parts = [unpacked(part, self._like) for part in state["parts"]]
+
+
+def _places(copies: int, count: int) -> dict[str, Tensor]:
+    place = torch.arange(count).expand(copies, -1)
+    return {"place": place, "size": torch.full_like(place, count)}
+
+
+def _renumber(notes: TensorDictBase) -> None:
+    """Count the places of all numbered notes [K, n] anew, also of those within."""
+    if "place" in notes.keys():
+        notes.update(_places(*notes.batch_size))
+    for within in notes.values():
+        if isinstance(within, TensorDictBase):
+            _renumber(within)

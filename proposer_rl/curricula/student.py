@@ -1,0 +1,375 @@
+"""What a curriculum may ask of the students that it proposes to.
+
+Most curricula ask for nothing; others name what they need (:attr:`Curriculum.needs`), so that a
+loop of any kind gives that alone, and a student that lacks something is refused before a run
+begins. :class:`TaskStudent` is ours and gives all that its task allows.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.learning import PPO
+from proposer_rl.learning.advantages import gae
+from proposer_rl.meta.first_order import (
+    Direction,
+    alignment,
+    exact_alignment,
+    exact_direction,
+    log_probabilities,
+    ppo_advantages,
+    surrogate,
+    target_direction,
+)
+from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
+from proposer_rl.task import (
+    DifferentiableTask,
+    EnumerableTask,
+    EpisodeLaw,
+    ExactTask,
+    Levels,
+    OptimalTask,
+    Task,
+)
+
+VALUE = "state_value"  # the critic's entry in a rollout
+
+
+class UnfitStudentError(TypeError):
+    """A student lacks what a curriculum needs; the message is a line that says what."""
+
+
+class Student:
+    """K students as a curriculum sees them, and a meter of what it asked of them.
+
+    What a student can do is a method here; each raises :class:`UnfitStudentError` unless a subclass
+    defines it, or a function is given in its place. Levels are [K, n] for any n unless it says
+    otherwise, or [E] where all students get the same; results are without gradients.
+
+    Args:
+        gamma, lmbda: discount, and decay of the traces of generalised advantages, by which
+            curricula read a critic.
+        batch_size: levels P that :meth:`play` takes at once; None for any number.
+        can: functions by the names of methods, such as ``performance=evaluate``.
+
+    Attributes:
+        frames: environment steps that each student was played for on a curriculum's account.
+        evaluations: levels on which each was evaluated for it.
+
+    Raises:
+        ValueError: for a name that is none of these methods'.
+
+    Example:
+        >>> student = Student(optimal_return=lambda levels: torch.ones(levels.shape))
+        >>> student.lacks("optimal_return"), student.lacks("probe")
+        (None, 'it has no probe(levels)')
+    """
+
+    def __init__(
+        self,
+        *,
+        gamma: float = 0.99,
+        lmbda: float = 0.95,
+        batch_size: int | None = None,
+        **can: Callable[..., Any],
+    ) -> None:
+        self.gamma, self.lmbda, self.batch_size = gamma, lmbda, batch_size
+        self.frames, self.evaluations = 0, 0
+        for name, function in can.items():
+            if name not in SIGNATURES:
+                raise ValueError(f"{name}: a student can have {', '.join(SIGNATURES)}")
+            setattr(self, name, function)
+
+    def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
+        """Count what each student, or another for it, was played and evaluated."""
+        self.frames += frames
+        self.evaluations += evaluations
+
+    def lacks(self, name: str) -> str | None:
+        """Why it cannot do what the method of that name says; None if it can."""
+        if name in vars(self) or getattr(type(self), name) is not getattr(Student, name):
+            return None
+        return f"it has no {name}{SIGNATURES[name]}"
+
+    def values(self, levels: Levels) -> Tensor:
+        """What the critic says of the first state of each level, float [K, n]."""
+        raise self._refusal("values")
+
+    def play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
+        """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
+
+        TorchRL's, with ``state_value`` where a score reads a critic. Actions of student k are drawn
+        from the k-th generator.
+        """
+        raise self._refusal("play")
+
+    def performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
+        """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].
+
+        Expectations, or estimates from episodes.
+        """
+        raise self._refusal("performance")
+
+    def exact_performance(self, levels: Levels) -> TensorDictBase:
+        """The same where it is exact, so that nothing is drawn."""
+        raise self._refusal("exact_performance")
+
+    def probe(self, levels: Levels) -> Tensor:
+        """What each would do on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
+        raise self._refusal("probe")
+
+    def optimal_return(self, levels: Levels) -> Tensor:
+        """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
+        raise self._refusal("optimal_return")
+
+    def episode_law(self, levels: Levels) -> EpisodeLaw:
+        """The law of each student's episodes on levels [K, n]."""
+        raise self._refusal("episode_law")
+
+    def gradient_norms(self, levels: Levels) -> Tensor:
+        """Squared length of the gradient of the return on each level, float [K, n]."""
+        raise self._refusal("gradient_norms")
+
+    def policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
+        """The same of the policy gradient of a rollout [K, n, T], float [K, n]."""
+        raise self._refusal("policy_gradient_norms")
+
+    def target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
+        """Performance on levels [K, E] of the target, float [K], and what raises it fastest.
+
+        See :mod:`proposer_rl.meta.first_order`.
+        """
+        raise self._refusal("target_direction")
+
+    def alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
+        """Slope of the return on each level along a direction, float [K, n].
+
+        Args:
+            direction: of the students' parameters.
+            levels: of each.
+            step: of the differences, in learning rates.
+        """
+        raise self._refusal("alignment")
+
+    def sampled_direction(self, rollout: TensorDictBase) -> Direction:
+        """The direction by the policy gradient of a rollout [K, n, T] on the target."""
+        raise self._refusal("sampled_direction")
+
+    def sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
+        """What the alignment of levels is made of, by a rollout [K, n, T] on them.
+
+        ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi,
+        with advantages A_t that are not standardised. Where the students' training standardises
+        them over a batch: ``drift``, the slope of log pi alone; and ``advantage`` and ``square``,
+        the means of A_t and of its square, so that this can be done when all of it has come in.
+        """
+        raise self._refusal("sampled_alignment")
+
+    def snapshot(self) -> TensorDict:
+        """All that training changes of the students, batch [K]."""
+        raise self._refusal("snapshot")
+
+    def restore(self, snapshot: TensorDictBase) -> None:
+        """Become what a snapshot [K] holds."""
+        raise self._refusal("restore")
+
+    def _refusal(self, name: str) -> UnfitStudentError:
+        return UnfitStudentError(f"{name}: {self.lacks(name)}")
+
+
+def _signature(name: str) -> str:
+    _, *arguments = inspect.signature(getattr(Student, name)).parameters
+    return f"({', '.join(arguments)})"
+
+
+SIGNATURES = {
+    name: _signature(name)
+    for name, method in vars(Student).items()
+    if inspect.isfunction(method) and name[0] != "_" and name not in ("spend", "lacks")
+}
+"""What a student can have, with the arguments of each."""
+
+
+def require(student: Student, needs: Iterable[str], who: str) -> None:
+    """Refuse a student that lacks something.
+
+    Args:
+        student: that is to be taught.
+        needs: names of methods.
+        who: needs them.
+
+    Raises:
+        UnfitStudentError: naming the first that is missing, and why.
+    """
+    for name in needs:
+        reason = student.lacks(name)
+        if reason is not None:
+            raise UnfitStudentError(f"{who} needs a student with {name}: {reason}")
+
+
+class TaskStudent(Student):
+    """Students of a task that train by PPO, which can do all that the task allows.
+
+    Args:
+        task: which tells how they do.
+        learner: of K of them.
+    """
+
+    def __init__(self, task: Task, learner: PPO) -> None:
+        numbers = learner.settings
+        super().__init__(
+            gamma=numbers.gamma,
+            lmbda=numbers.lmbda,
+            batch_size=learner.env.batch_size[1:].numel(),
+        )
+        self._task, self._learner = task, learner
+        self._norms: Callable[..., Tensor] | None = None
+        self._policy_norms: Callable[..., Tensor] | None = None
+
+    def lacks(self, name: str) -> str | None:
+        """Why its task does not allow it; None if it does."""
+        kinds: dict[str, tuple[type, str]] = {
+            "optimal_return": (OptimalTask, "optimal_return(levels)"),
+            "episode_law": (EnumerableTask, "episode_law(agent, levels)"),
+            **dict.fromkeys(
+                ("gradient_norms", "target_direction", "alignment"),
+                (DifferentiableTask, "differentiable_performance(agent, levels)"),
+            ),
+        }
+        task = type(self._task).__name__
+        if name == "exact_performance" and not self._task.exact_performance:
+            return f"{task} tells performance by playing, which is not exact"
+        if name in kinds and not isinstance(self._task, kinds[name][0]):
+            return f"{task} must define {kinds[name][1]}"
+        return None
+
+    @torch.no_grad()
+    def values(self, levels: Levels) -> Tensor:
+        """See :meth:`Student.values`; of at most ``batch_size`` levels."""
+        agent, count = self._learner.agent, levels.shape[1]
+        self._learner.env.set_levels(self._filled_up(levels))
+        state = self._learner.env.reset()
+        state.update(agent.no_memory(state))
+        return agent.decode(state, agent.encode(state))[VALUE].squeeze(-1)[:, :count]
+
+    def play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
+        """See :meth:`Student.play`."""
+        count = levels.shape[1]
+        self._learner.env.set_levels(self._filled_up(levels))
+        rollout = self._learner.collect(list(generators))
+        self.spend(frames=rollout[0].numel())
+        return rollout if count == rollout.shape[1] else rollout[:, :count]
+
+    @torch.no_grad()
+    def performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
+        """See :meth:`Student.performance`."""
+        self.spend(evaluations=levels.shape[-1])
+        return self._task.performance(self._learner.agent, levels, generator)
+
+    def exact_performance(self, levels: Levels) -> TensorDictBase:
+        """See :meth:`Student.exact_performance`."""
+        return self.performance(levels, torch.Generator())
+
+    @torch.no_grad()
+    def probe(self, levels: Levels) -> Tensor:
+        """See :meth:`Student.probe`."""
+        return self._task.probe(self._learner.agent, levels)
+
+    def optimal_return(self, levels: Levels) -> Tensor:
+        """See :meth:`Student.optimal_return`."""
+        return cast(OptimalTask, self._task).optimal_return(levels)
+
+    @torch.no_grad()
+    def episode_law(self, levels: Levels) -> EpisodeLaw:
+        """See :meth:`Student.episode_law`."""
+        self.spend(evaluations=levels.shape[-1])
+        return cast(EnumerableTask, self._task).episode_law(self._learner.agent, levels)
+
+    def gradient_norms(self, levels: Levels) -> Tensor:
+        """See :meth:`Student.gradient_norms`."""
+        self.spend(evaluations=levels.shape[-1])
+        self._norms = self._norms or squared_gradients(cast(ExactTask, self._task))
+        return self._norms(self._learner, levels)
+
+    def policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
+        """See :meth:`Student.policy_gradient_norms`."""
+        self._policy_norms = self._policy_norms or squared_policy_gradients(self._task)
+        return self._policy_norms(self._learner, rollout, advantages(self, rollout).float())
+
+    def target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
+        """See :meth:`Student.target_direction`."""
+        self.spend(evaluations=levels.shape[-1])
+        return exact_direction(cast(ExactTask, self._task), self._learner, levels, measure)
+
+    def alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
+        """See :meth:`Student.alignment`; a level counts on either side."""
+        self.spend(evaluations=2 * levels.shape[-1])
+        return exact_alignment(cast(ExactTask, self._task), self._learner, direction, levels, step)
+
+    def sampled_direction(self, rollout: TensorDictBase) -> Direction:
+        """See :meth:`Student.sampled_direction`."""
+        learner = self._learner
+        with torch.enable_grad():
+            gained = surrogate(learner.agent, rollout, ppo_advantages(learner, rollout)).mean(1)
+            return target_direction(learner, gained)
+
+    def sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
+        """See :meth:`Student.sampled_alignment`."""
+        agent, advantage = self._learner.agent, advantages(self, rollout)
+
+        def gained() -> Tensor:
+            log_prob = log_probabilities(agent, rollout).double()
+            return torch.stack([(advantage * log_prob).mean(-1), log_prob.mean(-1)], -1)
+
+        found = alignment(agent, direction, self._learner.settings.learning_rate, gained)
+        parts = {"slope": found[..., 0]}
+        if self._learner.settings.normalize_advantage:
+            parts["drift"] = found[..., 1]
+            parts |= {"advantage": advantage.mean(-1), "square": advantage.square().mean(-1)}
+        return TensorDict(parts, found.shape[:2])
+
+    def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
+        """Train on levels [K, n], with an update for each ``batch_size`` of them.
+
+        Raises:
+            DivergedError: if a number is not finite.
+        """
+        for some in levels.split(self._learner.env.batch_size[1:].numel(), 1):
+            self._learner.env.set_levels(self._filled_up(some).to(self._task.device))
+            self._learner.update(list(generators))
+            self._learner.check()
+
+    def snapshot(self) -> TensorDict:
+        """See :meth:`Student.snapshot`."""
+        return self._learner.snapshot()
+
+    def restore(self, snapshot: TensorDictBase) -> None:
+        """See :meth:`Student.restore`."""
+        self._learner.restore(snapshot)
+
+    def _filled_up(self, levels: Levels) -> Levels:
+        """As many levels as the environment takes: the last one over again."""
+        size, count = self._learner.env.batch_size[1:].numel(), levels.shape[1]
+        if count == size:
+            return levels
+        if count > size:
+            raise ValueError(f"{count} levels at once; the students' environment takes {size}")
+        return levels[:, torch.arange(size).clamp(max=count - 1)]
+
+
+def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
+    """Generalised advantages A_t by a student's critic, not standardised: float64 [K, n, T].
+
+    Args:
+        student: whose discount and trace decay count.
+        rollout: with ``state_value``, [K, n, T].
+        lmbda: in place of the student's decay; 0 for the error of one step.
+    """
+    estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda, VALUE)
+    return estimate(rollout.copy())["advantage"].squeeze(-1).double()

@@ -1,0 +1,176 @@
+"""Every curriculum, small and on mazes of seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from proposer_rl.curricula import (
+    Curriculum,
+    Filtered,
+    FirstOrderCurriculum,
+    FirstOrderProposer,
+    LearningProgressCurriculum,
+    Mixed,
+    MixtureCurriculum,
+    PairedProposer,
+    ProposerCurriculum,
+    ReplayCurriculum,
+    ReplayRule,
+    SampledFirstOrderCurriculum,
+    SamplingCurriculum,
+    Schedule,
+    Scorer,
+    SelectionCurriculum,
+    TaskStudent,
+    TransportCurriculum,
+)
+from proposer_rl.methods import Parts, proposer
+from proposer_rl.models import (
+    ActorCritic,
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    proposer_actor_critic,
+)
+from proposer_rl.settings import PPOSettings, ProposerSettings
+from proposer_rl.streams import Streams
+from tests.tiny import TASK
+
+Make = Callable[[], Curriculum]
+SPACE, TARGET, P = TASK.space, TASK.target, TASK.batch_size
+SMALL = {"capacity": 16, "fill": 0.5, "replay_probability": 0.6}
+SETTINGS = PPOSettings(horizon=1, learning_rate=3e-3, epochs=2)
+
+
+def replay(
+    score: str = "positive_value_loss",
+    source: Any = "episodes",
+    *,
+    rule: ReplayRule | None = None,
+    rollouts: int = 1,
+    **options: Any,
+) -> ReplayCurriculum:
+    scorer = Scorer(score, source, rollouts)
+    return ReplayCurriculum(SPACE, scorer, rule, edit=TASK.edit, **{**SMALL, **options})
+
+
+def ncc() -> ReplayCurriculum:
+    rule = ReplayRule(prioritization="softmax", temperature=0.05, staleness=0.0)
+    return replay("learnability", "exact", rule=rule, renew=True)
+
+
+def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> SelectionCurriculum:
+    numbers = {"candidates": 16, "keep": 6, "every": 3, "new": 0.5, **options}
+    return SelectionCurriculum(SPACE, Scorer("learnability", source, rollouts), **numbers)
+
+
+def problem_agent() -> ActorCritic:
+    torch.manual_seed(0)
+    head = ProblemHead(8, P, SPACE.size, hidden=16, bands=4)
+    network = ProposerNetwork(head, TASK.probe_encoder(8), context=8, hidden=8)
+    return proposer_actor_critic(network, categorical)
+
+
+def paired(streams: Streams | None = None) -> PairedProposer:
+    antagonist = TaskStudent(TASK, TASK.learner([streams or Streams(0, "antagonist")]))
+    return PairedProposer(
+        SPACE, TARGET, problem_agent(), SETTINGS, antagonist=antagonist, probe_levels=2
+    )
+
+
+def first_order_proposer() -> FirstOrderProposer:
+    return FirstOrderProposer(
+        SPACE, TARGET, problem_agent(), SETTINGS, probe_levels=2, target_levels=3
+    )
+
+
+def learnt() -> ProposerCurriculum:
+    """The paper's, in small."""
+    settings = ProposerSettings(
+        rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
+    )
+    return proposer(Parts(TASK, settings, [0]))
+
+
+def frozen() -> ProposerCurriculum:
+    """Without a trainer."""
+    learning = learnt()
+    return ProposerCurriculum(
+        learning.agent,
+        learning.view,
+        learning.actions,
+        meta_episode_length=2,
+        action_repeat=2,
+        own_action="sample",
+    )
+
+
+def filtered(curriculum: Curriculum, source: Any = "exact", times: int = 3) -> Filtered:
+    return Filtered(curriculum, Scorer("learnability", source, 2), times=times, temperature=0.05)
+
+
+MADE: dict[str, Make] = {
+    "uniform": lambda: SamplingCurriculum(SPACE),
+    "filtered": lambda: filtered(SamplingCurriculum(SPACE)),
+    "filtered from episodes": lambda: filtered(SamplingCurriculum(SPACE), "episodes"),
+    "plr": lambda: replay(train_on_new=True),
+    "robust": lambda: replay(synchronous=False),
+    "synchronous": replay,
+    "accel": lambda: replay(edits=3),
+    "easy": lambda: replay(edits=3, parents="easy"),
+    "max_mc": lambda: replay("max_mc"),
+    "regret": lambda: replay("regret", "exact"),
+    "plr of regret": lambda: replay("regret", "exact", train_on_new=True),
+    "plr of regret, renewed": lambda: replay("regret", "exact", train_on_new=True, renew=True),
+    "plr of regret, credited": lambda: replay(
+        "regret", "exact", train_on_new=True, co_learnability=0.5
+    ),
+    "ncc": ncc,
+    "traced": lambda: replay("regret", "exact", co_learnability=0.5, edits=2),
+    "gradients": lambda: replay("gradient_norm", "exact"),
+    "policy gradients": lambda: replay("gradient_norm"),
+    "negative advantages": lambda: replay("mean_negative_advantage"),
+    "law": lambda: replay("max_mc", "exact"),
+    "sfl": selection,
+    "sfl from episodes": lambda: selection("episodes"),
+    "progress": lambda: LearningProgressCurriculum(SPACE, probes=2, every=2),
+    "progress of episodes": lambda: LearningProgressCurriculum(SPACE, source="episodes", every=2),
+    "alp_gmm": lambda: MixtureCurriculum(SPACE, warmup=8, refit=6, components=3),
+    "alp_gmm, exact": lambda: MixtureCurriculum(
+        SPACE, source="exact", warmup=8, refit=6, components=3
+    ),
+    "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
+    "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
+    "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TARGET),
+    "filtered bins": lambda: filtered(
+        LearningProgressCurriculum(SPACE, source="episodes", every=2)
+    ),
+    "filtered replay": lambda: filtered(replay(train_on_new=True)),
+    "filtered alp_gmm": lambda: filtered(
+        MixtureCurriculum(SPACE, warmup=8, refit=6, components=3), times=2
+    ),
+    "schedule": lambda: Schedule([SamplingCurriculum(SPACE), replay(train_on_new=True)], [2]),
+    "filtered schedule": lambda: filtered(
+        Schedule([SamplingCurriculum(TARGET), replay(train_on_new=True)], [1])
+    ),
+    "mixed": lambda: Mixed(
+        [
+            LearningProgressCurriculum(SPACE, source="episodes", every=1),
+            replay(train_on_new=True),
+            SamplingCurriculum(TARGET),
+        ],
+        [1, 2, 1],
+    ),
+}
+LEARNED: dict[str, Make] = {
+    "perf_gain": learnt,
+    "filtered perf_gain": lambda: filtered(learnt()),
+    "frozen": frozen,
+    "first_order_proposer": first_order_proposer,
+    "paired": paired,
+    "filtered paired": lambda: filtered(paired(), times=2),
+}
+"""Of one Solver alone."""

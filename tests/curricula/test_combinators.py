@@ -1,0 +1,224 @@
+"""Filtered, Schedule and Mixed: the law of the filter's draws, what is kept, and who gets what."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from math import exp
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula import (
+    Batch,
+    Curriculum,
+    Filtered,
+    Improvement,
+    LearnedCurriculum,
+    Mixed,
+    SamplingCurriculum,
+    Schedule,
+    Student,
+    TaskStudent,
+)
+from proposer_rl.curricula.batches import fresh_levels
+from proposer_rl.curricula.buffer import level_keys
+from proposer_rl.curricula.combinators import draw_without_replacement
+from proposer_rl.streams import Streams
+from tests.curricula.living import live, solvers
+from tests.curricula.made import LEARNED, filtered, learnt
+from tests.curricula.scripted import GivenScores
+from tests.tiny import TASK, evaluate
+
+P, T = TASK.batch_size, 8
+INF = float("inf")
+
+
+def by_enumeration(logits: list[float], count: int) -> dict[frozenset[int], float]:
+    """How likely each set is that is drawn one after another, without replacement."""
+    weights = [exp(x) for x in logits]
+    law: dict[frozenset[int], float] = {}
+    for order in permutations(range(len(logits)), count):
+        chance, left = 1.0, sum(weights)
+        for place in order:
+            chance *= weights[place] / left
+            left -= weights[place]
+        law[frozenset(order)] = law.get(frozenset(order), 0.0) + chance
+    return law
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_draws_have_the_law_of_one_after_another(count: int) -> None:
+    logits, draws = [0.0, 1.0, -1.0, 2.0], 20_000
+    rows = torch.tensor(logits).expand(draws, -1)
+    generator = torch.Generator().manual_seed(count)
+    index = draw_without_replacement(rows, count, [generator] * draws)
+    found: dict[frozenset[int], int] = {}
+    for row in index.tolist():
+        found[frozenset(row)] = found.get(frozenset(row), 0) + 1
+    for drawn, chance in by_enumeration(logits, count).items():
+        error = (chance * (1 - chance) / draws) ** 0.5
+        assert abs(found.get(drawn, 0) / draws - chance) < 5 * error, drawn
+
+
+def test_what_has_no_score_is_drawn_last_and_evenly() -> None:
+    rows = torch.tensor([-INF, 0.0, -INF, -INF]).expand(6000, -1)
+    generator = torch.Generator().manual_seed(0)
+    index = draw_without_replacement(rows, 2, [generator] * 6000)
+    assert (index[:, 0] == 1).all()
+    counts = index[:, 1].bincount(minlength=4)
+    assert counts[1] == 0 and ((counts[[0, 2, 3]] - 2000).abs() < 200).all()
+
+
+def test_the_coldest_filter_keeps_the_most_learnable() -> None:
+    curriculum = filtered(SamplingCurriculum(TASK.space), times=8)
+    curriculum._temperature = 1e-9
+    learner, streams = solvers([0, 1]), [Streams(seed, "update", 0) for seed in (0, 1)]
+    student = TaskStudent(TASK, learner)
+    batch = curriculum.propose(student, P, streams)
+    candidates = fresh_levels(TASK.space, 8 * P, streams, "levels")
+    keys, kept = level_keys(candidates), level_keys(batch.levels)
+    for copy in (0, 1):
+        row = evaluate(solvers([copy]).agent, candidates[copy])["success"][0].tolist()
+        best = sorted(range(8 * P), key=lambda i: -row[i] * (1 - row[i]))[:P]
+        assert sorted(kept[copy].tolist()) == sorted(keys[copy, best].tolist())
+    assert (student.frames, student.evaluations) == (0, 8 * P)
+
+
+def test_scores_from_episodes_cost_frames() -> None:
+    lived = live(filtered(SamplingCurriculum(TASK.space), "episodes"), solvers([0]), [0], range(2))
+    assert lived.frames == [2 * 3 * P * T] * 2 and lived.evaluations == [0, 0]
+
+
+def test_a_proposers_student_trains_on_some_of_its_proposals() -> None:
+    plain, some = learnt(), filtered(learnt(), times=4)
+    batch = some.propose(TaskStudent(TASK, solvers([0])), P, [Streams(0)])
+    many = plain.propose(TaskStudent(TASK, solvers([0])), 4 * P, [Streams(0)])
+    assert set(level_keys(batch.levels)[0].tolist()) <= set(level_keys(many.levels)[0].tolist())
+    assert some.trains_replicas and some.learnt().keys() == {"proposer", "observed"}
+    assert not filtered(LEARNED["frozen"]()).trains_replicas
+
+
+class Noted(LearnedCurriculum):
+    """Levels are numbers from its first on; notes what it observes."""
+
+    trains_replicas = False
+
+    def __init__(self, first: int) -> None:
+        self.first, self.seen, self.improved = first, [], 0
+
+    def propose(self, student: Student, count: int, streams: Any) -> Batch:
+        levels = torch.arange(self.first, self.first + count).expand(len(streams), -1)
+        return Batch(levels, TensorDict({"own": levels}, levels.shape))
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        assert (batch.notes["own"] == batch.levels).all()
+        self.seen += [batch.levels[0].tolist(), outcome["return"][0].tolist()]
+
+    def improve(self, student: Student, streams: Any) -> Improvement:
+        self.improved += 1
+        return Improvement({"improved": self.first})
+
+    def log(self) -> dict[str, Any]:
+        return {"seen": list(self.seen)}
+
+    def learnt(self) -> dict[str, Any]:
+        return {"first": self.first} if self.first else {}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seen": list(self.seen)}
+
+    def load_state_dict(self, state: Any) -> None:
+        self.seen = list(state["seen"])
+
+
+def outcome(levels: Tensor) -> TensorDict:
+    return TensorDict({"return": levels.float() / 2}, levels.shape)
+
+
+def test_what_is_kept_is_observed_as_if_it_alone_had_been_proposed() -> None:
+    own = Noted(0)
+    numbers = torch.tensor([[0.0, 9.0, 5.0, 1.0]])
+    curriculum = Filtered(own, GivenScores(numbers), times=2, temperature=1e-6)
+    batch = curriculum.propose(Student(), 2, [Streams(0)])
+    assert batch.levels.tolist() == [[1, 2]]
+    curriculum.observe(Student(), batch, outcome(batch.levels))
+    assert own.seen == [[1, 2], [0.5, 1.0]]
+
+
+def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_from() -> None:
+    stages = [Noted(10 * i) for i in range(3)]
+    curriculum, batches = Schedule(stages, until=[2, 3]), []
+    for number in range(5):
+        if number == 3:  # interrupted, and put back from its state
+            state = curriculum.state_dict()
+            stages = [Noted(10 * i) for i in range(3)]
+            curriculum = Schedule(stages, until=[2, 3])
+            curriculum.load_state_dict(state)
+        improved = curriculum.improve(Student(), [Streams(0)]).metrics
+        batches.append(curriculum.propose(Student(), 2, [Streams(0)]))
+        assert improved == {"improved": int(batches[-1].levels[0, 0])}
+    assert [int(batch.levels[0, 0]) for batch in batches] == [0, 0, 10, 20, 20]
+    for batch in batches[::-1]:
+        curriculum.observe(Student(), batch[:, 1:], outcome(batch.levels[:, 1:]))
+    assert [len(stage.seen) // 2 for stage in stages] == [2, 1, 2]
+    assert stages[1].seen == [[11], [5.5]]
+    assert curriculum.learnt() == {"first": 20}
+    assert curriculum.log() == {"seen": stages[2].seen}
+
+
+def test_a_schedule_trains_replicas_where_a_stage_does() -> None:
+    plain = SamplingCurriculum(TASK.space)
+    assert not Schedule([plain, Noted(0)], [1]).trains_replicas
+    assert Schedule([plain, learnt()], [1]).trains_replicas
+
+
+@pytest.mark.parametrize("until", [[], [2], [3, 2], [2, 2], [0, 4]])
+def test_a_schedule_refuses_ends_that_do_not_fit(until: list[int]) -> None:
+    with pytest.raises(ValueError, match="3 stages need 2 ascending positive"):
+        Schedule([SamplingCurriculum(TASK.space)] * 3, until)
+
+
+@pytest.mark.parametrize(("count", "shares"), [(8, [4, 2, 2]), (3, [2, 0, 1]), (1, [0, 1, 0])])
+def test_each_curriculum_of_a_mixture_has_its_share(count: int, shares: list[int]) -> None:
+    parts = [Noted(10 * i) for i in range(3)]
+    curriculum = Mixed(parts, [0.5, 0.25, 0.25])
+    batch = curriculum.propose(Student(), count, [Streams(0), Streams(1)])
+    whose = (batch.levels // 10)[1]
+    assert whose.bincount(minlength=3).tolist() == shares and batch.count == count
+    for place in reversed(range(count)):
+        some = batch[:, [place]]
+        curriculum.observe(Student(), some, outcome(some.levels))
+    for part, share in zip(parts, shares, strict=True):
+        assert sorted(level for seen in part.seen[::2] for level in seen) == [
+            part.first + i for i in range(share)
+        ]
+    assert curriculum.log() == {f"{i}_seen": part.seen for i, part in enumerate(parts)}
+
+
+def test_shares_are_checked() -> None:
+    two: list[Curriculum] = [SamplingCurriculum(TASK.space)] * 2
+    for shares, message in (
+        ([1.0], "2 curricula need as many shares"),
+        ([1.0, -1.0], "shares must be a finite number of at least 0"),
+        ([0.0, 0.0], "sum of shares must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Mixed(two, shares)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"times": 1}, "times must be a whole number from 2 to"),
+        ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
+    ],
+)
+def test_a_filter_that_makes_no_sense_is_refused(numbers: dict[str, Any], message: str) -> None:
+    scorer = GivenScores(torch.zeros(1, 1))
+    with pytest.raises(ValueError, match=message):
+        Filtered(SamplingCurriculum(TASK.space), scorer, **numbers)
+    with pytest.raises(ValueError, match="filter the curricula of a mixture, each by itself"):
+        Filtered(Schedule([Mixed([SamplingCurriculum(TASK.space)], [1])], []), scorer)

@@ -1,0 +1,231 @@
+"""What holds of every curriculum, whatever it proposes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from proposer_rl.curricula import (
+    Batch,
+    Curriculum,
+    Inbox,
+    LearnedCurriculum,
+    Student,
+    TaskStudent,
+    UnfitStudentError,
+    outcome_of,
+    require,
+)
+from proposer_rl.curricula.student import SIGNATURES
+from proposer_rl.streams import Streams
+from tests.curricula.living import check_each_lives_alone, check_it_resumes, live, solvers
+from tests.curricula.made import LEARNED, MADE, SPACE, Make, P, replay
+from tests.tiny import TASK, mountain_cars, tiny_view_task
+
+EVERY = {**MADE, **LEARNED}
+every = pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
+
+
+@every
+def test_it_resumes(make: Make) -> None:
+    check_it_resumes(make)
+
+
+@pytest.mark.parametrize("name", [name for name in MADE if name != "robust" and name != "mixed"])
+def test_each_student_lives_as_if_alone(name: str) -> None:
+    check_each_lives_alone(MADE[name])
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two states are alike, bit by bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, torch.Tensor):
+        return one.shape == other.shape and bool(
+            ((one == other) | ((one != one) & (other != other))).all()
+        )
+    return bool(one == other)
+
+
+Return = tuple[int, slice]  # number of an outstanding batch, and the part of it that comes back
+IN_ORDER = [(0, slice(None)), (1, slice(None))]
+OTHERWISE = [(1, slice(None)), (0, slice(1, None, 2)), (0, slice(0, None, 2))]
+
+
+def two_outstanding(make: Make, returns: Sequence[Return]) -> tuple[Any, Any, Any]:
+    """Of two batches that come back somehow: what is logged, proposed next, and the state then."""
+    curriculum, learner = make(), solvers([0])
+    live(curriculum, learner, [0], range(4))  # long enough to fit, replay and score
+    student = TaskStudent(TASK, learner)
+    batches = [curriculum.propose(student, n, [Streams(0, "two", n)]) for n in (P, P + 1)]
+    outcomes = [played(student, batch, n) for n, batch in enumerate(batches)]
+    for number, part in returns:
+        curriculum.observe(student, batches[number][:, part], outcomes[number][:, part])
+    logged = curriculum.log()
+    following = curriculum.propose(student, P, [Streams(0, "next")])
+    logged.pop("levels", None)
+    return logged, following, curriculum.state_dict()
+
+
+def played(student: TaskStudent, batch: Batch, number: int) -> TensorDict:
+    """What comes of a batch of any size, without training."""
+    rollouts = [
+        student.play(some, [Streams(7, number, i).generator()])
+        for i, some in enumerate(batch.levels.split(P, 1))
+    ]
+    return outcome_of(torch.cat(rollouts, 1))
+
+
+@every
+def test_the_order_in_which_parts_come_back_has_no_effect(make: Make) -> None:
+    """Two outstanding batches of different sizes, the second first and the first in two parts."""
+    logged, batch, state = two_outstanding(make, IN_ORDER)
+    other_logged, other_batch, other_state = two_outstanding(make, OTHERWISE)
+    assert same(json.loads(json.dumps(logged)), json.loads(json.dumps(other_logged)))
+    assert (batch.levels == other_batch.levels).all()
+    assert (batch.notes == other_batch.notes).all()
+    assert same(state, other_state)
+
+
+LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "first order, sampled", "paired"]
+
+
+@pytest.mark.parametrize("name", [*LEARNING, "filtered bins", "schedule", "mixed"])
+def test_what_comes_back_makes_a_difference(name: str) -> None:
+    """Otherwise the test above would show nothing."""
+    missing = [(1, slice(None)), (0, slice(0, 1))]
+    whole, part = (two_outstanding(EVERY[name], returns) for returns in (IN_ORDER, missing))
+    assert not same(whole[2], part[2])
+
+
+@every
+def test_it_asks_for_what_it_says_whatever_the_size_and_tells_what_came_back(make: Make) -> None:
+    """With a student that can do what it needs and nothing else, on batches of any size."""
+    curriculum, learner = make(), solvers([0])
+    assert curriculum.log() == {}
+    whole = TaskStudent(TASK, learner)
+    can = {name: getattr(whole, name) for name in curriculum.needs}
+    student = Student(gamma=whole.gamma, lmbda=whole.lmbda, batch_size=P, **can)
+    if isinstance(curriculum, LearnedCurriculum):
+        curriculum.improve(student, [Streams(0)])
+    before = learner.snapshot()
+    counts = [P, 1, 3, 2 * P]
+    for number, count in enumerate(counts):
+        batch = curriculum.propose(student, count, [Streams(0, number)])
+        assert batch.levels.batch_size == (1, count) and batch.count == count
+        outcome = played(whole, batch, number)
+        for part in (slice(0, 1), slice(1, None))[:count]:
+            curriculum.observe(student, batch[:, part], outcome[:, part])
+    assert (learner.snapshot() == before).all()  # proposing trains nobody
+    logged = curriculum.log()
+    logged.pop("levels", None)
+    told = json.loads(json.dumps(logged, allow_nan=False))
+    if "histogram" in told:
+        assert torch.tensor(told["histogram"]).sum() == sum(counts)
+        assert torch.tensor(curriculum.log()["histogram"]).sum() == 0
+
+
+WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase]], str]] = {
+    "too few": (lambda b, o: (b, o[:, :2]), "the outcome has shape"),
+    "not finite": (
+        lambda b, o: (b, o.copy().set("return", o["return"] * torch.inf)),
+        "the outcome's return is not finite",
+    ),
+    "no return": (lambda b, o: (b, o.exclude("return")), "the outcome has no return"),
+    "another's": (
+        lambda b, o: (Batch(b.levels, TensorDict({}, b.notes.batch_size)), o),
+        "the batch is of another curriculum",
+    ),
+    "not proposed": (
+        lambda b, o: (Batch(b.levels, b.notes.clone().set("number", b.notes["number"] + 9)), o),
+        "an outcome is of one batch",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ["plr", "progress of episodes", "alp_gmm", "paired"])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:
+    curriculum, student = EVERY[name](), TaskStudent(TASK, solvers([0]))
+    batch = curriculum.propose(student, P, [Streams(0)])
+    outcome = played(student, batch, 0)
+    before = curriculum.state_dict()
+    change, message = WRONG[wrong]
+    with pytest.raises(ValueError, match=message):
+        curriculum.observe(student, *change(batch, outcome))
+    assert same(before, curriculum.state_dict())
+    curriculum.observe(student, batch, outcome)
+
+
+def test_levels_are_observed_once() -> None:
+    curriculum, student = replay(train_on_new=True), TaskStudent(TASK, solvers([0]))
+    batch = curriculum.propose(student, P, [Streams(0)])
+    outcome = played(student, batch, 0)
+    curriculum.observe(student, batch[:, :2], outcome[:, :2])
+    with pytest.raises(ValueError, match="levels of batch 0 have been observed before"):
+        curriculum.observe(student, batch[:, 1:], outcome[:, 1:])
+
+
+def test_a_batch_has_a_note_for_each_level() -> None:
+    with pytest.raises(ValueError, match="must have one shape"):
+        Batch(torch.zeros(2, 3), TensorDict({}, [2, 4]))
+
+
+def test_an_inbox_hands_out_in_order_and_waits_for_what_is_incomplete() -> None:
+    inbox = Inbox()
+    first, second = (inbox.batch(torch.arange(n).expand(2, -1)) for n in (4, 3))
+
+    def put(batch: Batch) -> None:
+        inbox.put(batch, seen=batch.levels)
+
+    put(second)
+    put(first[:, [3, 0]])
+    assert inbox.take(whole=True) == []  # the first is incomplete, and the second comes after it
+    put(first[:, [1]])
+    again = Inbox()
+    again.load_state_dict(inbox.state_dict())
+    inbox = again
+    put(first[:, [2]])
+    taken = inbox.take(whole=True)
+    assert [evidence["seen"][1].tolist() for evidence in taken] == [[0, 1, 2, 3], [0, 1, 2]]
+    assert inbox.take() == []
+
+
+def test_a_curriculum_must_propose() -> None:
+    with pytest.raises(TypeError, match="Curriculum must define propose"):
+        Curriculum().propose(Student(), 1, [Streams(0)])
+
+
+def test_a_student_that_lacks_something_is_named() -> None:
+    cars, windows = mountain_cars(), tiny_view_task()
+    for task, need, reason in (
+        (cars, "target_direction", "MountainCarTask must define differentiable_performance"),
+        (cars, "optimal_return", "MountainCarTask must define optimal_return"),
+        (cars, "episode_law", "MountainCarTask must define episode_law"),
+        (windows, "exact_performance", "ViewMazeTask tells performance by playing, which is not"),
+    ):
+        poor = TaskStudent(task, task.learner([Streams(0)]))
+        require(poor, ("play", "values", "probe", "performance"), "plr")
+        with pytest.raises(UnfitStudentError, match=f"it needs a student with {need}: {reason}"):
+            require(poor, (need,), "it")
+    for name in SIGNATURES:
+        with pytest.raises(UnfitStudentError, match=rf"{name}: it has no {name}\("):
+            getattr(Student(), name)(
+                *[None] * (SIGNATURES[name].count(",") + 1 - (name == "snapshot"))
+            )
+    with pytest.raises(ValueError, match="sing: a student can have values, play"):
+        Student(sing=print)
+
+
+def test_values_are_those_of_the_first_step() -> None:
+    student = TaskStudent(TASK, solvers([0, 1]))
+    levels = torch.stack([SPACE.sample(3, Streams(k).generator()) for k in range(2)])
+    rollout = student.play(levels, [Streams(k).generator() for k in range(2)])
+    torch.testing.assert_close(student.values(levels), rollout["state_value"][:, :, 0, 0])
