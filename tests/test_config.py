@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import build, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
+from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config, saved_config
 from proposer_rl.cli.errors import BAD_INPUT, UNFORESEEN, exit_code, lacks_memory, one_line
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
@@ -279,11 +279,16 @@ WRONG_COMMANDS = [
         "curriculum.until=3: input should be a valid array",
     ),
     (
-        ["+method=perf_gain", "checkpoint=lives/0"],
-        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does, "
+        ["+method=target", "checkpoint=other"],
+        "checkpoint=other: method=target takes none; those with a Proposer do, "
         "and a run goes on with hydra.run.dir=FOLDER",
     ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
+    (
+        ["+method=plr", "+curriculum.x=1"],
+        "curriculum.x: unknown; there are: score, source, rollouts, prioritization",
+    ),
+    (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
     (
         ["+method=perf_gain", "+ablation=paper_literal", "+scale=quick"],
@@ -296,7 +301,7 @@ WRONG_COMMANDS = [
     (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
     (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
     (
-        ["+method=task_difficulty", *SMOKE, "curriculum._target_=builtins.len"],
+        ["+method=target", *SMOKE, "curriculum._target_=builtins.len"],
         "curriculum: must make a Curriculum, but makes int",
     ),
     (
@@ -342,7 +347,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
-        "curriculum.reward: unknown; there are none",
+        "curriculum.reward: unknown; there are: checkpoint",
     ),
     (
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
@@ -590,6 +595,17 @@ def test_a_stored_configuration_instantiates_nothing(finished: Path, train, caps
     (folder / "config.json").write_text(json.dumps(stored))
     assert train("+method=target", *SMOKE, "hydra.run.dir=run") == 0
     assert not Path("executed").exists()
+
+
+def test_the_settings_of_an_earlier_version_stay_readable(finished: Path) -> None:
+    """It had several lives and no filter, and other names for a curriculum and the task's class."""
+    folder = copy_of(finished)
+    stored = json.loads((folder / "config.json").read_text())
+    earlier = {**stored, "lifetimes": 1, "hand_made": stored.pop("hand_designed")}
+    del earlier["filter"], earlier["hand_designed"]
+    earlier["task"]["_target_"] = "proposer_rl.mazes.task.MazeTask"
+    (folder / "config.json").write_text(json.dumps(earlier))
+    assert saved_config(folder) == saved_config(finished)
 
 
 def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> None:

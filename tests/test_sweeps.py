@@ -13,7 +13,7 @@ from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
-from proposer_rl.report.sweeps import PLAN, Left, left
+from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
 from tests.commands import call
@@ -154,11 +154,11 @@ def test_a_run_counts_as_finished_if_it_was_given_the_same(
     for name, overrides in others.items():
         finished(tmp_path / name, 1000.0, *overrides)
     # Four are left, of which two are like one that took 1000 seconds with another seed.
-    assert left(tmp_path, planned(tmp_path)) == Left(4, 4, pytest.approx(4000), 1, 2)
+    assert left(tmp_path, planned(tmp_path)) == Left(4, 4, pytest.approx(4000), 1)
     finished(tmp_path / "alone", 10.0, "seed=0", *reversed(own))
     finished(tmp_path / "of the sweep", 20.0, *own, "seed=1", "+sweep=medium")
     mean = (6 * 1000 + 30) / 8
-    assert left(tmp_path, planned(tmp_path)) == Left(2, 4, pytest.approx(2 * mean), 1, 2)
+    assert left(tmp_path, planned(tmp_path)) == Left(2, 4, pytest.approx(2 * mean), 1)
 
 
 def test_what_is_computed_alike_counts_where_it_is_swept(tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_a_sweep_of_seeds_alone_is_that_of_its_method(tmp_path: Path) -> None:
     (tmp_path / PLAN).write_text(plan)
     for seed, method in enumerate(["target", "perf_gain"]):
         finished(tmp_path / method, 9.0, f"+method={method}", "+scale=medium", f"seed={seed}")
-    assert left(tmp_path, planned(tmp_path)) == Left(1, 2, pytest.approx(9.0), 1, 0)
+    assert left(tmp_path, planned(tmp_path)) == Left(1, 2, pytest.approx(9.0), 1)
 
 
 def test_a_failed_run_is_listed_and_tried_again(
