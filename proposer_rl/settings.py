@@ -150,8 +150,8 @@ def _check_names(
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
     for name in values:
         if name not in known and not takes_any:
-            there_are = f"there are: {', '.join(known)}" if known else "there are none"
-            raise ArgumentError(f"{name}: unknown; {there_are}")
+            available = f"there are: {', '.join(known)}" if known else "there are none"
+            raise ArgumentError(f"{name}: unknown; {available}")
     for parameter in named:
         asked = parameter.default is parameter.empty and parameter.name in known
         if missing and asked and parameter.name not in values:

@@ -522,6 +522,13 @@ def test_a_resumed_run_with_other_settings_is_refused(finished: Path, train, cap
     assert line.endswith("differing keys: solver.ppo.gamma, task.maze.max_steps")
 
 
+def test_a_run_of_an_earlier_version_does_not_go_on(finished: Path, train, capsys) -> None:
+    file = copy_of(finished) / "config.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "lifetimes": 1}))
+    line = refused(train, capsys)
+    assert "begun by another version, which had lifetimes" in line
+
+
 def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, capsys) -> None:
     folder = copy_of(finished)
     (folder / "config.json").unlink()

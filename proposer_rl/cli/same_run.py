@@ -41,6 +41,12 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
         folder.write_json(file.name, now)
         return
     before = stored_config(file)
+    gone = sorted(before.keys() - now.keys()) if isinstance(before, dict) else []
+    if gone:
+        raise ConfigError(
+            f"hydra.run.dir={folder.path}: the run there was begun by another version, which had "
+            f"{', '.join(gone)}; it can be read, but not gone on with"
+        )
     differing = _different(before, now)
     if differing:
         key, (old, new) = next(iter(differing.items()))
