@@ -72,6 +72,12 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-signature", shorten)
     app.connect("autodoc-skip-member", skip_foreign)
     app.connect("missing-reference", resolve)
+    app.connect("source-read", unlink)
+
+
+def unlink(app: Sphinx, page: str, content: list[str]) -> None:
+    """Leaves links to Markdown outside of this folder to repository hosts: the site has none."""
+    content[0] = re.sub(r"\[([^\]]+)\]\((?:\.\./){2}[^)]*\.md(?:#[^)]*)?\)", r"\1", content[0])
 
 
 def mathml(translator: Any, node: nodes.math | nodes.math_block) -> None:

@@ -23,7 +23,7 @@ from torchrl.objectives import A2CLoss, ReinforceLoss
 
 from proposer_rl import ComputeContext, PPOSettings, SolverSettings, Streams, performance_gain
 from proposer_rl.curricula import TaskStudent
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 from proposer_rl.settings import LearningSettings, ProposerSettings
 
 UPDATES = 20
@@ -57,7 +57,7 @@ def main(cycles: int = 20) -> None:
         ppo=LearningSettings(epochs=1, gamma=1.0, learning_rate=0.02),
     )
     for loss in (a2c, reinforce):
-        curriculum = proposer(Parts(task, settings, seeds=[0]), performance_gain, loss)
+        curriculum = proposer(Components(task, settings, seeds=[0]), performance_gain, loss)
         for cycle in range(cycles):
             stream = Streams(0, cycle)
             student = TaskStudent(task, task.learner([stream]))

@@ -1,4 +1,4 @@
-"""A reward of your own: the Proposer is paid for levels that are solved about half of the time.
+"""A reward of your own: the Proposer is rewarded for levels that are solved about half of the time.
 
 A reward is a function of one training step of K Solvers that gives each of them a number. This one
 is learnability, p (1 - p) with p the success rate on a level (Rutherford et al. 2024, "No Regrets",
@@ -19,7 +19,7 @@ from small_mazes import proposer_settings, report, small_task, train
 from torch import Tensor
 
 from proposer_rl.meta.rewards import TrainingStep
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 
 
 def learnability(step: TrainingStep) -> Tensor:
@@ -34,9 +34,9 @@ def learnability(step: TrainingStep) -> Tensor:
 
 
 def main(updates: int = 60) -> None:
-    """Train a Solver on the proposals of a Proposer that is paid for learnability."""
+    """Train a Solver on the proposals of a Proposer that is rewarded for learnability."""
     task = small_task()
-    curriculum = proposer(Parts(task, proposer_settings(), seeds=[0]), reward=learnability)
+    curriculum = proposer(Components(task, proposer_settings(), seeds=[0]), reward=learnability)
     report(train(task, curriculum, updates))
 
 

@@ -15,7 +15,7 @@ from proposer_rl import (
     Curriculum,
     Experiment,
     PPOSettings,
-    Schedule,
+    ScheduleSettings,
     SolverSettings,
     Streams,
 )
@@ -71,7 +71,7 @@ def train(
             task,
             learner or task.learner([Streams(0, "solver")]),
             curriculum,
-            schedule=Schedule(updates=updates, cycle_length=CYCLE, evaluate_every=CYCLE),
+            schedule=ScheduleSettings(updates=updates, cycle_length=CYCLE, evaluate_every=CYCLE),
             seeds=[0],
             folder=RunFolder(Path(folder)),
             progress=False,

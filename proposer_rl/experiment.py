@@ -26,7 +26,7 @@ from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import Schedule
+from proposer_rl.settings import ScheduleSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -64,7 +64,7 @@ class Experiment:
         learner: PPO,
         curriculum: Curriculum,
         *,
-        schedule: Schedule,
+        schedule: ScheduleSettings,
         seeds: Sequence[int],
         folder: RunFolder,
         log: Log | None = None,
@@ -373,7 +373,7 @@ class Experiment:
         self._headline = state["headline"]
 
 
-def check_headline(task: Task, schedule: Schedule) -> None:
+def check_headline(task: Task, schedule: ScheduleSettings) -> None:
     """Refuse to sum runs up by what is not measured, or not reached.
 
     Raises:

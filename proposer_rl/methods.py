@@ -1,16 +1,17 @@
 """Methods: how a curriculum is put together from the task's parts. A method's config names one.
 
-Each is a factory of the :class:`Parts` and the config's numbers, which are mostly those of the
-curriculum that it makes.
+Each is a factory of the run's :class:`Components` and the config's numbers, which are mostly those
+of the curriculum that it makes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from tensordict import TensorDict
 
@@ -28,13 +29,13 @@ from proposer_rl.curricula import (
     ReplayRule,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
+    Schedule,
     Scorer,
     SelectionCurriculum,
     SomeBins,
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula import Schedule as StagedCurriculum
 from proposer_rl.curricula.buffer import Prioritization
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
@@ -50,18 +51,31 @@ from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.runs.folder import PROPOSER
-from proposer_rl.settings import FilterSettings, PPOSettings, ProblemSettings, ProposerSettings
+from proposer_rl.settings import (
+    ArgumentError,
+    Count,
+    FilterSettings,
+    NotNegative,
+    Positive,
+    PPOSettings,
+    ProblemSettings,
+    ProposerSettings,
+    checked,
+)
 from proposer_rl.streams import Streams
-from proposer_rl.task import LocatedTarget, Task
+from proposer_rl.task import Distribution, LocatedTarget, Space, Task
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Workers(NamedTuple):
-    """Other processes in which copies are trained.
+    """Other processes in which replicas of the Solver are trained.
 
     Attributes:
         settings: how many there are, and where.
         make_task: makes the task in one of them, given its device; can be pickled.
-        tell: called now and then with the number of updates that all copies have had of an episode.
+        tell: called now and then with the number of updates that all replicas have had of an
+            episode.
     """
 
     settings: WorkerSettings
@@ -69,7 +83,7 @@ class Workers(NamedTuple):
     tell: Callable[[int], None] = lambda done: None
 
 
-class Parts(NamedTuple):
+class Components(NamedTuple):
     """What a method's factory gets.
 
     Attributes:
@@ -77,8 +91,8 @@ class Parts(NamedTuple):
         proposer: the Proposer's settings.
         seeds: of the Solvers that are trained side by side; the first is that of a Proposer's
             weights.
-        on_update: called with the number of an episode's updates after every one of the copies that
-            are trained in this process.
+        on_update: called with the number of an episode's updates after every one of the replicas
+            that are trained in this process.
         workers: where else they are trained; None for this process.
     """
 
@@ -89,58 +103,87 @@ class Parts(NamedTuple):
     workers: Workers | None = None
 
 
-def filtered(curriculum: Curriculum, chosen: FilterSettings | None) -> Curriculum:
+def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculum:
     """A curriculum that draws more levels than are trained on, and keeps some by their scores.
 
     Args:
         curriculum: any.
-        chosen: how; None to leave the curriculum as it is.
+        config: how; None to leave the curriculum as it is.
 
     Raises:
         ValueError: if a value is wrong, naming its key.
     """
-    if chosen is None:
+    if config is None:
         return curriculum
     try:
-        scorer = Scorer(chosen.score, chosen.source, chosen.rollouts)
-        return Filtered(curriculum, scorer, times=chosen.times, temperature=chosen.temperature)
+        scorer = Scorer(config.score, config.source, config.rollouts)
+        return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
     except ValueError as error:
         raise ValueError(f"filter.{error}") from error
 
 
-def target(parts: Parts) -> Curriculum:
-    """Train on the target distribution itself (the paper's baseline)."""
-    return SamplingCurriculum(parts.task.target)
+def _takes_numbers_of(make: Callable[..., Curriculum], *given: str) -> Callable[[F], F]:
+    """Put a curriculum's own numbers in the place of ``**numbers`` in its factory's signature.
+
+    Args:
+        make: the curriculum's class.
+        given: those that the factory gives itself.
+    """
+
+    def decorate(factory: F) -> F:
+        own = [p for p in inspect.signature(factory).parameters.values() if p.name != "numbers"]
+        gives = {*given, *(p.name for p in own)}
+        parameters = inspect.signature(make).parameters.values()
+        numbers = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in gives]
+        hints = get_type_hints(make.__init__, include_extras=True)
+        factory.__signature__ = inspect.Signature([*own, *numbers])  # type: ignore[attr-defined]
+        factory.__annotations__ |= {number.name: hints[number.name] for number in numbers}
+        return factory
+
+    return decorate
 
 
-def domain_randomization(parts: Parts) -> Curriculum:
-    """Train on levels drawn uniformly from the Proposer's space."""
-    return SamplingCurriculum(parts.task.space)
+def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curriculum]:
+    """The factory of a curriculum of which the task gives the first arguments, by these names."""
+
+    @_takes_numbers_of(make)
+    def factory(run: Components, /, **numbers: Any) -> Curriculum:
+        return make(*(getattr(run.task, part) for part in parts), **numbers)
+
+    factory.__doc__ = make.__doc__
+    return factory
 
 
-def schedule(parts: Parts, distributions: Sequence[str], until: Sequence[int]) -> Curriculum:
+target = _of_task(SamplingCurriculum, "target")
+"""Train on the target distribution itself (the paper's baseline)."""
+domain_randomization = _of_task(SamplingCurriculum, "space")
+"""Train on levels drawn uniformly from the Proposer's space."""
+alp_gmm = _of_task(MixtureCurriculum, "space")
+learning_progress = _of_task(LearningProgressCurriculum, "space")
+first_order_gain = _of_task(FirstOrderCurriculum, "space", "target")
+first_order_sampled = _of_task(SampledFirstOrderCurriculum, "space", "target")
+
+
+@checked
+def schedule(components: Components, distributions: list[str], until: list[int]) -> Curriculum:
     """Train on named distributions one after another: a hand-designed curriculum.
 
     Args:
-        parts: the task.
+        components: the task.
         distributions: names, in order.
         until: updates after which each but the last ends.
 
     Raises:
-        ValueError: for an unknown name, or as :class:`~proposer_rl.curricula.Schedule`.
+        ArgumentError: for an unknown name, or as :class:`~proposer_rl.curricula.Schedule`.
     """
-    known = parts.task.distributions
-    if isinstance(distributions, str) or any(name not in known for name in distributions):
-        raise ValueError(
-            f"distributions must be a list of some of {sorted(known)}, got {distributions}"
-        )
-    if not isinstance(until, Sequence) or any(type(end) is not int for end in until):
-        raise ValueError(f"until must be a list of whole numbers, got {until!r}")
-    return StagedCurriculum([SamplingCurriculum(known[name]) for name in distributions], until)
+    known = components.task.distributions
+    if any(name not in known for name in distributions):
+        raise ArgumentError(f"distributions={distributions}: must be some of {sorted(known)}")
+    return Schedule([SamplingCurriculum(known[name]) for name in distributions], until)
 
 
 def proposer(
-    parts: Parts,
+    components: Components,
     reward: rewards.Reward = rewards.log_success_gain,
     loss: MakeLoss | None = None,
     checkpoint: str | None = None,
@@ -148,7 +191,7 @@ def proposer(
     """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
 
     Args:
-        parts: the task, and the Proposer's settings.
+        components: the task, and the Proposer's settings.
         reward: of an update.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.PPO`.
         checkpoint: of a Proposer that has learnt, which goes on learning; see
@@ -161,108 +204,90 @@ def proposer(
     """
     if not callable(reward):
         raise TypeError(f"reward must be a function of a training step, got {reward!r}")
-    _one_solver(parts)
-    task, chosen = parts.task, parts.proposer
-    if chosen.advantage == "leave_one_out" and chosen.rollouts < 2:
+    _one_solver(components)
+    task, config = components.task, components.proposer
+    if config.advantage == "leave_one_out" and config.rollouts < 2:
         raise ValueError(
-            f"proposer.rollouts={chosen.rollouts} must be at least 2 where "
+            f"proposer.rollouts={config.rollouts} must be at least 2 where "
             "proposer.advantage=leave_one_out"
         )
-    streams = Streams(parts.seeds[0], "proposer")
-    env = meta_env(task, chosen, streams, reward, range(chosen.rollouts), parts.on_update)
-    unknown = [name for name in chosen.observes if name not in env.observation_spec.keys()]
+    streams = Streams(components.seeds[0], "proposer")
+    env = meta_env(task, config, streams, reward, range(config.rollouts), components.on_update)
+    unknown = [name for name in config.observes if name not in env.observation_spec.keys()]
     if unknown:
         raise ValueError(
-            f"proposer.observes={chosen.observes}: this task does not tell {', '.join(unknown)}; "
+            f"proposer.observes={config.observes}: this task does not tell {', '.join(unknown)}; "
             "return and progress are available"
         )
     with streams.as_default("weights"):
-        agent = proposer_agent(task, chosen)
+        agent = proposer_agent(task, config)
     if checkpoint:
-        _load(agent, checkpoint, chosen.observes)
-    numbers = PPOSettings(horizon=env.steps, **asdict(chosen.ppo))
-    advantage = LeaveOneOutBaseline(numbers.gamma) if chosen.advantage == "leave_one_out" else None
+        _load(agent, checkpoint, config.observes)
+    numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
+    advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
     copies = None
-    if parts.workers is not None:
-        settings, make_task, tell = parts.workers
-        make_env = partial(worker_env, make_task, chosen, streams, reward)
+    if components.workers is not None:
+        settings, make_task, tell = components.workers
+        make_env = partial(worker_env, make_task, config, streams, reward)
         copies = CopiesInWorkers(learner, make_env, settings, tell)
-    return ProposerTrainer(learner, copies, chosen.advance).curriculum(chosen.own_action)
+    return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
 
 
-def task_difficulty(parts: Parts, checkpoint: str | None = None) -> ProposerCurriculum:
+def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:
     """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
 
     The paper's ablation; no other reward can be put in its place.
     """
-    return proposer(parts, rewards.task_difficulty, checkpoint=checkpoint)
+    return proposer(components, rewards.task_difficulty, checkpoint=checkpoint)
 
 
-def frozen_proposer(parts: Parts, checkpoint: str | None) -> ProposerCurriculum:
+def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerCurriculum:
     """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
 
     Args:
-        parts: the task, and the settings of the Proposer's network and actions, which must be those
-            of that run.
+        components: the task, and the settings of the Proposer's network and actions, which must be
+            those of that run.
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
 
     Raises:
         ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
         CheckpointError: if it cannot be read.
     """
-    _one_solver(parts)
+    _one_solver(components)
     if not checkpoint:
         raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
-    task, chosen = parts.task, parts.proposer
-    agent = proposer_agent(task, chosen)
-    _load(agent, checkpoint, chosen.observes)
+    task, config = components.task, components.proposer
+    agent = proposer_agent(task, config)
+    _load(agent, checkpoint, config.observes)
     return ProposerCurriculum(
         agent,
-        solver_view(task, chosen),
-        proposer_actions(task, chosen),
-        meta_episode_length=chosen.meta_episode_length,
-        action_repeat=chosen.action_repeat,
-        own_action=chosen.own_action,
+        solver_view(task, config),
+        proposer_actions(task, config),
+        meta_episode_length=config.meta_episode_length,
+        action_repeat=config.action_repeat,
+        own_action=config.own_action,
     )
 
 
-def alp_gmm(parts: Parts, **numbers: Any) -> MixtureCurriculum:
-    """Train on draws from Gaussians; see :class:`MixtureCurriculum` for the numbers."""
-    return MixtureCurriculum(parts.task.space, **numbers)
-
-
-def learning_progress(parts: Parts, **numbers: Any) -> LearningProgressCurriculum:
-    """Train where success changes; see :class:`LearningProgressCurriculum` for the numbers."""
-    return LearningProgressCurriculum(parts.task.space, **numbers)
-
-
-def currot(parts: Parts, **numbers: Any) -> TransportCurriculum:
+@_takes_numbers_of(TransportCurriculum)
+def currot(components: Components, **numbers: Any) -> TransportCurriculum:
     """Train on the way to the target; see :class:`TransportCurriculum` for the numbers.
 
     Raises:
         TypeError: if the task does not say where its target lies.
     """
-    if not isinstance(parts.task, LocatedTarget):
+    if not isinstance(components.task, LocatedTarget):
         raise TypeError(
-            f"currot moves towards the target: {type(parts.task).__name__} must define "
+            f"currot moves towards the target: {type(components.task).__name__} must define "
             "target_shares, the target as shares of the space's bins"
         )
-    return TransportCurriculum(parts.task.space, parts.task.target_shares, **numbers)
+    return TransportCurriculum(components.task.space, components.task.target_shares, **numbers)
 
 
-def first_order_gain(parts: Parts, **numbers: Any) -> FirstOrderCurriculum:
-    """Train on aligned bins; see :class:`FirstOrderCurriculum` for the numbers."""
-    return FirstOrderCurriculum(parts.task.space, parts.task.target, **numbers)
-
-
-def first_order_sampled(parts: Parts, **numbers: Any) -> SampledFirstOrderCurriculum:
-    """The same from episodes; see :class:`SampledFirstOrderCurriculum` for the numbers."""
-    return SampledFirstOrderCurriculum(parts.task.space, parts.task.target, **numbers)
-
-
+@_takes_numbers_of(ReplayCurriculum, "edit")
 def replay(
-    parts: Parts,
+    components: Components,
     score: str,
     source: Source,
     rollouts: int,
@@ -270,7 +295,7 @@ def replay(
     temperature: float,
     best: int | None,
     staleness: float,
-    new_levels: Mapping[str, Sequence[float]] | None,
+    new_levels: dict[str, list[float]] | None,
     **numbers: Any,
 ) -> ReplayCurriculum:
     """Train on levels that are kept by their scores.
@@ -283,113 +308,97 @@ def replay(
     rule = ReplayRule(
         prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
     )
-    space, edit = parts.task.space, getattr(parts.task, "edit", None)
+    space, edit = components.task.space, getattr(components.task, "edit", None)
     try:
         new = space if new_levels is None else SomeBins(space, new_levels)
-    except ValueError as error:
-        raise ValueError(f"new_levels: {error}") from error
+    except ArgumentError as error:
+        raise ArgumentError(f"new_levels.{str(error).removeprefix('values.')}") from error
     scorer = Scorer(score, source, rollouts)
     curriculum = ReplayCurriculum(new, scorer, rule, edit=edit, **numbers)
-    curriculum.check(len(parts.seeds))
+    curriculum.check(len(components.seeds))
     return curriculum
 
 
+@_takes_numbers_of(SelectionCurriculum)
 def learnability(
-    parts: Parts, score: str, source: Source, rollouts: int, **numbers: Any
+    components: Components, score: str, source: Source, rollouts: int, **numbers: Any
 ) -> SelectionCurriculum:
     """Train on levels that stood out among many, and on new ones.
 
     The scorer as for :func:`replay`; further numbers: see :class:`SelectionCurriculum`.
     """
-    return SelectionCurriculum(parts.task.space, Scorer(score, source, rollouts), **numbers)
+    return SelectionCurriculum(components.task.space, Scorer(score, source, rollouts), **numbers)
 
 
+@_takes_numbers_of(FirstOrderProposer, "probe_levels")
 def first_order_proposer(
-    parts: Parts,
-    target_levels: int = 256,
-    step: float = 1.0,
-    measure: str = "log_success",
+    components: Components,
+    epochs: Count,
+    learning_rate: Positive,
+    entropy_coeff: NotNegative,
+    checkpoint: str | None = None,
     **numbers: Any,
 ) -> FirstOrderProposer:
     """Train on the draws of a policy that is rewarded for each problem, to first order.
 
     Args:
-        parts: the task, and the Proposer's settings: of them the probes, the network, and of PPO
-            how far a step goes (``adam_eps``, ``clip_epsilon``, ``max_grad_norm``).
-        target_levels: see :class:`FirstOrderProposer`.
-        step: the same.
-        measure: the same.
-        numbers: see :func:`_problem_policy`.
-    """
-    agent, settings = _problem_policy(parts, **numbers)
-    return FirstOrderProposer(
-        parts.task.space,
-        parts.task.target,
-        agent,
-        settings,
-        probe_levels=parts.proposer.probe_levels,
-        target_levels=target_levels,
-        step=step,
-        measure=measure,
-    )
-
-
-def paired(parts: Parts, **numbers: Any) -> PairedProposer:
-    """Train on the draws of a policy that is rewarded for the regret against a second Solver.
-
-    Args:
-        parts: the task, and the Proposer's settings as for :func:`first_order_proposer`.
-        numbers: see :func:`_problem_policy`.
-    """
-    agent, settings = _problem_policy(parts, **numbers)
-    task = parts.task
-    return PairedProposer(
-        task.space,
-        task.target,
-        agent,
-        settings,
-        probe_levels=parts.proposer.probe_levels,
-        antagonist=TaskStudent(task, task.learner([Streams(parts.seeds[0], "antagonist")])),
-    )
-
-
-def _problem_policy(
-    parts: Parts,
-    epochs: int,
-    learning_rate: float,
-    entropy_coeff: float,
-    checkpoint: str | None = None,
-) -> tuple[ActorCritic, PPOSettings]:
-    """A policy that draws each problem by itself, and how it learns.
-
-    Args:
-        parts: the task, and the Proposer's settings.
+        components: the task, and the Proposer's settings: of them the probes, the network, and of
+            PPO how far a step goes (``adam_eps``, ``clip_epsilon``, ``max_grad_norm``).
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
         entropy_coeff: of the policy.
         checkpoint: of such a policy that has learnt; None to begin anew.
+        numbers: see :class:`FirstOrderProposer`.
     """
-    _one_solver(parts)
-    task, chosen = parts.task, parts.proposer
-    action = ProblemSettings()
-    if isinstance(chosen.action, ProblemSettings):
-        action = chosen.action
+    policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
+    return FirstOrderProposer(*policy, probe_levels=components.proposer.probe_levels, **numbers)
+
+
+def paired(
+    components: Components,
+    epochs: Count,
+    learning_rate: Positive,
+    entropy_coeff: NotNegative,
+    checkpoint: str | None = None,
+) -> PairedProposer:
+    """Train on the draws of a policy that is rewarded for the regret against a second Solver.
+
+    The arguments are those of :func:`first_order_proposer`.
+    """
+    policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
+    task, stream = components.task, Streams(components.seeds[0], "antagonist")
+    antagonist = TaskStudent(task, task.learner([stream]))
+    probes = components.proposer.probe_levels
+    return PairedProposer(*policy, probe_levels=probes, antagonist=antagonist)
+
+
+def _problem_policy(
+    components: Components,
+    epochs: int,
+    learning_rate: float,
+    entropy_coeff: float,
+    checkpoint: str | None,
+) -> tuple[Space, Distribution, ActorCritic, PPOSettings]:
+    """Space and target, a policy that draws each problem by itself, and how it learns."""
+    _one_solver(components)
+    task, config = components.task, components.proposer
+    action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()
     if action.ratio == "joint":
         raise ValueError("proposer.action.ratio=joint: here each draw is rewarded by itself")
-    with Streams(parts.seeds[0], "proposer").as_default("weights"):
-        agent = proposer_agent(task, replace(chosen, observes=[], action=action))
+    with Streams(components.seeds[0], "proposer").as_default("weights"):
+        agent = proposer_agent(task, replace(config, observes=[], action=action))
     if checkpoint:
         _load(agent, checkpoint, [])
     numbers = replace(
-        chosen.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
+        config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
-    return agent, PPOSettings(horizon=1, **asdict(numbers))
+    return task.space, task.target, agent, PPOSettings(horizon=1, **asdict(numbers))
 
 
-def _one_solver(parts: Parts) -> None:
-    if len(parts.seeds) > 1:
+def _one_solver(components: Components) -> None:
+    if len(components.seeds) > 1:
         raise ValueError(
-            f"seeds={list(parts.seeds)}: a Proposer proposes to one Solver at a time; "
+            f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; "
             "give one run for each, as in -m seed=0,1,2"
         )
 

@@ -36,8 +36,12 @@ Count = Annotated[int, Interval(ge=1, le=1_000_000)]
 """Of what is counted, at least one: more than a million would not fit, or never come to pass."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, or a probability."""
+Decay = Annotated[float, Interval(ge=0, lt=1)]
+"""The share of the old in a running average."""
 Positive = Annotated[float, Gt(0)]
 """A number above zero."""
+NotNegative = Annotated[float, Ge(0)]
+"""Zero, or a number above it."""
 
 
 class ArgumentError(ValueError):
@@ -81,6 +85,22 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         return function(*bound.args, **bound.kwargs)
 
     return call
+
+
+def signed(made: type[T]) -> type[T]:
+    """Show a class's constructor as its signature, which TorchRL's metaclass of environments hides.
+
+    Example:
+        >>> from torchrl.envs import EnvBase
+        >>> @signed
+        ... class Env(EnvBase):
+        ...     def __init__(self, levels, *, max_steps=25): ...
+        >>> inspect.signature(Env)
+        <Signature (levels, *, max_steps=25)>
+    """
+    _, *parameters = inspect.signature(made.__init__).parameters.values()
+    made.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return made
 
 
 def arguments(
@@ -338,7 +358,7 @@ class ProposerSettings:
 
 
 @settings
-class Schedule:
+class ScheduleSettings:
     """How long a run is, and what happens how often; all in Solver updates.
 
     Attributes:
@@ -365,7 +385,7 @@ class Schedule:
 
 @settings
 class HandDesignedSettings:
-    """A curriculum by hand.
+    """A hand-designed curriculum.
 
     Attributes:
         distributions: of the task, in order.
@@ -434,7 +454,7 @@ class ComputeSettings:
         device: ``auto``: cuda where there is one, else cpu.
         graphs: replay updates and evaluations as CUDA graphs on a GPU, where it is untried.
         threads: CPU threads of one operation; None leaves torch's choice.
-        cores: copies of the Solver computed at once on a CPU; None for all cores.
+        cores: replicas of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
         workers: processes for them; None for one for each GPU, or core, at most one for each copy.
         worker_devices: of the workers, in turn; None for all GPUs, or the CPU.

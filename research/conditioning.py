@@ -20,7 +20,7 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.stored import StoredRun, stored_run
 from proposer_rl.curricula import ProposerCurriculum
-from proposer_rl.methods import Parts, frozen_proposer
+from proposer_rl.methods import Components, frozen_proposer
 from proposer_rl.models import draw, uniform_noise
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, Task
@@ -61,7 +61,7 @@ def shown(proposer: Path, solvers: Path, seed: int = 0) -> Rows:
     """
     config = saved_config(proposer)
     task = make_task(config)
-    frozen = frozen_proposer(Parts(task, config.proposer, [seed]), str(proposer))
+    frozen = frozen_proposer(Components(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
     stages = _stages(task, frozen, stored_run(solvers))
     rows = []

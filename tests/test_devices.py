@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch.utils import backend_registration
 
 from proposer_rl.curricula import Batch, Curriculum, SamplingCurriculum, Student
-from proposer_rl.methods import Parts
+from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
 from tests.tasks.gymnasium.toys import TINY
@@ -92,7 +92,7 @@ class Careless(SamplingCurriculum):
         torch.zeros(rewards.shape).add_(rewards)
 
 
-def careless(parts: Parts, **_: Any) -> Curriculum:
+def careless(parts: Components, **_: Any) -> Curriculum:
     return Careless(parts.task.target)
 
 

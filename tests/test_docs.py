@@ -7,8 +7,9 @@ import importlib
 import json
 import re
 import shlex
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,12 +17,17 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from proposer_rl.cli.config import CONFIG_FOLDER
-from tests.test_readme import DOCS, README, blocks
+from proposer_rl.cli.eval import main as evaluate
+from proposer_rl.cli.places import CONFIG_FOLDER
+from tests.commands import call, trained_run
+from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
 
-ROOT = DOCS.parent
-PAGES = {file.stem: file.read_text(encoding="utf-8") for file in sorted(DOCS.glob("*.md"))}
-CODE = [page for page, text in PAGES.items() if blocks("python", text)]
+PAGES = {
+    str(file.relative_to(DOCS).with_suffix("")): file.read_text(encoding="utf-8")
+    for file in sorted(DOCS.rglob("*.md"))
+    if file.parts[len(DOCS.parts)] != "api"
+}
+CONFIGURATION, LEVELS = PAGES["reference/configuration"], PAGES["how_to/levels"]
 
 
 def programs() -> dict[str, list[str]]:
@@ -34,26 +40,29 @@ def programs() -> dict[str, list[str]]:
     return found
 
 
-def commands() -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Page, program and arguments of every command in a block, executed by a test or not."""
-    for page, text in {"README": README, **PAGES}.items():
-        for language, block in re.findall(
-            r"^```(\S*).*?\n(.*?)^```", text, re.DOTALL | re.MULTILINE
-        ):
-            for line in block.splitlines() if language in ("", "bash") else ():
-                command = line.startswith(("bin/", "proposer-"))
-                words = shlex.split(line, comments=True) if command else []
-                called = re.fullmatch(r"(?:bin/|proposer-)(\w+)", words[0]) if words else None
-                if called:
-                    yield page, called[1], tuple(words[1:])
+def shown() -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Program and arguments of every command in a block or in a line, executed here or not."""
+    for text in (README, *PAGES.values()):
+        lines = [line.strip() for block in blocks("(?:bash)?", text) for line in block.splitlines()]
+        for line in (*lines, *re.findall("`(bin/[^`]+)`", text)):
+            command = re.match(r"(?:bin/|proposer-)(\w+) ?", line)
+            words = shlex.split(line[command.end() :], comments=True) if command else []
+            if command and words and not re.search("NAME|<TAB>|-sc ", line):
+                yield command[1], tuple(words)
 
 
-TRAIN = sorted({call for _, program, call in commands() if program == "train"})
-OTHERS = sorted({(program, call) for _, program, call in commands() if program != "train"})
+def settings(words: tuple[str, ...]) -> tuple[str, ...]:
+    """Of the arguments of a run those that differ in more than seeds, folders and flags."""
+    return tuple(w for w in words if "=" in w and not re.match(r"'?(seeds?|hydra\.\w+\.dir)=", w))
+
+
+TRAIN = sorted({words for program, words in shown() if program == "train"})
+SETTINGS = {(settings(words), "--config-dir" in words) for words in TRAIN}
+OTHERS = sorted({(program, words) for program, words in shown() if program != "train"})
 
 
 @pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize("page", CODE)
+@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if blocks("python", text)])
 def test_the_code_runs(page: str) -> None:
     """The blocks of a page one after another, as a reader would type them."""
     names: dict[str, object] = {}
@@ -61,23 +70,26 @@ def test_the_code_runs(page: str) -> None:
         exec(block, names)
 
 
-@pytest.mark.parametrize("arguments", TRAIN, ids=" ".join)
-def test_the_settings_exist(arguments: tuple[str, ...], tmp_path: Path) -> None:
+def test_the_settings_exist(tmp_path: Path) -> None:
     """Every key and group of every bin/train in the pages, also of those that no test executes."""
-    write_files(tmp_path)
-    words = [word for word in arguments if "=" in word]
-    overrides = [
-        override.input_line
-        if not override.is_sweep_override()
-        else f"{override.input_line.partition('=')[0]}={next(override.sweep_string_iterator())}"
-        for override in OverridesParser.create().parse_overrides(words)
-        if "glob(" not in override.input_line
-    ]
-    if "--config-dir" in arguments:
-        overrides.append(f"hydra.searchpath=[file://{tmp_path / 'my_conf'}]")
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        compose("train", overrides, return_hydra_config=True)
+    for text in (CONFIGURATION, PAGES["how_to/gymnasium_environment"]):
+        write_files(text, tmp_path)
+    assert len(SETTINGS) > 40
+    for words, own in sorted(SETTINGS):
+        words = [
+            word.replace("checkpoint=", "+checkpoint=") for word in words if "/job" not in word
+        ]
+        overrides = [
+            override.input_line
+            if not override.is_sweep_override()
+            else f"{override.input_line.partition('=')[0]}={next(override.sweep_string_iterator())}"
+            for override in OverridesParser.create().parse_overrides(list(words))
+        ]
+        if own:
+            overrides.append(f"hydra.searchpath=[file://{tmp_path / 'my_conf'}]")
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+            compose("train", overrides, return_hydra_config=True)
 
 
 class Parsed(Exception):
@@ -107,62 +119,76 @@ def test_the_arguments_are_understood(
         main()
 
 
-def write_files(folder: Path) -> list[Path]:
-    """Writes the files that two pages show, each after a line that ends in its path."""
-    written = []
-    for page in ("configuration", "your_gymnasium_environment"):
-        shown = re.findall(r"`(my_conf/\S+)`:\n\n```yaml\n(.*?)```", PAGES[page], re.DOTALL)
-        assert len(shown) == len(blocks("yaml", PAGES[page]))
-        for path, block in shown:
-            file = folder / path
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(block, encoding="utf-8")
-            written.append(file)
-    return written
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize("page", ["how_to/resume", "how_to/reuse_a_proposer"])
+def test_the_commands_run(page: str) -> None:
+    """The pages whose commands build on one another; other pages' settings are composed above."""
+    run(
+        PAGES[page].replace(
+            "+scale=medium checkpoint=results/medium/proposer.pt", "checkpoint=learned"
+        )
+    )
+    assert list(Path().rglob("summary.json"))
 
 
 @pytest.mark.usefixtures("own_folder")
-def test_the_config_folder_of_ones_own_works(train) -> None:
-    assert len(write_files(Path())) == 4
-    own = [call for call in TRAIN if "--config-dir" in call and "task=hill" not in call]
-    assert own
-    for call in own:
-        words = ["+scale=smoke" if word == "+scale=quick" else word for word in call]
-        assert train(*words, "compute.progress=false") == 0
-    folders = sorted(path.parent.name for path in Path().glob("outputs/*/*/summary.json"))
-    assert len(folders) == sum("-m" not in call for call in own)
+def test_the_config_folder_of_ones_own_works(train: Callable[..., int]) -> None:
+    assert len(write_files(CONFIGURATION, Path())) == len(blocks("yaml", CONFIGURATION)) == 3
+    own = [words for _, *words in commands(CONFIGURATION) if "--config-dir" in words]
+    for words in own:
+        assert train(*smallest(words)) == 0
+    assert len(list(Path().glob("outputs/*/*/summary.json"))) == sum("-m" not in w for w in own)
     assert len(list(Path().glob("multirun/*/*/summary.json"))) == 2
     # What a reader of the report is told of it, and what the command needs beside its settings.
     facts = json.loads(next(Path().glob("outputs/*/*/run.json")).read_text(encoding="utf-8"))
-    given = own[0][own[0].index("--config-dir") + 1]
-    assert facts["arguments"]["config_dir"] == given and facts["about"]["method"]
+    assert facts["arguments"]["config_dir"] == "my_conf" and facts["about"]["method"]
 
 
 @pytest.mark.usefixtures("own_folder")
-def test_settings_can_be_looked_at(train, capsys: pytest.CaptureFixture[str]) -> None:
-    looks = [call for call in TRAIN if {"--cfg", "--info"} & set(call)]
+def test_settings_can_be_looked_at(
+    train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    looks = [words for _, *words in commands(CONFIGURATION) if {"--cfg", "--info"} & set(words)]
     assert looks
-    for call in looks:
-        assert train(*call) == 0
+    for words in looks:
+        assert train(*words) == 0
         said = capsys.readouterr()
         assert said.err == ""
-        if call[-1] == "searchpath":
+        if words[-1] == "searchpath":
             assert str(CONFIG_FOLDER) in said.out
-        if call[-1] == "job":
+        if words[-1] == "job":
             assert "method: perf_gain" in said.out and "scale: quick" in said.out
     assert not list(Path().rglob("*"))
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_the_commands_about_levels_run() -> None:
+    """On a Solver of a few updates, and with the file of levels that the page shows."""
+    (drawn,) = blocks("text", LEVELS)
+    Path("my_levels.txt").write_text(drawn)
+    trained_run(Path("my_run"), "+method=target", "+scale=smoke", "compute.progress=false")
+    shutil.copytree("my_run", "sweeps/quick/run")
+    for program, *words in commands(LEVELS):
+        assert program == "bin/eval" and call(evaluate, *words) == 0, words
+    assert all(Path(file).is_file() for file in ("scores.csv", "table.csv", "paths.png"))
 
 
 def test_pages_link_to_what_is_there() -> None:
     """Sphinx checks links within the site; this, those to files outside of it."""
     for page, text in PAGES.items():
-        for target in re.findall(r"\]\((\.\./[^)#]+)\)", text):
-            assert (DOCS / target).is_file(), f"{page}.md: {target}"
+        for target in re.findall(r"\]\(((?:\.\./)+[^)#]+)\)", text):
+            assert (DOCS / page).parent.joinpath(target).is_file(), f"{page}.md: {target}"
 
 
 def test_every_example_is_on_the_site() -> None:
-    shown = set(re.findall(r"^```\{literalinclude\} \.\./(\S+)$", PAGES["examples"], re.MULTILINE))
+    text = PAGES["how_to/examples"]
+    shown = set(re.findall(r"^```\{literalinclude\} \.\./\.\./(\S+)$", text, re.MULTILINE))
     files = [*(ROOT / "examples").rglob("*.py"), *(ROOT / "examples").rglob("*.yaml")]
     assert shown == {str(path.relative_to(ROOT)) for path in files}
-    for name in re.findall(r"\]\(examples\.md#(\w+)\)", PAGES["own_parts"]):
-        assert f"## `{name.removesuffix('py')}.py`" in PAGES["examples"]
+
+
+def test_every_method_scale_task_and_sweep_is_in_the_reference() -> None:
+    names = set(re.findall(r"`(?:\+?\w+=)?(\w+)`", PAGES["reference/methods"]))
+    for group in ("method", "scale", "task", "sweep", "as", "filter", "score"):
+        files = {file.stem for file in (CONFIG_FOLDER / group).glob("*.yaml")}
+        assert {name for name in files - names if not name.endswith("_accel")} == set(), group

@@ -31,7 +31,7 @@ def test_every_choice_has_its_line(file: Path) -> None:
 
 def test_every_group_that_a_command_adds_is_listed() -> None:
     given = {folder.name for folder in CONFIG_FOLDER.iterdir() if folder.is_dir()}
-    always = {"logger", "compute", "proposer"}  # docs/configuration.md has these
+    always = {"logger", "compute", "proposer"}  # docs/reference/configuration.md has these
     assert given - always == {group.strip("+=") for group in GROUPS}
     assert {"target", "perf_gain", "plr"} <= {file.stem for file in FILES}
 

@@ -13,7 +13,7 @@ from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.meta.rewards import performance_gain
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import ProposerSettings
@@ -43,12 +43,12 @@ def test_a_proposer_observes_what_the_task_tells() -> None:
     chosen = ProposerSettings(rollouts=2, validation_levels=4, probe_levels=2)
     said = r"proposer\.observes=\['log_success', 'progress'\]: this task does not tell log_success"
     with pytest.raises(ValueError, match=said):
-        proposer(Parts(task, chosen, [0]), performance_gain)
+        proposer(Components(task, chosen, [0]), performance_gain)
 
 
 def test_every_method_says_what_it_needs() -> None:
     assert set(NEEDS) == {file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml")}
-    known = {TARGET, EXACT, GRADIENTS, "levels sorted by hand", "a Proposer that has learnt"}
+    known = {TARGET, EXACT, GRADIENTS, "a schedule", "a Proposer that has learnt"}
     assert {need for found in NEEDS.values() for need in found} == known
     assert "a Proposer that has learnt" in NEEDS[REUSED]
 

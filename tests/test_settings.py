@@ -18,7 +18,7 @@ from proposer_rl.settings import (
     MixtureSettings,
     ProblemSettings,
     ProposerSettings,
-    Schedule,
+    ScheduleSettings,
     SolverSettings,
 )
 from proposer_rl.streams import Streams
@@ -32,7 +32,7 @@ def test_the_papers_values_are_the_defaults_of_the_code() -> None:
     config = composed("+method=perf_gain")
     assert config.solver == SolverSettings()
     assert config.proposer == ProposerSettings()
-    assert config.schedule == Schedule()
+    assert config.schedule == ScheduleSettings()
     assert config.compute == ComputeSettings()
     assert config.task["maze"] == asdict(MazeSettings())
     problems = composed("+method=perf_gain", "proposer/action=problems")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
-from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
+from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
@@ -19,7 +19,6 @@ from proposer_rl.runs.lock import locked
 from tests.commands import call
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
-ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
 
 
 @pytest.fixture
@@ -145,7 +144,7 @@ def test_a_run_counts_as_finished_if_it_was_given_the_same(
     (tmp_path / PLAN).write_text(PLANNED.format(scale=scale, given=", ".join(given)))
     own = ["+method=perf_gain", "+scale=medium", *more]
     others = {
-        "+ablation=probes_0": [*own, "seed=0", "+ablation=probes_0"],
+        "+ablation=other": [*own, "seed=0", "+ablation=other"],
         "+filter=learnability": [*own, "seed=0", "+filter=learnability"],
         "another number": [*own, "seed=0", "pool.capacity=7"],
         "another method": ["+method=sfl", *own[1:], "seed=0"],
@@ -274,16 +273,9 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
 
     monkeypatch.setattr("proposer_rl.cli.run.parts", note)
     assert train("+sweep=medium_frozen", "seed=107") == 1
-    assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
+    assert train("+sweep=medium", "+method=perf_gain", "+ablation=paper_literal", "seed=107") == 1
     frozen = "sweeps/medium/frozen_proposer-none-seed_107"
     assert made == [
         (frozen, "results/medium/proposer.pt", 107, "none"),
         ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
     ]
-
-
-def test_a_family_of_ablations_is_one_command(composed) -> None:
-    """Beside the experiment's own runs, at the same scale."""
-    made = composed("+sweep=ablations", "+scale=quick", "+ablation=glob(probes_*)", "seed=1")
-    family = [name for name in ABLATIONS if name.startswith("probes_")]
-    assert family and made == {("quick", "perf_gain", name, 1) for name in family}

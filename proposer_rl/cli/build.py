@@ -19,7 +19,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Parts, Workers, filtered
+from proposer_rl.methods import Components, Workers, filtered
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
@@ -107,6 +107,8 @@ def make_task(config: RunConfig) -> Task:
     context = ComputeContext(device, config.precision, compute.cores)
     try:
         task = task_maker(config.task)(solver=config.solver, context=context)
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
     return recorded(task) if compute.graphs else task
@@ -130,9 +132,11 @@ def _curriculum(
         tell(done)
         signals.check()
 
-    chosen = Parts(task, config.proposer, config.seeds, on_update, _workers(config, task, tell))
+    components = Components(
+        task, config.proposer, config.seeds, on_update, _workers(config, task, tell)
+    )
     try:
-        curriculum = curriculum_maker(config.curriculum)(chosen)
+        curriculum = curriculum_maker(config.curriculum)(components)
     except ArgumentError as error:
         raise ConfigError(f"curriculum.{one_line(error)}") from error
     except ConfigError:
@@ -143,10 +147,10 @@ def _curriculum(
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
-    if chosen.workers is not None and not learned:
+    if components.workers is not None and not learned:
         raise ConfigError(
-            f"compute.collector={config.compute.collector}: this method trains no copies of the "
-            "Solver that workers could have; leave compute.collector=single"
+            f"compute.collector={config.compute.collector}: this method trains no replicas "
+            "that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)

@@ -1,8 +1,8 @@
 """What a command that does not come to its end says, and the exit code that it ends with.
 
 An error that is foreseen is a class with an ``exit_code``; its message is one line.
-docs/reliability.md lists the codes: 2 bad input, 3 divergence, 4 storage, 5 a folder in use, 6 lost
-workers; 128 plus its number for a signal; 1, Python's own, for an error that nobody foresaw.
+docs/reference/exit_codes.md lists the codes: 2 bad input, 3 divergence, 4 storage, 5 a folder in
+use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an unforeseen error.
 """
 
 from __future__ import annotations

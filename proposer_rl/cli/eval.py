@@ -41,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="bin/eval",
         description="Evaluate a trained Solver on named levels, one by one: as exactly as its task "
         "can, on levels of any size where it has files of them.",
-        epilog="docs/levels.md describes such files and the sets that come along.",
+        epilog="docs/how_to/levels.md describes such files and the sets that come along.",
     )
     parser.add_argument(
         "checkpoint",

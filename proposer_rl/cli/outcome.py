@@ -1,4 +1,4 @@
-"""What a run is, and what came out of it."""
+"""What a run is, and its results."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _from_here(path: str) -> str:
 
 
 def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:
-    """Say what came out; on one screen, unless the run is one of a sweep's."""
+    """Print the results; on one screen, unless the run is one of a sweep's."""
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         Console().print(screen(read_progress(folder.path)))
     for seed, reached, final in zip(

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-PACKAGE = Path(__file__).resolve().parents[1]
-# In a wheel the configuration lies in the package, in a checkout beside it.
-CONFIG_FOLDER = next(
-    (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
-    PACKAGE / "conf",
-)
+from proposer_rl.recipes import CONFIG_FOLDER as CONFIG_FOLDER
+from proposer_rl.recipes import PACKAGE as PACKAGE
 
 # In the order in which they are given on the command line, and what each decides.
 GROUPS = {

@@ -25,7 +25,8 @@ examples:
   bin/play my_run --open           opens it, too
   bin/play my_run --port 8123      a port that stays, for a tunnel or a bookmark
 
-The page is for a browser on this machine alone; docs/play.md says how to reach it from another."""
+The page is for a browser on this machine alone; docs/how_to/play.md says how to reach it from
+another."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

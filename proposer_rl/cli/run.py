@@ -32,7 +32,7 @@ SUMMARY = "summary.json"
 
 
 def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
-    """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
+    """Carry a run out for the command line: where it is stopped, say how it goes on, and end.
 
     Args:
         config: the run's settings.
@@ -42,6 +42,33 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
     Returns:
         The headline measurement at the end.
     """
+    try:
+        value = carry_out(config, path, signals)
+    except Interrupted as stop:
+        stopped = f"{one_line(stop).capitalize()}; all is saved"
+        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        sys.exit(SIGNALLED + stop.signum)
+    except KeyboardInterrupt:
+        stopped = "Stopped at once; what came after the last checkpoint is lost"
+        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        raise
+    return value
+
+
+def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
+    """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
+
+    Args:
+        config: the run's settings.
+        path: the run's folder.
+        signals: which may ask the run to stop.
+
+    Returns:
+        The headline measurement at the end.
+
+    Raises:
+        Interrupted: if a signal asked the run to stop; all is saved then.
+    """
     status = Status(config.proposer.meta_episode_length)
     config = as_begun(config, path)
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
@@ -50,14 +77,6 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
             value = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin
             return value
-        except Interrupted as stop:
-            stopped = f"{one_line(stop).capitalize()}; all is saved"
-            tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
-            sys.exit(SIGNALLED + stop.signum)
-        except KeyboardInterrupt:
-            stopped = "Stopped at once; what came after the last checkpoint is lost"
-            tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
-            raise
         finally:
             made.curriculum.close()
 
@@ -89,7 +108,7 @@ def proceed(
 
 
 def run(experiment: Experiment, config: RunConfig) -> float:
-    """Run to the end, write summary and picture, say what came out.
+    """Run to the end, write summary and picture, print the results.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.

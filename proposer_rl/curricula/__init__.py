@@ -1,10 +1,16 @@
 """What students train on: the curricula, and all that one of your own is made of.
 
 The contract is in :mod:`~proposer_rl.curricula.contract`, what a curriculum may ask of a student in
-:mod:`~proposer_rl.curricula.student`.
+:mod:`~proposer_rl.curricula.student`. ``curricula.plr()``, ``curricula.currot()`` and so on are
+recipes, named as the files of ``conf/method`` and with their settings, for
+:func:`proposer_rl.train`.
 """
 
-from proposer_rl.curricula.alp_gmm import MixtureCurriculum
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.buffer import (
@@ -26,18 +32,19 @@ from proposer_rl.curricula.contract import (
     LearnedCurriculum,
     outcome_of,
 )
-from proposer_rl.curricula.currot import TransportCurriculum
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
-from proposer_rl.curricula.first_order_proposer import FirstOrderProposer
-from proposer_rl.curricula.learning_progress import LearningProgressCurriculum
-from proposer_rl.curricula.paired import PairedProposer
+from proposer_rl.curricula.gaussians import MixtureCurriculum
 from proposer_rl.curricula.problem_proposer import ProblemProposer
+from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer
+from proposer_rl.curricula.progress import LearningProgressCurriculum
 from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.selection import SelectionCurriculum
 from proposer_rl.curricula.student import Student, TaskStudent, UnfitStudentError, require
+from proposer_rl.curricula.transport import TransportCurriculum
+from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 __all__ = [
     "Advance",
@@ -74,7 +81,21 @@ __all__ = [
     "insert",
     "level_keys",
     "outcome_of",
+    "own",
     "replay_weights",
     "require",
     "rescore",
 ]
+
+
+def own(make: Callable[..., Any], **settings: Any) -> Recipe:
+    """A curriculum of one's own: see :func:`proposer_rl.recipes.own_recipe`."""
+    return own_recipe("method", make, **settings)
+
+
+def __getattr__(name: str) -> Callable[..., Recipe]:
+    return recipe_function("method", name)
+
+
+def __dir__() -> list[str]:
+    return [*available("method"), *__all__]

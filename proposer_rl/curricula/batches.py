@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
 
 class SomeBins:
-    """Levels of some of a space's bins, drawn evenly.
+    """Levels of some of a space's bins, drawn uniformly.
 
     Args:
         space: with the bins.
         values: for some of its axes, by name, those values whose bins count.
 
     Raises:
-        ValueError: for an axis or a value that the space does not have.
+        ArgumentError: for an axis or a value that the space does not have.
 
     Example:
         >>> from proposer_rl.tasks.mazes.distributions import SpecificationSpace
@@ -31,21 +33,18 @@ class SomeBins:
         tensor([0, 1, 2])
     """
 
-    def __init__(self, space: Space, values: Mapping[str, Sequence[float]]) -> None:
-        if not isinstance(values, Mapping):
-            raise ValueError(
-                f"must be values by the names of axes {list(space.axes)}, got {values!r}"
-            )
-        counts = []
+    @checked
+    def __init__(self, space: Space, values: dict[str, Annotated[list[float], Len(1)]]) -> None:
+        axes = {name: list(known) for name, known in space.axes.items()}
         for name, wanted in values.items():
-            known = list(space.axes.get(name, ()))
-            if not isinstance(wanted, Sequence):
-                raise ValueError(f"{name!r}: must be a list of values, got {wanted!r}")
-            if not wanted or any(value not in known for value in wanted):
-                axes = {axis: list(all_) for axis, all_ in space.axes.items()}
-                raise ValueError(f"{name!r}: {list(wanted)} must be among the space's axes {axes}")
-        for name, there in space.axes.items():
-            counts.append(torch.tensor([value in values.get(name, there) for value in there]))
+            if any(value not in axes.get(name, ()) for value in wanted):
+                raise ArgumentError(
+                    f"values.{name}={wanted}: must be among the space's axes {axes}"
+                )
+        counts = [
+            torch.tensor([value in values.get(name, known) for value in known])
+            for name, known in axes.items()
+        ]
         # The last axis runs fastest.
         grid = torch.cartesian_prod(*counts).reshape(-1, len(counts)).all(-1)
         self.bins = grid.nonzero().flatten()
@@ -68,6 +67,25 @@ def fresh_levels(
 def levels_at(levels: Levels, index: Tensor) -> Levels:
     """Levels [K, P] out of [K, N], by their places int64 [K, P]."""
     return levels[torch.arange(len(index)).unsqueeze(-1), index]
+
+
+def saved(value: Any) -> Any:
+    """What a state holds of an attribute: its own state, or a copy of numbers, tensors, texts."""
+    if hasattr(value, "state_dict"):
+        return value.state_dict()
+    if isinstance(value, Mapping):
+        return {key: saved(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [saved(entry) for entry in value]
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+def restored(state: Any, present: Any) -> Any:
+    """The attribute that a state holds; an object with a state of its own stays and takes it."""
+    if not hasattr(present, "load_state_dict"):
+        return saved(state)
+    present.load_state_dict(state)
+    return present
 
 
 def packed(entries: TensorDictBase) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.checks import whole
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
+from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
@@ -38,6 +38,14 @@ class BinCounts:
         counts, self.counts = self.counts, torch.zeros_like(self.counts)
         return list(counts.view(self._shape).tolist())
 
+    def state_dict(self) -> dict[str, Any]:
+        """The counts."""
+        return {"counts": self.counts}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on counting."""
+        self.counts = state["counts"]
+
 
 class BinCurriculum(Curriculum):
     """Draws its batches from shares of the bins, which it renews now and then in a scoring pass.
@@ -48,17 +56,15 @@ class BinCurriculum(Curriculum):
     Args:
         space: that has the bins.
         every: batches between two scoring passes.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
     shown: ClassVar[Sequence[str]] = ("score",)
     """Scores that are logged."""
+    remembers: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed", "_inbox")
 
-    def __init__(self, space: Space, *, every: int) -> None:
-        self.space = space
-        self._every = whole("every", every, 1)
+    @checked
+    def __init__(self, space: Space, *, every: Count) -> None:
+        self.space, self._every = space, every
         self._proposed = 0
         self._counts = BinCounts(space)
         self._inbox = Inbox()
@@ -112,22 +118,6 @@ class BinCurriculum(Curriculum):
             "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
             "effective_bins": (1 / shares.square().sum(-1)).tolist(),
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """The scores, the counts and the clock."""
-        return {
-            "scores": dict(self.scores),
-            "counts": self._counts.counts,
-            "proposed": self._proposed,
-            "inbox": self._inbox.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        self.scores = dict(state["scores"])
-        self._counts.counts = state["counts"]
-        self._proposed = int(state["proposed"])
-        self._inbox.load_state_dict(state["inbox"])
 
     def _take_in(self) -> None:
         for evidence in self._inbox.take():

@@ -23,22 +23,21 @@ Functions return a changed copy and leave the buffer that they are given as it w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from hashlib import blake2b
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.checks import one_of, part, real, whole
+from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
 
 SEEN = ("best", "solved")  # entries that never fall
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class ReplayRule:
     """How levels are drawn from a buffer.
 
@@ -49,22 +48,12 @@ class ReplayRule:
         temperature: T; towards 0 the best level takes all, towards infinity all are alike.
         best: the number of levels with the highest scores that get weights at all; None for all.
         staleness: share of the draws that go by the time since the last one.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
     prioritization: Prioritization = "rank"
-    temperature: float = 1.0
-    best: int | None = None
-    staleness: float = 0.3
-
-    def __post_init__(self) -> None:
-        one_of("prioritization", self.prioritization, get_args(Prioritization))
-        real("temperature", self.temperature, above=0)
-        part("staleness", self.staleness)
-        if self.best is not None:
-            whole("best", self.best, 1)
+    temperature: Positive = 1.0
+    best: Count | None = None
+    staleness: Share = 0.3
 
 
 def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
@@ -229,14 +218,14 @@ def rescore(
         best: float [K, P], the highest returns, of which the highest ever is kept.
         solved: bool [K, P], whether there was a success, of which one is enough for ever.
     """
-    found = score.double().where(score.isfinite(), 0.0)
+    finite = score.double().where(score.isfinite(), 0.0)
     none = torch.zeros_like(buffer["score"])
     counts = none.scatter_add(1, slots, score.isfinite().to(none))
-    means = none.scatter_add(1, slots, found.to(none)) / counts
+    means = none.scatter_add(1, slots, finite.to(none)) / counts
     scores = means.where(counts > 0, buffer["score"])
     seen = {
-        name: buffer[name].scatter_reduce(1, slots, found.to(buffer[name]), "amax")
-        for name, found in zip(SEEN, (best, solved), strict=True)
+        name: buffer[name].scatter_reduce(1, slots, new.to(buffer[name]), "amax")
+        for name, new in zip(SEEN, (best, solved), strict=True)
     }
     return _changed(buffer, score=scores, **seen)
 

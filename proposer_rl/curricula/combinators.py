@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.checks import real, whole
 from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, LearnedCurriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
+from proposer_rl.settings import ArgumentError, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 
 
@@ -26,16 +27,8 @@ class _Combinator(LearnedCurriculum):
 
     def __init__(self, parts: Sequence[Curriculum]) -> None:
         self.parts = list(parts)
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What any of the parts needs."""
-        return tuple(dict.fromkeys(need for part in self.parts for need in part.needs))
-
-    @property
-    def trains_replicas(self) -> bool:
-        """Whether any of the parts does."""
-        return any(part.trains_replicas for part in self._learned())
+        self.needs = tuple(dict.fromkeys(need for part in parts for need in part.needs))
+        self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Improve the parts that train something; at most one of them may advance the student."""
@@ -53,11 +46,12 @@ class _Combinator(LearnedCurriculum):
         return next(filter(None, (part.learnt() for part in reversed(self.parts))), {})
 
     def state_dict(self) -> dict[str, Any]:
-        """Those of the parts."""
-        return {"parts": [part.state_dict() for part in self.parts]}
+        """Those of the parts, too."""
+        return {**super().state_dict(), "parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put every part back."""
+        super().load_state_dict(state)
         for part, own in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(own)
 
@@ -90,23 +84,23 @@ class Filtered(_Combinator):
         temperature: of the draws among them, in units of the score.
 
     Raises:
-        ValueError: if a number is out of range, or the curriculum is :class:`Mixed`.
+        ValueError: if the curriculum is :class:`Mixed`.
     """
 
+    @checked
     def __init__(
-        self, curriculum: Curriculum, scorer: Scorer, *, times: int = 4, temperature: float = 0.05
+        self,
+        curriculum: Curriculum,
+        scorer: Scorer,
+        *,
+        times: Annotated[int, Interval(ge=2, le=1_000_000)] = 4,
+        temperature: Positive = 0.05,
     ) -> None:
         super().__init__([curriculum])
         if _mixes(curriculum):
             raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
-        self._scorer = scorer
-        self._times = whole("times", times, 2)
-        self._temperature = real("temperature", temperature, above=0)
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What the curriculum and the scores need."""
-        return tuple(dict.fromkeys((*super().needs, *self._scorer.needs)))
+        self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
+        self._scorer, self._times, self._temperature = scorer, times, temperature
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """The levels that are kept, of a batch of the curriculum's."""
@@ -132,15 +126,18 @@ class Schedule(_Combinator):
         until: number of batches after which each but the last ends, ascending.
 
     Raises:
-        ValueError: if ``until`` is not ascending or does not fit the stages.
+        ArgumentError: if ``until`` is not ascending or does not fit the stages.
     """
 
-    def __init__(self, stages: Sequence[Curriculum], until: Sequence[int]) -> None:
+    remembers = ("_proposed",)
+
+    @checked
+    def __init__(self, stages: Sequence[Curriculum], until: list[int]) -> None:
         super().__init__(stages)
         if len(until) != len(stages) - 1 or sorted({0, *until}) != [0, *until]:
-            raise ValueError(
-                f"{len(stages)} stages need {len(stages) - 1} ascending positive numbers of "
-                f"updates, got {list(until)}"
+            raise ArgumentError(
+                f"until={until}: {len(stages)} stages need {len(stages) - 1} ascending positive "
+                "numbers of updates"
             )
         self._until = list(until)
         self._proposed = 0
@@ -167,15 +164,6 @@ class Schedule(_Combinator):
             return part.improve(student, streams)
         return Improvement()
 
-    def state_dict(self) -> dict[str, Any]:
-        """How many batches there were, too."""
-        return {**super().state_dict(), "proposed": self._proposed}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
-        super().load_state_dict(state)
-        self._proposed = int(state["proposed"])
-
     @property
     def _stage(self) -> int:
         return bisect_right(self._until, self._proposed)
@@ -189,16 +177,19 @@ class Mixed(_Combinator):
         shares: of the levels of a batch, not negative; rounded to whole levels so that they add up.
 
     Raises:
-        ValueError: if a share is no such number, or there is not one for each curriculum.
+        ArgumentError: if there is not one share for each curriculum, or all are zero.
     """
 
-    def __init__(self, curricula: Sequence[Curriculum], shares: Sequence[float]) -> None:
+    @checked
+    def __init__(
+        self, curricula: Sequence[Curriculum], shares: Annotated[list[NotNegative], Len(1)]
+    ) -> None:
         super().__init__(curricula)
-        if len(shares) != len(curricula) or not curricula:
-            raise ValueError(f"{len(curricula)} curricula need as many shares, got {list(shares)}")
-        given = [real("shares", share, least=0) for share in shares]
-        total = real("sum of shares", sum(given), above=0)
-        self._ends = [sum(given[: i + 1]) / total for i in range(len(given))]
+        if len(shares) != len(curricula) or not any(shares):
+            raise ArgumentError(
+                f"shares={shares}: {len(curricula)} curricula need as many, not all of them zero"
+            )
+        self._ends = [sum(shares[: i + 1]) / sum(shares) for i in range(len(shares))]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels [K, n], those of the first curriculum first."""

@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import levels_at, packed, unpacked
+from proposer_rl.curricula.batches import levels_at, packed, restored, saved, unpacked
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import Update, first_episode_return, first_episode_success
 from proposer_rl.streams import Streams
@@ -105,12 +105,16 @@ class Curriculum:
     """The interface of curricula; of its methods only :meth:`propose` must be defined.
 
     ``streams`` are the random streams of the K students, for the present proposal.
+
+    Attributes:
+        needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
+        remembers: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
+            and dicts of these, and objects with a state of their own. Others are for
+            :meth:`state_dict`.
     """
 
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`."""
-        return ()
+    needs: tuple[str, ...] = ()
+    remembers: ClassVar[tuple[str, ...]] = ()
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels for the students to train on next.
@@ -147,10 +151,12 @@ class Curriculum:
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
-        return {}
+        return {name.strip("_"): saved(getattr(self, name)) for name in self.remembers}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put back what :meth:`state_dict` returned."""
+        for name in self.remembers:
+            setattr(self, name, restored(state[name.strip("_")], getattr(self, name)))
 
     def close(self) -> None:
         """Let go of all that is held outside of this process."""
@@ -185,17 +191,18 @@ class Improvement:
 
 
 class LearnedCurriculum(Curriculum):
-    """A curriculum that trains something before a cycle, such as a Proposer or one of its parts."""
+    """A curriculum that trains something before a cycle, such as a Proposer or one of its parts.
 
-    @property
-    def trains_replicas(self) -> bool:
-        """Whether it trains replicas of the student, which other processes can do."""
-        return False
+    Attributes:
+        trains_replicas: whether it trains replicas of the student, which other processes can do.
+    """
+
+    trains_replicas: bool = False
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Prepare for the next cycle, whose first proposal has not been made.
 
-        Whatever is raised in it may be followed by :meth:`load_state_dict` and a repeated call.
+        After whatever it raises may come :meth:`Curriculum.load_state_dict`, and a repeated call.
 
         Args:
             student: as it is before the cycle.

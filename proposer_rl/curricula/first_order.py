@@ -11,10 +11,10 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import device_of, fresh_levels
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
-from proposer_rl.curricula.checks import one_of, part, real, whole
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.student import Student
-from proposer_rl.meta.first_order import MEASURES, bin_scores
+from proposer_rl.meta.first_order import Measure, bin_scores
+from proposer_rl.settings import Count, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
 
@@ -25,31 +25,13 @@ class _AlignedBins(BinCurriculum):
     With s_n the exponential moving average of the n-th bin's score, its share of the batch is
 
         q_n  proportional to  exp( s_n / (temperature * max over n of |s_n|) ).
-
-    Args:
-        space: that has the bins.
-        target: the distribution that is to be mastered.
-        every: batches between two scoring passes.
-        temperature: of the shares.
-        smoothing: share of the old score in the average.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
     def __init__(
-        self,
-        space: Space,
-        target: Distribution,
-        *,
-        every: int,
-        temperature: float,
-        smoothing: float,
+        self, space: Space, target: Distribution, every: int, temperature: float, smoothing: float
     ) -> None:
         super().__init__(space, every=every)
-        self._target = target
-        self._temperature = real("temperature", temperature, above=0)
-        self.smoothing = part("smoothing", smoothing, below_one=True)
+        self._target, self._temperature, self.smoothing = target, temperature, smoothing
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
@@ -75,34 +57,27 @@ class FirstOrderCurriculum(_AlignedBins):
         step: of the differences that tell the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
+    needs = ("target_direction", "alignment")
+
+    @checked
     def __init__(
         self,
         space: Space,
         target: Distribution,
         *,
-        every: int = 2,
-        target_levels: int = 128,
-        candidates: int = 8,
-        step: float = 1.0,
-        temperature: float = 0.1,
-        smoothing: float = 0.9,
-        measure: str = "log_success",
+        every: Count = 2,
+        target_levels: Count = 128,
+        candidates: Count = 8,
+        step: Positive = 1.0,
+        temperature: Positive = 0.1,
+        smoothing: Decay = 0.9,
+        measure: Measure = "log_success",
     ) -> None:
-        super().__init__(space, target, every=every, temperature=temperature, smoothing=smoothing)
-        self._target_levels = whole("target_levels", target_levels, 1)
-        self._candidates = whole("candidates", candidates, 1)
-        self._step = real("step", step, above=0)
-        self._measure = one_of("measure", measure, MEASURES)
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Gradients of the exact performance."""
-        return ("target_direction", "alignment")
+        super().__init__(space, target, every, temperature, smoothing)
+        self._target_levels, self._candidates = target_levels, candidates
+        self._step, self._measure = step, measure
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Score every bin."""
@@ -151,30 +126,26 @@ class SampledFirstOrderCurriculum(_AlignedBins):
             s its averaged score.
         smoothing: share of the old score in the average.
         exploration: part of each batch that is drawn uniformly.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
+    needs = ("play", "sampled_direction", "sampled_alignment")
+    remembers = (*BinCurriculum.remembers, "_direction")
+
+    @checked
     def __init__(
         self,
         space: Space,
         target: Distribution,
         *,
-        every: int = 1,
-        temperature: float = 0.1,
-        smoothing: float = 0.9,
-        exploration: float = 0.2,
+        every: Count = 1,
+        temperature: Positive = 0.1,
+        smoothing: Decay = 0.9,
+        exploration: Share = 0.2,
     ) -> None:
-        super().__init__(space, target, every=every, temperature=temperature, smoothing=smoothing)
-        self._exploration = part("exploration", exploration)
+        super().__init__(space, target, every, temperature, smoothing)
+        self._exploration = exploration
         self._direction: dict[str, Tensor] = {}
         self._device = device_of(target.sample(1, torch.Generator()))
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Rollouts on the target, and gradients by rollouts."""
-        return ("play", "sampled_direction", "sampled_alignment")
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Play as many levels of the target as the student plays at once, or as are proposed."""
@@ -218,12 +189,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         shares = super().shares()
         return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
 
-    def state_dict(self) -> dict[str, Any]:
-        """The direction, too."""
-        return {**super().state_dict(), "direction": dict(self._direction)}
-
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
+        """Go on with the direction, on the device: a checkpoint's tensors are on the CPU."""
         super().load_state_dict(state)
-        # A checkpoint's tensors are on the CPU.
-        self._direction = {k: v.to(self._device) for k, v in state["direction"].items()}
+        self._direction = {k: v.to(self._device) for k, v in self._direction.items()}

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.curricula.student import Student
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Space
 
-MEASURES = ("success", "return")
+Measure = Literal["success", "return"]
 
 
 class Probes:
@@ -28,15 +27,10 @@ class Probes:
         space: that has the bins.
         count: levels of each bin.
         measure: ``"success"`` or ``"return"``.
-
-    Raises:
-        ValueError: if a value is out of range.
     """
 
-    def __init__(self, space: Space, count: int, measure: str) -> None:
-        self._space = space
-        self._count = whole("probes", count, 1)
-        self.measure = one_of("measure", measure, MEASURES)
+    def __init__(self, space: Space, count: int, measure: Measure) -> None:
+        self._space, self._count, self.measure = space, count, measure
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 

@@ -13,7 +13,6 @@ from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.bins import BinCounts
-from proposer_rl.curricula.checks import real, whole
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student
@@ -25,7 +24,7 @@ from proposer_rl.task import Distribution, Levels, Space
 
 
 class ProblemProposer(Curriculum):
-    """Draws each of P problems from a policy over probes, and learns what each was worth.
+    """Draws each of P problems from a policy over probes, and learns from the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
@@ -41,10 +40,10 @@ class ProblemProposer(Curriculum):
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
+
+    needs: tuple[str, ...] = ("probe",)
+    remembers = ("_metrics", "_counts", "_inbox")
 
     def __init__(
         self,
@@ -56,11 +55,7 @@ class ProblemProposer(Curriculum):
         probe_levels: int = 16,
     ) -> None:
         self.agent, self.space, self.target = agent, space, target
-        whole("epochs", settings.epochs, 1)
-        real("learning_rate", settings.learning_rate, above=0)
-        real("entropy_coeff", settings.entropy_coeff, least=0)
-        self._settings = settings
-        self._probe_levels = probe_levels
+        self._settings, self._probe_levels = settings, probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
             actor,
@@ -78,11 +73,6 @@ class ProblemProposer(Curriculum):
         self._inbox = Inbox()
         self._counts = BinCounts(space)
         self._metrics: dict[str, float] = {}
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What the student would do on the probes."""
-        return ("probe",)
 
     @abstractmethod
     def reward(
@@ -146,26 +136,24 @@ class ProblemProposer(Curriculum):
         return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights and Adam's state, and what is logged."""
+        """Weights and Adam's state, too."""
         moments = {
             name: self._adam.state[parameter]
             for name, parameter in self.agent.named_parameters()
             if parameter in self._adam.state
         }
-        return {
+        return super().state_dict() | {
             "proposer": {
                 name: {"value": parameter.detach().clone()}
                 | {key: value.clone() for key, value in moments.get(name, {}).items()}
                 for name, parameter in self.agent.named_parameters()
             },
             "observed": self.agent.in_keys,
-            "counts": self._counts.counts,
-            "metrics": dict(self._metrics),
-            "inbox": self._inbox.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with them."""
+        super().load_state_dict(state)
         for name, parameter in self.agent.named_parameters():
             entry = dict(state["proposer"][name])
             parameter.data.copy_(entry.pop("value"))
@@ -174,9 +162,6 @@ class ProblemProposer(Curriculum):
                 key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
                 for key, value in entry.items()
             }
-        self._counts.counts = state["counts"]
-        self._metrics = dict(state["metrics"])
-        self._inbox.load_state_dict(state["inbox"])
 
     def _take_in(self) -> None:
         """Take in what came of the levels; here, nothing."""

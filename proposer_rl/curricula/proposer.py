@@ -57,19 +57,13 @@ class ProposerCurriculum(LearnedCurriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
+        # What it sees; and while it learns, what becomes of replicas.
+        self.needs = ("performance", "probe")
+        self.trains_replicas = trainer is not None
+        if self.trains_replicas:
+            self.needs += ("snapshot", "restore")
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What it sees; and while it learns, what becomes of replicas."""
-        seen = ("performance", "probe")
-        return seen if self.trainer is None else (*seen, "snapshot", "restore")
-
-    @property
-    def trains_replicas(self) -> bool:
-        """While it learns."""
-        return self.trainer is not None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Draw the levels through which the student is seen, and let the trainer train."""
@@ -210,11 +204,11 @@ class ProposerTrainer:
     def _advance(self, student: Student, rewards: Tensor, stream: Streams) -> Advance | None:
         if self.advance == "train":
             return None
-        chosen = int(rewards.argmax())
+        best = int(rewards.argmax())
         if self.advance == "random":
             generator = stream.generator("advance")
-            chosen = int(torch.randint(len(rewards), (), generator=generator))
-        trained = self.copies.trained(chosen)
+            best = int(torch.randint(len(rewards), (), generator=generator))
+        trained = self.copies.trained(best)
         student.restore(trained.solver)
         return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 

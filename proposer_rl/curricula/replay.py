@@ -17,9 +17,10 @@ One loop with options, which is what the methods differ in:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -34,11 +35,11 @@ from proposer_rl.curricula.buffer import (
     replay_weights,
     rescore,
 )
-from proposer_rl.curricula.checks import flag, one_of, part, real, whole
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
+from proposer_rl.settings import ArgumentError, Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
@@ -74,55 +75,55 @@ class ReplayCurriculum(Curriculum):
     Raises:
         DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
             replayed.
-        TypeError: if there are to be edits and nothing makes them.
-        ValueError: if a number is out of range, or the numbers do not go together.
+        ArgumentError: if there are to be edits and nothing makes them, or options contradict.
     """
 
+    remembers = ("_scored", "_came_back", "_inbox")
+
+    @checked
     def __init__(
         self,
         new_levels: Distribution,
         scorer: Scorer,
         rule: ReplayRule | None = None,
         *,
-        capacity: int = 4000,
-        fill: float = 0.5,
-        replay_probability: float = 0.5,
+        capacity: Count = 4000,
+        fill: Positive = 0.5,
+        replay_probability: Annotated[float, Interval(gt=0, le=1)] = 0.5,
         train_on_new: bool = False,
         synchronous: bool | None = None,
-        edits: int = 0,
+        edits: Annotated[int, Interval(ge=0, le=1_000_000)] = 0,
         edit: Edit | None = None,
         parents: Literal["batch", "easy"] = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
-        for name, value in (
-            ("synchronous", synchronous), ("train_on_new", train_on_new), ("renew", renew)
-        ):  # fmt: skip
-            flag(name, value)
         if train_on_new and synchronous:
-            raise ValueError(
+            raise ArgumentError(
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
                 "scored, beside every update"
             )
-        one_of("parents", parents, ("batch", "easy"))
-        self._capacity = whole("capacity", capacity, 1)
-        if whole("edits", edits, 0) and edit is None:
-            raise TypeError(
+        if edits and edit is None:
+            raise ArgumentError(
                 f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
                 "set edits=0"
             )
         if renew and co_learnability:
-            raise ValueError(
+            raise ArgumentError(
                 f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
                 "before each draw, what is added to them is lost"
             )
+        self.needs = scorer.needs
         self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
-        self._warm = real("fill", fill, above=0) * capacity
-        self._probability = part("replay_probability", replay_probability, above_zero=True)
+        self._capacity, self._warm, self._probability = (
+            capacity,
+            fill * capacity,
+            replay_probability,
+        )
         self._synchronous, self._train_on_new = synchronous, train_on_new
         self._edits, self._edit, self._parents, self._renew = edits, edit, parents, renew
-        self._co_learnability = real("co_learnability", co_learnability)
+        self._co_learnability = co_learnability
         self._template = new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, 0, self._capacity)
@@ -133,11 +134,6 @@ class ReplayCurriculum(Curriculum):
         self._before: TensorDict | None = None  # [K, m]: "slot" and "key", the time before
         self._scored = 0  # new levels of each student
         self._came_back = {"levels": 0, "replayed": 0}
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What the scores of levels need that nobody trains on."""
-        return self.scorer.needs
 
     def check(self, copies: int) -> None:
         """Refuse several students, if each would decide by itself how many new levels to score.
@@ -223,27 +219,23 @@ class ReplayCurriculum(Curriculum):
         return told
 
     def state_dict(self) -> dict[str, Any]:
-        """The buffers, and what is known of the levels that were trained on."""
+        """The buffers, too, and what is known of the levels that were trained on."""
         optional = {"last": self._last, "before": self._before}
-        return {
+        return super().state_dict() | {
             "buffer": packed(self.buffer),
             **{name: None if td is None else packed(td) for name, td in optional.items()},
             "due": [packed(evidence) for evidence in self._due],
-            "scored": self._scored,
-            "came_back": dict(self._came_back),
-            "inbox": self._inbox.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with them."""
+        super().load_state_dict(state)
         self.buffer = unpacked(state["buffer"], self._template)
         self._last, self._before = (
             None if state[name] is None else unpacked(state[name], self._template)
             for name in ("last", "before")
         )
         self._due = [unpacked(evidence, self._template) for evidence in state["due"]]
-        self._scored, self._came_back = state["scored"], dict(state["came_back"])
-        self._inbox.load_state_dict(state["inbox"])
 
     def _take_in(self) -> None:
         """Take in what episodes on levels have shown, and note what remains to be done."""

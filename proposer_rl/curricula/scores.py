@@ -39,11 +39,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.checks import one_of, whole
 from proposer_rl.curricula.exact_scores import EXACT
 from proposer_rl.curricula.stepwise import STEPWISE
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import succeeded
+from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
@@ -117,7 +117,7 @@ class Scorer:
     """One of the scores, from one of its sources.
 
     Args:
-        name: of the score; see the table above.
+        score: its name; see the table above.
         source: whether it is read off episodes or asked of the student.
         rollouts: played on each level that is scored without training on it, from episodes;
             from evaluation, the episodes of which ``max_mc`` takes the expected highest return.
@@ -127,21 +127,20 @@ class Scorer:
         needs: what scoring levels asks of a student, that nobody trains on.
 
     Raises:
-        ValueError: if there is no such score, or not from this source.
+        ArgumentError: if there is no such score, or not from this source.
     """
 
-    def __init__(self, name: str, source: Source, rollouts: int = 1) -> None:
-        self.rollouts = whole("rollouts", rollouts, 1)
-        self.from_episodes = one_of("source", source, ("episodes", "exact")) == "episodes"
-        self._name = name
+    @checked
+    def __init__(self, score: str, source: Source, rollouts: Count = 1) -> None:
+        self._name, self.rollouts, self.from_episodes = score, rollouts, source == "episodes"
         available = {
             "episodes": [*STEPWISE, "learnability", "return_variance", "regret", "gradient_norm"],
             "exact": [*EXACT],
         }[source]
-        if name not in available:
-            raise ValueError(f"score={name!r}: from source={source} there are {available}")
-        self.needs = EXACT[name].needs if source == "exact" else ("play",)
-        if self.from_episodes and name == "gradient_norm":
+        if score not in available:
+            raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
+        self.needs = EXACT[score].needs if source == "exact" else ("play",)
+        if self.from_episodes and score == "gradient_norm":
             self.needs += ("policy_gradient_norms",)
 
     def of_outcome(
@@ -187,8 +186,8 @@ class Scorer:
                 where there was none.
             solved: whether an episode was a success before, bool [K, n].
         """
-        found = [episodes(rollout) for rollout in rollouts]
-        _, *numbers = zip(*found, strict=True)  # weights may be of several lengths
+        split = [episodes(rollout) for rollout in rollouts]
+        _, *numbers = zip(*split, strict=True)  # weights may be of several lengths
         ended, successes, total, squares, highest = map(torch.stack, numbers)
         count, some = ended.sum(0), ended.sum(0).clamp(1)
         best = torch.maximum(best.to(count.device).double(), highest.amax(0))
@@ -200,8 +199,8 @@ class Scorer:
         elif self._name in STEPWISE:
             step_score = STEPWISE[self._name]
             each = [
-                (step_score(student, rollout, best) * f.weight).sum(-1)
-                for rollout, f in zip(rollouts, found, strict=True)
+                (step_score(student, rollout, best) * own.weight).sum(-1)
+                for rollout, own in zip(rollouts, split, strict=True)
             ]
             score = torch.stack(each).sum(0) / some
             if self._name == "mean_negative_advantage":

@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, of_kind
-from proposer_rl.curricula.checks import part, whole
 from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
+from proposer_rl.settings import ArgumentError, Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
@@ -36,33 +36,31 @@ class SelectionCurriculum(Curriculum):
         new: share of a batch that is drawn anew instead, rounded.
 
     Raises:
-        ValueError: if a number is out of range.
+        ArgumentError: if more are to be kept than are scored.
     """
 
+    remembers = ("scores", "_proposed")
+
+    @checked
     def __init__(
         self,
         new_levels: Distribution,
         scorer: Scorer,
         *,
-        candidates: int = 2048,
-        keep: int = 256,
-        every: int = 10,
-        new: float = 0.5,
+        candidates: Count = 2048,
+        keep: Count = 256,
+        every: Count = 10,
+        new: Share = 0.5,
     ) -> None:
-        self._candidates = whole("candidates", candidates, 1)
-        if whole("keep", keep, 1) > candidates:
-            raise ValueError(f"keep={keep} must be at most candidates={candidates}")
-        self._keep, self._every, self._new = keep, whole("every", every, 1), part("new", new)
+        if keep > candidates:
+            raise ArgumentError(f"keep={keep}: must be at most candidates={candidates}")
+        self.needs = scorer.needs
+        self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
         self._new_levels, self.scorer = new_levels, scorer
         self._template = new_levels.sample(1, torch.Generator())[0]
         self._proposed = 0
         self.kept: Levels | None = None  # [K, keep], by falling score
         self.scores = torch.zeros(0)  # float64 [K, keep]
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """What the scores need."""
-        return self.scorer.needs
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels [K, n]: some of those kept, then new ones."""
@@ -108,12 +106,12 @@ class SelectionCurriculum(Curriculum):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """What is kept."""
+        """What is kept, too."""
         kept = None if self.kept is None else self.kept.to_dict(convert_tensors=False)
-        return {"kept": kept, "scores": self.scores.clone(), "proposed": self._proposed}
+        return {**super().state_dict(), "kept": kept}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with it."""
-        kept, self.scores = state["kept"], state["scores"].clone()
-        self._proposed = int(state["proposed"])
+        super().load_state_dict(state)
+        kept = state["kept"]
         self.kept = None if kept is None else of_kind(self._template, kept, self.scores.shape)

@@ -48,28 +48,78 @@ class UnfitStudentError(TypeError):
 class Student:
     """K students as a curriculum sees them, and a meter of what it asked of them.
 
-    What a student can do is a method here; each raises :class:`UnfitStudentError` unless a subclass
-    defines it, or a function is given in its place. Levels are [K, n] for any n unless it says
-    otherwise, or [E] where all students get the same; results are without gradients.
+    What a student can do is a function: given to the constructor, or a method of a subclass. Levels
+    are [K, n] for any n unless it says otherwise, or [E] where all students get the same; results
+    are without gradients. Asking for a function that it lacks raises :class:`UnfitStudentError`.
 
     Args:
         gamma, lmbda: discount, and decay of the traces of generalised advantages, by which
             curricula read a critic.
-        batch_size: levels P that :meth:`play` takes at once; None for any number.
-        can: functions by the names of methods, such as ``performance=evaluate``.
+        batch_size: levels P that :attr:`play` takes at once; None for any number.
+        can: functions by their names, such as ``performance=evaluate``.
 
     Attributes:
         frames: environment steps that each student was played for on a curriculum's account.
         evaluations: levels on which each was evaluated for it.
 
     Raises:
-        ValueError: for a name that is none of these methods'.
+        ValueError: for a name that is none of these functions'.
 
     Example:
         >>> student = Student(optimal_return=lambda levels: torch.ones(levels.shape))
         >>> student.lacks("optimal_return"), student.lacks("probe")
         (None, 'it has no probe(levels)')
     """
+
+    values: Callable[[Levels], Tensor]
+    """What the critic says of the first state of each level, float [K, n]."""
+    play: Callable[[Levels, Sequence[torch.Generator]], TensorDictBase]
+    """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
+
+    TorchRL's, with ``state_value`` where a score reads a critic. Actions of student k are drawn
+    from the k-th generator.
+    """
+    performance: Callable[[Levels, torch.Generator], TensorDictBase]
+    """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].
+
+    Expectations, or estimates from episodes.
+    """
+    exact_performance: Callable[[Levels], TensorDictBase]
+    """The same where it is exact, so that nothing is drawn."""
+    probe: Callable[[Levels], Tensor]
+    """What each would do on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
+    optimal_return: Callable[[Levels], Tensor]
+    """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
+    episode_law: Callable[[Levels], EpisodeLaw]
+    """The law of each student's episodes on levels [K, n]."""
+    gradient_norms: Callable[[Levels], Tensor]
+    """Squared length of the gradient of the return on each level, float [K, n]."""
+    policy_gradient_norms: Callable[[TensorDictBase], Tensor]
+    """The same of the policy gradient of a rollout [K, n, T], float [K, n]."""
+    target_direction: Callable[[Levels, str], tuple[Tensor, Direction]]
+    """Performance on levels [K, E] of the target, float [K], and what raises it fastest.
+
+    The second argument is the measure; see :mod:`proposer_rl.meta.first_order`.
+    """
+    alignment: Callable[[Direction, Levels, float], Tensor]
+    """Slope of the return on each level along a direction of the parameters, float [K, n].
+
+    The last argument is the step of the differences, in learning rates.
+    """
+    sampled_direction: Callable[[TensorDictBase], Direction]
+    """The direction by the policy gradient of a rollout [K, n, T] on the target."""
+    sampled_alignment: Callable[[Direction, TensorDictBase], TensorDict]
+    """What the alignment of levels is made of, by a rollout [K, n, T] on them.
+
+    ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi, with
+    advantages A_t that are not standardised. Where the students' training standardises them over a
+    batch: ``drift``, the slope of log pi alone; and ``advantage`` and ``square``, the means of A_t
+    and of its square, so that this can be done when all of it has come in.
+    """
+    snapshot: Callable[[], TensorDict]
+    """All that training changes of the students, batch [K]."""
+    restore: Callable[[TensorDictBase], None]
+    """Become what a snapshot [K] holds."""
 
     def __init__(
         self,
@@ -82,8 +132,8 @@ class Student:
         self.gamma, self.lmbda, self.batch_size = gamma, lmbda, batch_size
         self.frames, self.evaluations = 0, 0
         for name, function in can.items():
-            if name not in SIGNATURES:
-                raise ValueError(f"{name}: a student can have {', '.join(SIGNATURES)}")
+            if name not in ABILITIES:
+                raise ValueError(f"{name}: a student can have {', '.join(ABILITIES)}")
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
@@ -92,108 +142,20 @@ class Student:
         self.evaluations += evaluations
 
     def lacks(self, name: str) -> str | None:
-        """Why it cannot do what the method of that name says; None if it can."""
-        if name in vars(self) or getattr(type(self), name) is not getattr(Student, name):
+        """Why it cannot do what the function of that name does; None if it can."""
+        if name in vars(self) or hasattr(type(self), name):
             return None
-        return f"it has no {name}{SIGNATURES[name]}"
+        _, *given = inspect.signature(getattr(TaskStudent, f"_{name}")).parameters
+        return f"it has no {name}({', '.join(given)})"
 
-    def values(self, levels: Levels) -> Tensor:
-        """What the critic says of the first state of each level, float [K, n]."""
-        raise self._refusal("values")
-
-    def play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
-        """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
-
-        TorchRL's, with ``state_value`` where a score reads a critic. Actions of student k are drawn
-        from the k-th generator.
-        """
-        raise self._refusal("play")
-
-    def performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
-        """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].
-
-        Expectations, or estimates from episodes.
-        """
-        raise self._refusal("performance")
-
-    def exact_performance(self, levels: Levels) -> TensorDictBase:
-        """The same where it is exact, so that nothing is drawn."""
-        raise self._refusal("exact_performance")
-
-    def probe(self, levels: Levels) -> Tensor:
-        """What each would do on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
-        raise self._refusal("probe")
-
-    def optimal_return(self, levels: Levels) -> Tensor:
-        """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
-        raise self._refusal("optimal_return")
-
-    def episode_law(self, levels: Levels) -> EpisodeLaw:
-        """The law of each student's episodes on levels [K, n]."""
-        raise self._refusal("episode_law")
-
-    def gradient_norms(self, levels: Levels) -> Tensor:
-        """Squared length of the gradient of the return on each level, float [K, n]."""
-        raise self._refusal("gradient_norms")
-
-    def policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
-        """The same of the policy gradient of a rollout [K, n, T], float [K, n]."""
-        raise self._refusal("policy_gradient_norms")
-
-    def target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
-        """Performance on levels [K, E] of the target, float [K], and what raises it fastest.
-
-        See :mod:`proposer_rl.meta.first_order`.
-        """
-        raise self._refusal("target_direction")
-
-    def alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
-        """Slope of the return on each level along a direction, float [K, n].
-
-        Args:
-            direction: of the students' parameters.
-            levels: of each.
-            step: of the differences, in learning rates.
-        """
-        raise self._refusal("alignment")
-
-    def sampled_direction(self, rollout: TensorDictBase) -> Direction:
-        """The direction by the policy gradient of a rollout [K, n, T] on the target."""
-        raise self._refusal("sampled_direction")
-
-    def sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
-        """What the alignment of levels is made of, by a rollout [K, n, T] on them.
-
-        ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi,
-        with advantages A_t that are not standardised. Where the students' training standardises
-        them over a batch: ``drift``, the slope of log pi alone; and ``advantage`` and ``square``,
-        the means of A_t and of its square, so that this can be done when all of it has come in.
-        """
-        raise self._refusal("sampled_alignment")
-
-    def snapshot(self) -> TensorDict:
-        """All that training changes of the students, batch [K]."""
-        raise self._refusal("snapshot")
-
-    def restore(self, snapshot: TensorDictBase) -> None:
-        """Become what a snapshot [K] holds."""
-        raise self._refusal("restore")
-
-    def _refusal(self, name: str) -> UnfitStudentError:
-        return UnfitStudentError(f"{name}: {self.lacks(name)}")
+    def __getattr__(self, name: str) -> Any:
+        if name in ABILITIES:
+            raise UnfitStudentError(f"{name}: {self.lacks(name)}")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
-def _signature(name: str) -> str:
-    _, *arguments = inspect.signature(getattr(Student, name)).parameters
-    return f"({', '.join(arguments)})"
-
-
-SIGNATURES = {
-    name: _signature(name)
-    for name, method in vars(Student).items()
-    if inspect.isfunction(method) and name[0] != "_" and name not in ("spend", "lacks")
-}
-"""What a student can have, with the arguments of each."""
+ABILITIES = tuple(name for name in Student.__annotations__)
+"""Names of the functions that a student can have."""
 
 
 def require(student: Student, needs: Iterable[str], who: str) -> None:
@@ -227,6 +189,7 @@ class TaskStudent(Student):
             gamma=numbers.gamma,
             lmbda=numbers.lmbda,
             batch_size=learner.env.batch_size[1:].numel(),
+            **{name: getattr(self, f"_{name}") for name in ABILITIES},
         )
         self._task, self._learner = task, learner
         self._norms: Callable[..., Tensor] | None = None
@@ -250,16 +213,14 @@ class TaskStudent(Student):
         return None
 
     @torch.no_grad()
-    def values(self, levels: Levels) -> Tensor:
-        """See :meth:`Student.values`; of at most ``batch_size`` levels."""
+    def _values(self, levels: Levels) -> Tensor:
         agent, count = self._learner.agent, levels.shape[1]
         self._learner.env.set_levels(self._filled_up(levels))
         state = self._learner.env.reset()
         state.update(agent.no_memory(state))
         return agent.decode(state, agent.encode(state))[VALUE].squeeze(-1)[:, :count]
 
-    def play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
-        """See :meth:`Student.play`."""
+    def _play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
         count = levels.shape[1]
         self._learner.env.set_levels(self._filled_up(levels))
         rollout = self._learner.collect(list(generators))
@@ -267,72 +228,61 @@ class TaskStudent(Student):
         return rollout if count == rollout.shape[1] else rollout[:, :count]
 
     @torch.no_grad()
-    def performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
-        """See :meth:`Student.performance`."""
+    def _performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
         self.spend(evaluations=levels.shape[-1])
         return self._task.performance(self._learner.agent, levels, generator)
 
-    def exact_performance(self, levels: Levels) -> TensorDictBase:
-        """See :meth:`Student.exact_performance`."""
+    def _exact_performance(self, levels: Levels) -> TensorDictBase:
         return self.performance(levels, torch.Generator())
 
     @torch.no_grad()
-    def probe(self, levels: Levels) -> Tensor:
-        """See :meth:`Student.probe`."""
+    def _probe(self, levels: Levels) -> Tensor:
         return self._task.probe(self._learner.agent, levels)
 
-    def optimal_return(self, levels: Levels) -> Tensor:
-        """See :meth:`Student.optimal_return`."""
+    def _optimal_return(self, levels: Levels) -> Tensor:
         return cast(OptimalTask, self._task).optimal_return(levels)
 
     @torch.no_grad()
-    def episode_law(self, levels: Levels) -> EpisodeLaw:
-        """See :meth:`Student.episode_law`."""
+    def _episode_law(self, levels: Levels) -> EpisodeLaw:
         self.spend(evaluations=levels.shape[-1])
         return cast(EnumerableTask, self._task).episode_law(self._learner.agent, levels)
 
-    def gradient_norms(self, levels: Levels) -> Tensor:
-        """See :meth:`Student.gradient_norms`."""
+    def _gradient_norms(self, levels: Levels) -> Tensor:
         self.spend(evaluations=levels.shape[-1])
         self._norms = self._norms or squared_gradients(cast(ExactTask, self._task))
         return self._norms(self._learner, levels)
 
-    def policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
-        """See :meth:`Student.policy_gradient_norms`."""
+    def _policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
         self._policy_norms = self._policy_norms or squared_policy_gradients(self._task)
         return self._policy_norms(self._learner, rollout, advantages(self, rollout).float())
 
-    def target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
-        """See :meth:`Student.target_direction`."""
+    def _target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
         self.spend(evaluations=levels.shape[-1])
         return exact_direction(cast(ExactTask, self._task), self._learner, levels, measure)
 
-    def alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
-        """See :meth:`Student.alignment`; a level counts on either side."""
+    def _alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
         self.spend(evaluations=2 * levels.shape[-1])
         return exact_alignment(cast(ExactTask, self._task), self._learner, direction, levels, step)
 
-    def sampled_direction(self, rollout: TensorDictBase) -> Direction:
-        """See :meth:`Student.sampled_direction`."""
+    def _sampled_direction(self, rollout: TensorDictBase) -> Direction:
         learner = self._learner
         with torch.enable_grad():
             gained = surrogate(learner.agent, rollout, ppo_advantages(learner, rollout)).mean(1)
             return target_direction(learner, gained)
 
-    def sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
-        """See :meth:`Student.sampled_alignment`."""
+    def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
         agent, advantage = self._learner.agent, advantages(self, rollout)
 
         def gained() -> Tensor:
             log_prob = log_probabilities(agent, rollout).double()
             return torch.stack([(advantage * log_prob).mean(-1), log_prob.mean(-1)], -1)
 
-        found = alignment(agent, direction, self._learner.settings.learning_rate, gained)
-        parts = {"slope": found[..., 0]}
+        slopes = alignment(agent, direction, self._learner.settings.learning_rate, gained)
+        parts = {"slope": slopes[..., 0]}
         if self._learner.settings.normalize_advantage:
-            parts["drift"] = found[..., 1]
+            parts["drift"] = slopes[..., 1]
             parts |= {"advantage": advantage.mean(-1), "square": advantage.square().mean(-1)}
-        return TensorDict(parts, found.shape[:2])
+        return TensorDict(parts, slopes.shape[:2])
 
     def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
         """Train on levels [K, n], with an update for each ``batch_size`` of them.
@@ -345,12 +295,10 @@ class TaskStudent(Student):
             self._learner.update(list(generators))
             self._learner.check()
 
-    def snapshot(self) -> TensorDict:
-        """See :meth:`Student.snapshot`."""
+    def _snapshot(self) -> TensorDict:
         return self._learner.snapshot()
 
-    def restore(self, snapshot: TensorDictBase) -> None:
-        """See :meth:`Student.restore`."""
+    def _restore(self, snapshot: TensorDictBase) -> None:
         self._learner.restore(snapshot)
 
     def _filled_up(self, levels: Levels) -> Levels:

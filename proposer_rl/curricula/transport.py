@@ -1,14 +1,117 @@
-"""Optimal transport between distributions over bins, solved exactly as linear programs."""
+"""CurrOT on the bins: a distribution that moves to the target through what is mastered."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.optimize import linprog
+from torch import Tensor
+
+from proposer_rl.curricula.bins import BinCurriculum
+from proposer_rl.curricula.probes import Measure, Probes
+from proposer_rl.curricula.student import Student
+from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Space
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+NOTHING = 1e-6  # a share that is rounding of the solver's
+
+
+class TransportCurriculum(BinCurriculum):
+    """Draws each student's batch from a distribution that moves towards the target.
+
+    At a scoring pass, the distribution p over the bins becomes the nearest to the target, in the
+    2-Wasserstein distance of the space's coordinates, among those that are within epsilon of the
+    present one and on bins in which the student's performance is at least delta (Klink et al. 2022,
+    "Curriculum Reinforcement Learning via Constrained Optimal Transport", ICML). Where no bin is,
+    those of the best performance are taken for it, so that the search begins with what is easiest.
+    A student's first distribution is uniform.
+
+    See :func:`step_towards` for the program, and for what happens when the student forgets.
+
+    Args:
+        space: that has the bins.
+        target_shares: the target as shares of the bins, float [N].
+        delta: least performance of a bin that is drawn from.
+        epsilon: how far the distribution moves at a scoring pass; neighbouring bins of an axis with
+            n values are about 2 / (n - 1) apart.
+        every: batches between two scoring passes.
+        probes: levels of each bin.
+        measure: of performance, ``"success"`` or ``"return"``.
+
+    Raises:
+        ArgumentError: if there is not one share for each bin.
+    """
+
+    shown = ("performance",)
+    needs = ("performance",)
+    remembers = (*BinCurriculum.remembers, "_probes")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target_shares: Tensor,
+        *,
+        delta: float = 0.3,
+        epsilon: Positive = 0.3,
+        every: Count = 5,
+        probes: Count = 16,
+        measure: Measure = "success",
+    ) -> None:
+        super().__init__(space, every=every)
+        if target_shares.shape != (space.size,):
+            raise ArgumentError(
+                f"target_shares={list(target_shares.shape)}: must be one for each of {space.size} "
+                "bins"
+            )
+        self._delta, self._epsilon = delta, epsilon
+        self._probes = Probes(space, probes, measure)
+        target = target_shares.double()
+        self._target = (target / target.sum()).numpy()
+        places = space.coordinates.double()
+        self._costs = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+        self._costs = self._costs.square()
+
+    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
+        """Move the distributions, each by its own student's performance on the probes."""
+        performance = self._probes.performance(student, streams)
+        best = performance.amax(-1, keepdim=True)
+        allowed = performance >= best.clamp(max=self._delta)
+        even = torch.full(performance.shape, 1 / performance.shape[-1], dtype=torch.float64)
+        steps = [
+            step_towards(self._target, now, self._costs.numpy(), mask, self._epsilon)
+            for now, mask in zip(
+                self.scores.get("share", even).numpy(), allowed.numpy(), strict=True
+            )
+        ]
+        shares, left = zip(*steps, strict=True)
+        share = torch.from_numpy(np.stack(shares))
+        share = share.where(share > NOTHING, 0.0)
+        self.scores = {
+            "share": share / share.sum(-1, keepdim=True),
+            "performance": performance,
+            "allowed": allowed,
+            "distance": torch.tensor(left).clamp(min=0).sqrt().unsqueeze(-1),
+        }
+
+    def shares(self) -> Tensor:
+        """Of the bins in the next batch, float [K, N]."""
+        return self.scores["share"]
+
+    def log(self) -> dict[str, Any]:
+        """Besides, how many bins are allowed, and how far off the target is, in W2."""
+        told = super().log()
+        if told:
+            told["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
+            told["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
+        return told
 
 
 def step_towards(
@@ -50,6 +153,15 @@ def step_towards(
         >>> p.round(6).tolist(), round(left, 6)
         ([0.75, 0.25, 0.0], 3.25)
     """
+    # SciPy's solvers take long to import, and no other curriculum needs them.
+    from scipy import sparse
+    from scipy.optimize import linprog
+
+    def sums(shape: tuple[int, int], over: int) -> sparse.coo_array:
+        """What maps a matrix of that shape, row by row, to its sums over an axis."""
+        kept, summed = sparse.eye_array(shape[1 - over]), np.ones((1, shape[over]))
+        return sparse.kron(summed, kept) if over == 0 else sparse.kron(kept, summed)
+
     rows, to, fro = (np.flatnonzero(mask) for mask in (allowed, target > 0, now > 0))
     nearest = costs[np.ix_(rows, fro)].min(0) @ now[fro]  # of all on allowed bins, squared
     count = len(rows)
@@ -58,13 +170,13 @@ def step_towards(
     none_b = sparse.coo_array((len(to), count * len(fro)))
     equal = sparse.block_array(
         [
-            [_sums(shape_a, over=0), none_b],
-            [none_a, _sums(shape_b, over=0)],
-            [_sums(shape_a, over=1), -_sums(shape_b, over=1)],
+            [sums(shape_a, over=0), none_b],
+            [none_a, sums(shape_b, over=0)],
+            [sums(shape_a, over=1), -sums(shape_b, over=1)],
         ]
     )
     cost_a, cost_b = (costs[np.ix_(rows, columns)].ravel() for columns in (to, fro))
-    found = linprog(
+    result = linprog(
         np.concatenate([cost_a, np.zeros_like(cost_b)]),
         A_ub=np.concatenate([np.zeros_like(cost_a), cost_b])[None],
         b_ub=[max(reach**2, nearest)],
@@ -74,14 +186,8 @@ def step_towards(
         # Presolving takes what the shares are off by, 1e-16 in their sums, for a contradiction.
         options={"presolve": False},
     )
-    if found.x is None:
-        raise RuntimeError(f"the transport to the target cannot be computed: {found.message}")
+    if result.x is None:
+        raise RuntimeError(f"the transport to the target cannot be computed: {result.message}")
     p = np.zeros_like(target)
-    p[rows] = found.x[: cost_a.size].reshape(shape_a).sum(1).clip(0)
-    return p / p.sum(), float(found.fun)
-
-
-def _sums(shape: tuple[int, int], over: int) -> sparse.coo_array:
-    """What maps a matrix of that shape, row by row, to its sums over an axis."""
-    kept, summed = sparse.eye_array(shape[1 - over]), np.ones((1, shape[over]))
-    return sparse.kron(summed, kept) if over == 0 else sparse.kron(kept, summed)
+    p[rows] = result.x[: cost_a.size].reshape(shape_a).sum(1).clip(0)
+    return p / p.sum(), float(result.fun)

@@ -88,7 +88,7 @@ class Mixture(Actions):
     """An action is a mixture of bins from which the whole batch is drawn.
 
     Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]: the zero action
-    is the even mixture. Batches of one policy really differ then, and what the Solver gained can be
+    is the uniform one. Batches of one policy really differ then, and what the Solver gained can be
     credited to the mixture that it trained on. The draws are :func:`systematic_draw`.
 
     Args:

@@ -15,9 +15,11 @@ from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.learner import Learner
 from proposer_rl.meta.rewards import Reward, TrainingStep
 from proposer_rl.meta.view import SolverView
+from proposer_rl.settings import signed
 from proposer_rl.streams import Streams
 
 
+@signed
 class SolverTrainingEnv(EnvBase):
     """Training K Solvers as a batch of K episodes (section 5 of the paper).
 
@@ -30,14 +32,14 @@ class SolverTrainingEnv(EnvBase):
     told from chance.
 
     Observations: those of :meth:`~proposer_rl.meta.view.SolverView.observation`, and ``proposed``
-    int64 [K, N], how often each bin was chosen in the step before. Actions: ``action``, as
+    int64 [K, N], how often each bin was drawn in the step before. Actions: ``action``, as
     ``actions`` defines them. Episodes end by ``terminated``.
 
     Args:
         solvers: K of them; see :class:`~proposer_rl.meta.learner.Learner`.
         view: what is seen of the Solvers, and the validation levels that the gain is measured on.
         actions: the levels that an action stands for.
-        reward: what an update is worth; a step is worth the sum of its updates.
+        reward: of an update; that of a step is the sum over its updates.
         meta_episode_length: updates L of an episode.
         action_repeat: updates for which an action holds; divides L.
         first_copy: number of the first of these Solvers, where others are trained elsewhere: a
@@ -128,16 +130,16 @@ class SolverTrainingEnv(EnvBase):
         rewards, choices = [], []
         for update in range(self.action_repeat):
             last = update == self.action_repeat - 1
-            reward, chosen = self._train(tensordict["action"], measure=last)
+            reward, drawn = self._train(tensordict["action"], measure=last)
             rewards.append(reward)
-            choices.append(chosen)
+            choices.append(drawn)
             self.on_update(self._updates)
         proposed = _count(torch.cat(choices, -1), self.actions.bins).to(self.device)
         state = self._observation(*self._seen, proposed)
         return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))
 
     def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
-        """One update of every Solver: its reward [K], and the bins that were chosen [K, P]."""
+        """One update of every Solver: its reward [K], and the bins that were drawn [K, P]."""
         streams = [self.streams.within(self._episode, self._updates, k) for k in self._copies]
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)

@@ -1,4 +1,4 @@
-"""First-order performance gain: what levels are worth to a Solver, without training copies of it.
+"""First-order performance gain: what levels bring a Solver, without training replicas of it.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 
@@ -24,7 +24,7 @@ Here u is scaled to a root mean square of 1 over the parameters of each Solver: 
 moves a parameter by about s, as a step of Adam with that learning rate does. For a million
 parameters together that is a long way, on which returns are no straight lines: with s the learning
 rate the difference is a secant, what a step towards the target changes, and with a twentieth of it
-the derivative (docs/first_order.md compares them).
+the derivative (docs/explanation/first_order.md compares them).
 
 Relatives: gradients of training examples aligned with those of a validation set: TracIn (Pruthi et
 al. 2020, arXiv 2002.08484), example weights (Ren et al. 2018, arXiv 1803.09050); in curricula the
@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -54,7 +55,7 @@ SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 Direction = Mapping[str, Tensor]
 """By the parameters' names, [K, ...]: a direction in which K Solvers can be moved."""
 
-MEASURES = ("log_success", "return")
+Measure = Literal["log_success", "return"]
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
@@ -73,8 +74,9 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     """
     if measure == "return":
         return mean_return(performance)
-    if measure not in MEASURES:
-        raise ValueError(f"measure must be {' or '.join(MEASURES)}, got {measure!r}")
+    if measure not in get_args(Measure):
+        known = " or ".join(get_args(Measure))
+        raise ValueError(f"measure={measure!r}: must be {known}")
     mean, success = mean_log_success(performance), performance["success"]
     hopeless = (success <= 0).all(1)
     if bool(hopeless.any()):
@@ -148,7 +150,7 @@ def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[Non
 
 @torch.no_grad()
 def alignment(
-    agent: ActorCritic, direction: Direction, step: float, worth: Callable[[], Tensor]
+    agent: ActorCritic, direction: Direction, step: float, gained: Callable[[], Tensor]
 ) -> Tensor:
     """The slope along a direction of what K Solvers get, by a central difference.
 
@@ -159,7 +161,7 @@ def alignment(
         agent: the Solvers.
         direction: as :func:`target_direction` makes it.
         step: of the difference, such as the learning rate.
-        worth: what the agent gets as it stands, such as the exact return of levels, or
+        gained: what the agent gets as it stands, such as the exact return of levels, or
             :func:`surrogate`: float [K, E].
 
     Returns:
@@ -176,9 +178,9 @@ def alignment(
         tensor([[6.]])
     """
     with moved(agent, direction, step):
-        ahead = worth()
+        ahead = gained()
     with moved(agent, direction, -step):
-        behind = worth()
+        behind = gained()
     return (ahead - behind) / (2 * step)
 
 

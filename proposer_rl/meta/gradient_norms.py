@@ -29,7 +29,7 @@ from proposer_rl.task import ExactTask, Levels, Task
 AT_ONCE = 16
 """Levels: as many networks, their gradients and their activations are in memory."""
 
-Worth = Callable[[ActorCritic, int, Tensor], Tensor]
+Value = Callable[[ActorCritic, int, Tensor], Tensor]
 """Of m agents in a population, a Solver and the places of m of its levels, int64 [m]: float [m]."""
 
 
@@ -83,18 +83,18 @@ def squared_policy_gradients(
     return score
 
 
-def level_gradients(task: Task) -> Callable[[PPO, Worth, int, int], Tensor]:
+def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
     """Makes what takes the gradient of each level by itself, and a population for it to work with.
 
     The population has :data:`AT_ONCE` Solvers. All of them become copies of one whose levels are to
-    be scored, and each gets one level of its own. So the sum of what they are worth, differentiated
-    once, gives each the gradient of its level.
+    be scored, and each gets one level of its own. So the sum of their values, differentiated once,
+    gives each the gradient of its level.
 
     Args:
         task: that makes Solvers.
 
     Returns:
-        A function of a learner of K Solvers, what a level is worth, K, and the number n of levels
+        A function of a learner of K Solvers, the value of a level, K, and the number n of levels
         of each: the squared lengths of its gradients, float [K, n].
     """
     agent = task.learner([Streams(0)] * AT_ONCE).agent
@@ -105,8 +105,8 @@ def level_gradients(task: Task) -> Callable[[PPO, Worth, int, int], Tensor]:
             for name, parameter in learner.agent.named_parameters():
                 parameters[name].copy_(parameter[solver])
 
-    def lengths(learner: PPO, worth: Worth, solvers: int, count: int) -> Tensor:
-        found = []
+    def lengths(learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
+        parts = []
         for solver in range(solvers):
             become(learner, solver)
             for start in range(0, count, AT_ONCE):
@@ -116,13 +116,13 @@ def level_gradients(task: Task) -> Callable[[PPO, Worth, int, int], Tensor]:
                 )
                 with torch.enable_grad():
                     gradients = torch.autograd.grad(
-                        worth(agent, solver, which).sum(),
+                        value(agent, solver, which).sum(),
                         list(parameters.values()),
                         allow_unused=True,
                         materialize_grads=True,
                     )
                 named = dict(zip(parameters, gradients, strict=True))
-                found.append(squared_length(named)[: count - start])
-        return torch.cat(found).unflatten(0, (solvers, count))
+                parts.append(squared_length(named)[: count - start])
+        return torch.cat(parts).unflatten(0, (solvers, count))
 
     return lengths

@@ -1,4 +1,4 @@
-"""What the Proposer is paid for: functions of one training step of K Solvers, each to float [K]."""
+"""Rewards of the Proposer: functions of one training step of K Solvers, each to float [K]."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Reward = Callable[[TrainingStep], Tensor]
 def performance_gain(step: TrainingStep) -> Tensor:
     """How much the mean return on the validation levels went up: R(after) - R(before).
 
-    The paper's reward (its section on the method; docs/method.md).
+    The paper's reward (its section on the method; docs/explanation/method.md).
 
     Example:
         >>> import torch

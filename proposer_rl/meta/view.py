@@ -28,7 +28,7 @@ class SolverView:
         if validation_levels < 1 or not 0 <= probe_levels <= validation_levels:
             raise ValueError(
                 f"probe_levels={probe_levels} must be at least 0 and at most validation_levels="
-                f"{validation_levels}: the Proposer is shown no more than it is paid for"
+                f"{validation_levels}: the Proposer is shown no more than it is rewarded for"
             )
         self.task = task
         self.validation_levels = validation_levels

@@ -1,7 +1,7 @@
 """A run's folder: tables that grow row by row and that a resumed run cuts back to its checkpoint.
 
-Two kinds of table lie in the folder, told apart by their suffix. ``.csv`` is tidy: a header, then
-rows of numbers and text. ``.jsonl`` holds one JSON object per line, for rows with lists in them. In
+Two kinds of table lie in the folder, with a suffix each. ``.csv`` is tidy: a header, then rows of
+numbers and text. ``.jsonl`` holds one JSON object per line, for rows with lists in them. In
 both, one row is one line, and every float is written so that it reads back bit for bit. A line
 without its newline is a row that a crash interrupted: readers skip it, and
 :meth:`RunFolder.cut_back` removes it.

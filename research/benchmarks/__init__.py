@@ -1,4 +1,4 @@
 """Measurements of speed and memory, where they can be against something timed beside them.
 
-``bin/bench`` runs them; ``docs/benchmark.md`` says what they mean.
+``bin/bench`` runs them; ``docs/explanation/performance.md`` says what they mean.
 """

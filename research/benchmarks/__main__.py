@@ -25,7 +25,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bench",
         description="Measure speed and memory, each against something timed beside it.",
-        epilog="docs/benchmark.md says what the rows mean.",
+        epilog="docs/explanation/performance.md says what the rows mean.",
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks; default: see --list")
     parser.add_argument("--list", action="store_true", help="list the benchmarks and stop")

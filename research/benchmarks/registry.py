@@ -39,7 +39,7 @@ BENCHMARKS = {
     "levels": Benchmark("levels generated per second", generation),
     "shortest_paths": Benchmark("shortest paths against networkx and scipy", shortest_paths),
     "environment": Benchmark("environment steps against Gymnasium", environment_steps),
-    "view": Benchmark("steps in the field's maze against MiniGrid", view_steps),
+    "view": Benchmark("steps in the view maze against MiniGrid", view_steps),
     "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),
     "overhead": Benchmark("what of a Solver update is not the network", overhead),
     "precision": Benchmark("a Solver update in bf16 against fp32", in_both_precisions),

@@ -1,4 +1,4 @@
-"""Steps per second in the field's maze: TorchRL's interface, MiniGrid's own, and jaxued's."""
+"""Steps per second in the partially observable maze: TorchRL's interface, MiniGrid's, jaxued's."""
 
 from __future__ import annotations
 

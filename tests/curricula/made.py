@@ -27,7 +27,7 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.methods import Parts, proposer
+from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (
     ActorCritic,
     ProblemHead,
@@ -92,7 +92,7 @@ def learnt() -> ProposerCurriculum:
     settings = ProposerSettings(
         rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
     )
-    return proposer(Parts(TASK, settings, [0]))
+    return proposer(Components(TASK, settings, [0]))
 
 
 def frozen() -> ProposerCurriculum:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from proposer_rl.curricula import (
     Batch,
-    Curriculum,
     Filtered,
     Improvement,
     LearnedCurriculum,
@@ -196,29 +195,3 @@ def test_each_curriculum_of_a_mixture_has_its_share(count: int, shares: list[int
             part.first + i for i in range(share)
         ]
     assert curriculum.log() == {f"{i}_seen": part.seen for i, part in enumerate(parts)}
-
-
-def test_shares_are_checked() -> None:
-    two: list[Curriculum] = [SamplingCurriculum(TASK.space)] * 2
-    for shares, message in (
-        ([1.0], "2 curricula need as many shares"),
-        ([1.0, -1.0], "shares must be a finite number of at least 0"),
-        ([0.0, 0.0], "sum of shares must be"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Mixed(two, shares)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "message"),
-    [
-        ({"times": 1}, "times must be a whole number from 2 to"),
-        ({"temperature": 0.0}, "temperature must be a finite number above 0, got 0.0"),
-    ],
-)
-def test_a_filter_that_makes_no_sense_is_refused(numbers: dict[str, Any], message: str) -> None:
-    scorer = GivenScores(torch.zeros(1, 1))
-    with pytest.raises(ValueError, match=message):
-        Filtered(SamplingCurriculum(TASK.space), scorer, **numbers)
-    with pytest.raises(ValueError, match="filter the curricula of a mixture, each by itself"):
-        Filtered(Schedule([Mixed([SamplingCurriculum(TASK.space)], [1])], []), scorer)

@@ -11,10 +11,10 @@ SMOKE = ("+scale=smoke", "compute.progress=false", "hydra.run.dir=run")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["+method=learning_progress", "curriculum.fast=1"], "curriculum: fast must be from 0 to"),
-        (["+method=alp_gmm", "curriculum.refit=300"], "components=10 must be at most refit=300"),
-        (["+method=currot", "curriculum.epsilon=.nan"], "curriculum: epsilon must be a finite"),
-        (["+method=currot", "compute.collector=multiprocess"], "this method trains no copies"),
+        (["+method=learning_progress", "curriculum.fast=1"], "curriculum.fast=1: input should be"),
+        (["+method=alp_gmm", "curriculum.refit=300"], "warmup=250: a mixture is fitted"),
+        (["+method=currot", "curriculum.epsilon=.nan"], "curriculum.epsilon=nan: input should"),
+        (["+method=currot", "compute.collector=multiprocess"], "this method trains no replicas"),
     ],
 )
 def test_the_command_refuses_in_one_line(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from proposer_rl import curricula
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
@@ -21,7 +24,7 @@ from proposer_rl.curricula import (
     outcome_of,
     require,
 )
-from proposer_rl.curricula.student import SIGNATURES
+from proposer_rl.curricula.student import ABILITIES
 from proposer_rl.streams import Streams
 from tests.curricula.living import check_each_lives_alone, check_it_resumes, live, solvers
 from tests.curricula.made import LEARNED, MADE, SPACE, Make, P, replay
@@ -198,6 +201,12 @@ def test_an_inbox_hands_out_in_order_and_waits_for_what_is_incomplete() -> None:
     assert inbox.take() == []
 
 
+def test_no_module_hides_a_method() -> None:
+    """``proposer_rl.curricula.NAME`` is the method of that name."""
+    modules = {path.stem for path in Path(curricula.__path__[0]).glob("*.py")}
+    assert not modules & {path.stem for path in CONFIG_FOLDER.glob("method/*.yaml")}
+
+
 def test_a_curriculum_must_propose() -> None:
     with pytest.raises(TypeError, match="Curriculum must define propose"):
         Curriculum().propose(Student(), 1, [Streams(0)])
@@ -215,11 +224,9 @@ def test_a_student_that_lacks_something_is_named() -> None:
         require(poor, ("play", "values", "probe", "performance"), "plr")
         with pytest.raises(UnfitStudentError, match=f"it needs a student with {need}: {reason}"):
             require(poor, (need,), "it")
-    for name in SIGNATURES:
+    for name in ABILITIES:
         with pytest.raises(UnfitStudentError, match=rf"{name}: it has no {name}\("):
-            getattr(Student(), name)(
-                *[None] * (SIGNATURES[name].count(",") + 1 - (name == "snapshot"))
-            )
+            getattr(Student(), name)
     with pytest.raises(ValueError, match="sing: a student can have values, play"):
         Student(sing=print)
 

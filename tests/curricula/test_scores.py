@@ -230,13 +230,6 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
         torch.testing.assert_close(here, share * (1 - share), atol=1e-6, rtol=0)
 
 
-def test_what_cannot_be_scored_is_refused_in_one_line() -> None:
-    with pytest.raises(ValueError, match=r"score='luck': from source=exact there are \['learn"):
-        Scorer("luck", "exact")
-    with pytest.raises(ValueError, match="source must be episodes or exact, got 'oracle'"):
-        Scorer("regret", "oracle")  # type: ignore[arg-type]
-
-
 def test_without_a_rollout_success_and_return_are_what_a_level_is_scored_by() -> None:
     outcome = TensorDict(
         {"return": torch.tensor([[0.2]]), "success": torch.tensor([[0.25]])}, [1, 1]

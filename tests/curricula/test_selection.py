@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 
@@ -73,16 +71,3 @@ def test_the_mixture_is_exact(new: float, fresh: int) -> None:
     if fresh:
         drawn = level_keys(fresh_levels(TASK.space, fresh, [Streams(0)], "levels"))
         assert torch.equal(keys[:, P - fresh :], drawn)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"every": 0}, "every must be a whole number from 1"),
-        ({"keep": 17}, "keep=17 must be at most candidates=16"),
-        ({"new": -0.1}, "new must be from 0 to 1, got -0.1"),
-    ],
-)
-def test_numbers_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        selection(**options)

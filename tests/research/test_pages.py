@@ -93,7 +93,7 @@ def pages(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_best_depends_on_what_there_is_and_on_what_is_scarce(runs: Path) -> None:
-    """Levels that are sorted by hand nobody has here: that method is not chosen."""
+    """A schedule nobody has here: that method is not chosen."""
     best = {
         there: [choice.best.label if choice else None for choice in row.values()]
         for there, row in choices(study_of(runs), NEEDS).items()
@@ -241,7 +241,7 @@ def test_the_same_runs_give_the_same_pages(
 def test_the_pages_say_what_was_found(pages: Path) -> None:
     text = (pages / CHOICE).read_text(encoding="utf-8")
     assert "| **perf\\_gain** 0." in text and "better than all others (" in text
-    assert "hand\\_designed (a target, levels sorted by hand)" in text
+    assert "hand\\_designed (a schedule, a target)" in text
     claims = (pages / CLAIMS).read_text(encoding="utf-8")
     ours = claims.partition("## Our claims")[2]
     assert claims.count("**Supported**") and ours.count("**Not tested**") == 3

@@ -70,11 +70,11 @@ class Drawings:
         return shipped_levels(name, self._task.level)
 
     def read_file(self, text: str) -> Mapping[str, Level]:
-        """The levels of a file's text; docs/levels.md has the format."""
+        """The levels of a file's text; docs/how_to/levels.md has the format."""
         return levels_from_text(text, kind=self._task.level)
 
     def write_file(self, name: str, level: Level) -> str:
-        """A file's text; docs/levels.md has the format."""
+        """A file's text; docs/how_to/levels.md has the format."""
         return levels_to_text({name: level})
 
 

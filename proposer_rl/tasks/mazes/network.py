@@ -27,7 +27,7 @@ def unet(settings: NetworkSettings, planes: int) -> UNet:
 def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     """``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
 
-    That is a wide network on a CPU with instructions for it; see docs/benchmark.md.
+    That is a wide network on a CPU with instructions for it; see docs/explanation/performance.md.
 
     Args:
         channels: of the Solver's network.

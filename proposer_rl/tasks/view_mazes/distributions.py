@@ -1,4 +1,4 @@
-"""What the field's levels are drawn from: named kinds of them, and the Proposer's bins."""
+"""What levels are drawn from: named kinds of them, and the Proposer's bins."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class ViewSpace:
     """Bins of levels: every number of walls, or each of these with every length of the path.
 
     Without lengths start and goal are anywhere, and may have no path between them: levels drawn
-    uniformly from all bins are the field's domain randomization. With lengths every level has
-    a shortest path of exactly so many moves.
+    uniformly from all bins are domain randomization as in PLR, ACCEL and SFL. With lengths every
+    level has a shortest path of exactly so many moves.
 
     Args:
         settings: numbers and lengths.

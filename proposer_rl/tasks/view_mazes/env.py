@@ -8,8 +8,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical
 
+from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import cell_index
 from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
@@ -24,6 +25,7 @@ AGENT = (VIEW // 2, VIEW - 1)  # where the agent is in its view
 PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
 
 
+@signed
 class ViewMazeEnv(LevelEnv):
     """The maze of PAIRED, PLR, ACCEL, SFL and their libraries; a batch of them.
 
@@ -32,20 +34,18 @@ class ViewMazeEnv(LevelEnv):
     - Observation, what a Solver sees: ``"view"``, uint8 ``[*B, 5, 5]``, and ``"direction"``, int64
       ``[*B]``, 0 right, 1 down, 2 left, 3 up. The view shows the cells before the agent: 1 empty, 2
       wall, 8 goal, as MiniGrid's ``image[:, :, 0]`` with ``agent_view_size=5`` and
-      ``see_through_walls=True``, which are the field's. The first index runs from the agent's left
-      to its right, the second from afar to near; the agent is at ``[2, 4]`` and not shown. Walls
-      hide nothing; outside of the grid there are walls.
-    - State besides: ``"agent"``, ``"step_count"``
-    (:class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`),
-      and ``"is_init"``, bool ``[*B, 1]``, whether an episode begins, as TorchRL calls it.
+      ``see_through_walls=True``, as PLR, ACCEL and SFL have it. The first index runs from the
+      agent's left to its right, the second from afar to near; the agent is at ``[2, 4]`` and not
+      shown. Walls hide nothing; outside of the grid there are walls.
+    - State besides: ``"agent"``, ``"step_count"``, and ``"is_init"``, bool ``[*B, 1]``, whether an
+      episode begins, as TorchRL calls it.
     - Reward: float32 ``[*B, 1]``, 1 - 0.9 t / ``max_steps`` on entering the goal with step t, else
       0.
     - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
       elsewhere.
 
     Args:
-        levels: Levels of any batch shape ``[*B]``, valid
-            (:func:`~proposer_rl.tasks.view_mazes.levels.validate_view_levels`).
+        levels: As of :class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`.
         max_steps: Step limit of an episode.
 
     Raises:
@@ -62,22 +62,13 @@ class ViewMazeEnv(LevelEnv):
 
     def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
         super().__init__(levels, max_steps)
-        self._make_specs()
-
-    def _make_specs(self) -> None:
-        batch, (height, width) = self.batch_size, self._grid
-        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
-        self.observation_spec = Composite(
+        batch = self.batch_size
+        self._specify(
+            actions=FORWARD + 1,
             view=Bounded(EMPTY, GOAL, (*batch, VIEW, VIEW), dtype=torch.uint8),
             direction=Categorical(len(AHEAD), shape=batch),
-            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
-            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
             is_init=Binary(1, (*batch, 1), dtype=torch.bool),
-            shape=batch,
-        ).to(self.device)
-        self.action_spec = Categorical(3, shape=batch, device=self.device)
-        self.reward_spec = Unbounded((*batch, 1), device=self.device)
-        self.done_spec = self._ends()
+        )
 
     def _tabulate(self, levels: ViewLevel) -> None:
         """Takes levels up as one line of objects, of all grids with their rims one after another.

@@ -19,7 +19,7 @@ MOST_DRAWS = 1000  # of a level whose goal is to be reachable
 def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
     """Levels with exact numbers of walls; their cells, start, goal and direction are uniform.
 
-    Nothing else is asked of them: the goal may be out of reach, as in the field's generators.
+    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's.
 
     Args:
         count: of the walls of each level, int64 ``[N]`` on the CPU, at most H * W - 2.
@@ -75,12 +75,12 @@ def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -
         beside = here.unsqueeze(1) + step  # [N, 4, 2]
         open_ = new[levels.unsqueeze(1), beside[..., 0], beside[..., 1]]
         chance = torch.rand(number, len(AHEAD), generator=draw)
-        chosen = step[chance.where(open_, -1.0).argmax(1)]
+        moved = step[chance.where(open_, -1.0).argmax(1)]
         on = open_.any(1)
         trail[depth, levels] = here
         depth = torch.where(on, depth + 1, (depth - 1).clamp(min=0))
-        there = torch.where(on.unsqueeze(1), here + chosen, trail[depth, levels])
-        between = 2 * here - 2 + chosen * on.unsqueeze(1)
+        there = torch.where(on.unsqueeze(1), here + moved, trail[depth, levels])
+        between = 2 * here - 2 + moved * on.unsqueeze(1)
         free[levels, between[:, 0], between[:, 1]] = True
         new[levels, there[:, 0], there[:, 1]] = False
         here = there

@@ -1,4 +1,4 @@
-"""The user's files of the field's levels: drawings, jaxued's module, MiniGrid's encodings."""
+"""The user's files of levels with directions: drawings, jaxued's module, MiniGrid's encodings."""
 
 from __future__ import annotations
 

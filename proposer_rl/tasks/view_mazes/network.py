@@ -1,4 +1,4 @@
-"""The Solver of the field's maze: a convolution over the view, the direction, and memory."""
+"""The Solver's network: a convolution over the view, the direction, and memory."""
 
 from __future__ import annotations
 

@@ -1,0 +1,70 @@
+"""A run from overrides, in a process that is not Hydra's: what ``prl.train`` calls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.singleton import Singleton
+from hydra.errors import HydraException
+from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from proposer_rl.cli.config import ConfigError, check_groups, read_config
+from proposer_rl.cli.hydra_errors import explained
+from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.cli.run import carry_out
+from proposer_rl.runs.signals import StopSignals
+
+
+def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:
+    """Train as ``bin/train`` with these overrides does.
+
+    Args:
+        overrides: as on the command line.
+        own: what takes the place of top-level keys; of a task or curriculum that no file has.
+        folder: the run's; None for a new one below ``outputs/``.
+
+    Returns:
+        The run's folder.
+
+    Raises:
+        ConfigError: naming the first wrong key, its value and what is allowed.
+        Interrupted: if a signal asked the run to stop; all is saved then.
+    """
+    with _composed(overrides) as config:
+        with open_dict(config):
+            del config["hydra"]
+            for key, value in own.items():
+                config[key] = value
+        path = folder or Path("outputs") / str(config.method) / _moment(config.seed)
+        check_groups(list(overrides))
+        carry_out(read_config(config), path, StopSignals())
+    return path
+
+
+def _moment(seed: Any) -> str:
+    return f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{seed}"
+
+
+@contextmanager
+def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
+    """The configuration, which Hydra's globals hold meanwhile; a Hydra around us gets them back."""
+    before = Singleton.get_state()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+            config = compose("train", list(overrides), return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        yield config
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(explained(error)) from error
+    finally:
+        Singleton.set_state(before)

@@ -1,0 +1,300 @@
+"""ALP-GMM: levels from where a mixture of Gaussians has seen absolute learning progress."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal, NamedTuple
+
+import torch
+from annotated_types import Interval
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.bins import BinCounts
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.student import Student
+from proposer_rl.extras import install_command
+from proposer_rl.settings import ArgumentError, Share, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Space
+
+LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
+CHUNK = 2**16  # earlier episodes that are compared at once
+TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
+
+
+class TaskMixture(NamedTuple):
+    """Gaussians over points and progress; the last of the D + 1 coordinates is progress.
+
+    Attributes:
+        means: float64 [J, D + 1].
+        covariances: float64 [J, D + 1, D + 1].
+    """
+
+    means: Tensor
+    covariances: Tensor
+
+
+class MixtureCurriculum(Curriculum):
+    """Draws each student's levels as points of a box, and rounds them to the space's bins.
+
+    A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
+    coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
+    that of the nearest earlier task in the student's whole history. The first ``warmup`` points are
+    drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
+    fitted to the points and the progress of the last ``refit``, from which all but a part of the
+    draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
+    :func:`fit` and :func:`draw`).
+
+    Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.
+    Bins and not points are compared: between two points with a border of bins in between, the
+    difference of the bins would pass for progress for ever.
+
+    The episodes of one batch are played by one and the same student: none of them is earlier than
+    another, and each is compared with those of earlier batches. Of equally near ones the last
+    counts.
+
+    Args:
+        space: that has the bins.
+        source: of the return: ``"episodes"`` for what came of training on the level; ``"exact"``
+            for the student's performance on it when it was proposed, which costs an evaluation and
+            is exact where that is.
+        warmup: episodes before the first mixture.
+        refit: episodes between two mixtures, and that one is fitted to.
+        components: the most Gaussians of a mixture; there are at least two.
+        exploration: part of the draws that come uniformly from the box.
+
+    Raises:
+        ValueError: if scikit-learn is missing, or the numbers of episodes are not in order.
+    """
+
+    remembers = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        *,
+        source: Literal["episodes", "exact"] = "episodes",
+        warmup: TwoOrMore = 250,
+        refit: TwoOrMore = 250,
+        components: TwoOrMore = 10,
+        exploration: Share = 0.2,
+    ) -> None:
+        if find_spec("sklearn") is None:
+            raise ValueError(
+                f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"
+            )
+        if not components <= refit <= warmup:
+            raise ArgumentError(
+                f"components={components}: must be at most refit={refit}, and that at most "
+                f"warmup={warmup}: a mixture is fitted to that many episodes"
+            )
+        self.space = space
+        self.needs = ("performance",) if source == "exact" else ()
+        self._source, self._components, self._refit = source, components, refit
+        self._warmup, self._exploration = warmup, exploration
+        # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
+        self._history: dict[str, Tensor] = {}
+        self._mixtures: list[TaskMixture] = []  # of each student
+        self._fitted = 0  # episodes at the last fit
+        self._inbox = Inbox()
+        self._counts = BinCounts(space)
+        self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
+
+    @property
+    def episodes(self) -> int:
+        """Episodes H in the history of each student."""
+        return self._history["returns"].shape[1] if self._history else 0
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [K, n] of the bins nearest to the points drawn."""
+        self._take_in()
+        self._fit(streams)
+        drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
+        points = torch.stack(drawn)
+        bins = nearest(points.flatten(0, 1), self.space.coordinates.double()).view(points.shape[:2])
+        levels = self.space.generate(bins, [s.generator("levels") for s in streams])
+        notes = {"bins": bins, "points": points}
+        if self._source == "exact":
+            reached = student.performance(levels, streams[0].generator("performance"))["return"]
+            notes["returns"] = reached.double().cpu()
+        return self._inbox.batch(levels, **notes)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Put tasks and returns aside for the histories."""
+        self._inbox.check(batch, outcome)
+        notes = batch.notes
+        self._counts.add(notes["bins"])
+        returns = outcome["return"].double() if self._source == "episodes" else notes["returns"]
+        self._inbox.put(batch, points=notes["points"], bins=notes["bins"], returns=returns)
+
+    def log(self) -> dict[str, Any]:
+        """Counts, the mixtures, and how often a draw was clipped."""
+        self._take_in()
+        if not self._history:
+            return {}
+        drawn, clipped = self._drawn.tolist()
+        self._drawn = torch.zeros_like(self._drawn)
+        return {
+            "histogram": self._counts.histogram(),
+            "progress": self._history["progress"][:, -self._refit :].mean(1).tolist(),
+            "components": [len(mixture.means) for mixture in self._mixtures],
+            "means": [mixture.means.tolist() for mixture in self._mixtures],
+            "clipped": clipped / drawn if drawn else 0.0,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with histories and mixtures."""
+        super().load_state_dict(state)
+        self._mixtures = [TaskMixture(*mixture) for mixture in self._mixtures]
+
+    def _take_in(self) -> None:
+        """Add tasks, returns and progress to the histories."""
+        for evidence in self._inbox.take():
+            self._remember(evidence)
+
+    def _remember(self, evidence: TensorDict) -> None:
+        tasks, returns = self.space.coordinates.double()[evidence["bins"]], evidence["returns"]
+        progress = torch.zeros_like(returns)
+        if history := self._history:
+            past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)
+            progress = torch.stack([absolute_progress(*own) for own in past])
+        new = {
+            "points": evidence["points"],
+            "tasks": tasks,
+            "returns": returns,
+            "progress": progress,
+        }
+        self._history = {
+            name: torch.cat([history[name], entry], 1) if history else entry
+            for name, entry in new.items()
+        }
+
+    def _fit(self, streams: Sequence[Streams]) -> None:
+        """Fit new mixtures if it is time."""
+        due = self.episodes // self._refit > self._fitted // self._refit
+        if self.episodes < self._warmup or not due:
+            return
+        last = {name: entry[:, -self._refit :] for name, entry in self._history.items()}
+        seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [K, refit, D + 1]
+        self._mixtures = [
+            fit(own, self._components, s.generator("mixture"))
+            for own, s in zip(seen, streams, strict=True)
+        ]
+        self._fitted = self.episodes
+
+    def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
+        """A batch of points for one student, float64 [n, D]."""
+        size = self.space.coordinates.shape[1]
+        uniform = 2 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 1
+        if not self._mixtures:
+            return uniform
+        explored = torch.rand(count, generator=generator) < self._exploration
+        drawn = draw(self._mixtures[student], count, generator)
+        kept = drawn.clamp(-1, 1)
+        clipped = (kept != drawn).any(-1) & ~explored
+        self._drawn = self._drawn + torch.stack([(~explored).sum(), clipped.sum()])
+        return torch.where(explored.unsqueeze(-1), uniform, kept)
+
+
+def fit(points: Tensor, most: int, generator: torch.Generator) -> TaskMixture:
+    """The mixture of 2 to ``most`` Gaussians with the least AIC.
+
+    Full covariances, expectation maximisation from one start by k-means
+    (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
+
+    Args:
+        points: float [n, D + 1], n at least ``most``.
+        most: components that are tried.
+        generator: of the starts.
+    """
+    # Only this method needs it, and it takes a second to import.
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+    from threadpoolctl import threadpool_limits
+
+    data = points.double().numpy()
+    seeds = torch.randint(2**31, (most - 1,), generator=generator).tolist()
+    # Several threads would add up in any order, and the same run would not come out again.
+    with warnings.catch_warnings(), threadpool_limits(1):
+        # Fewer distinct points than components, or slow convergence: the AIC decides on what came.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        mixtures = [
+            GaussianMixture(count, random_state=seed).fit(data)
+            for count, seed in zip(range(2, most + 1), seeds, strict=True)
+        ]
+        best = min(mixtures, key=lambda one: float(one.aic(data)))
+    return TaskMixture(torch.from_numpy(best.means_), torch.from_numpy(best.covariances_))
+
+
+def draw(mixture: TaskMixture, count: int, generator: torch.Generator) -> Tensor:
+    """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
+
+    Where no Gaussian has progress, all are alike.
+
+    Args:
+        mixture: of points with D coordinates.
+        count: number P of draws.
+        generator: of the CPU.
+
+    Returns:
+        float64 [P, D].
+    """
+    progress = mixture.means[:, -1].clamp(min=0)
+    weights = progress if bool(progress.sum() > 0) else torch.ones_like(progress)
+    which = torch.multinomial(weights, count, replacement=True, generator=generator)
+    # Without its last coordinate a Gaussian is one of the others' means and covariances.
+    means, spread = mixture.means[:, :-1], mixture.covariances[:, :-1, :-1]
+    noise = torch.randn(count, means.shape[1], 1, generator=generator, dtype=means.dtype)
+    return means[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
+
+
+def nearest(points: Tensor, places: Tensor) -> Tensor:
+    """The place nearest to each point, the last of equally near ones.
+
+    Args:
+        points: float [n, D].
+        places: float [m, D], m at least 1.
+
+    Returns:
+        int64 [n].
+
+    Example:
+        >>> nearest(torch.tensor([[0.9], [0.5]]), torch.tensor([[0.0], [1.0], [1.0]]))
+        tensor([2, 2])
+    """
+    best = torch.full((len(points),), torch.inf, dtype=points.dtype)
+    which = torch.zeros(len(points), dtype=torch.int64)
+    for start in range(0, len(places), CHUNK):
+        some = places[start : start + CHUNK].flip(0)  # min takes the first, flipped the last
+        # Through a matrix product, equal distances would not come out equal.
+        apart = torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist")
+        least, index = apart.min(1)
+        which = torch.where(least <= best, start + len(some) - 1 - index, which)
+        best = torch.minimum(best, least)
+    return which
+
+
+def absolute_progress(
+    tasks: Tensor, returns: Tensor, new_tasks: Tensor, new_returns: Tensor
+) -> Tensor:
+    """|r - r'| of new episodes, r' the return on the nearest of earlier tasks; else 0.
+
+    Portelas et al. 2019 (arXiv 1910.07224), equation of the absolute learning progress. As in their
+    code, it is 0 as long as no more than five are stored.
+
+    Args:
+        tasks: the earlier ones, the oldest first, float [H, D].
+        returns: on them, float [H].
+        new_tasks: those of the new episodes, float [P, D].
+        new_returns: on them, float [P].
+
+    Returns:
+        float [P].
+    """
+    if len(returns) < LEAST_STORED:
+        return torch.zeros_like(new_returns)
+    return (new_returns - returns[nearest(new_tasks, tasks)]).abs()

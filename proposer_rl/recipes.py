@@ -1,0 +1,175 @@
+"""Tasks and curricula by name: what ``prl.tasks.maze()`` and ``prl.curricula.plr()`` return.
+
+The names, their settings and the defaults are those of the files in ``conf/task`` and
+``conf/method``, which the command line reads, too; so both sides of the library know the same.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from proposer_rl.settings import ArgumentError
+
+PACKAGE = Path(__file__).resolve().parent
+# In a wheel the configuration lies in the package, in a checkout beside it.
+CONFIG_FOLDER = next(
+    (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
+    PACKAGE / "conf",
+)
+KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
+CONSTANTS = {"null", "true", "false", "nan", "inf"}
+MISSING = "???"  # in a file: to be given
+KEYS = {"task": "task", "method": "curriculum"}
+"""Where the settings of a group's files stand in the configuration."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A task or a curriculum that is made when a run begins.
+
+    Attributes:
+        group: ``"task"`` or ``"method"``.
+        name: of a file in that folder of the configuration; or of a function of one's own.
+        settings: that differ from the file's, by name; mappings are merged into those there.
+        target: dotted name of one's own class or function; None for a file's.
+    """
+
+    group: Literal["task", "method"]
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    target: str | None = None
+
+    def overrides(self) -> list[str]:
+        """The same on the command line, but for what is one's own."""
+        if self.target is not None:
+            return ["~task"] if self.group == "task" else []
+        group = "task" if self.group == "task" else "+method"
+        key = KEYS[self.group]
+        given = [f"++{key}.{name}={override_value(v)}" for name, v in self.settings.items()]
+        return [f"{group}={self.name}", *given]
+
+    def own(self) -> dict[str, Any]:
+        """The part of the configuration that no file has: one's own task or curriculum."""
+        if self.target is None:
+            return {}
+        named = {"method": self.name} if self.group == "method" else {}
+        return {**named, KEYS[self.group]: {"_target_": self.target, **self.settings}}
+
+
+def own_recipe(
+    group: Literal["task", "method"], make: Callable[..., Any], **settings: Any
+) -> Recipe:
+    """A recipe for a class or function of one's own, which other processes can import.
+
+    Args:
+        group: ``"task"``, or ``"method"`` for a curriculum.
+        make: of a task, called with the settings, ``solver`` and ``context``; of a curriculum, with
+            the run's :class:`~proposer_rl.methods.Components` and the settings.
+        settings: numbers, texts, lists and mappings.
+
+    Raises:
+        ArgumentError: if it cannot be imported by its name.
+    """
+    name = f"{make.__module__}.{make.__qualname__}"
+    if make.__module__ == "__main__" or "<" in name:
+        raise ArgumentError(
+            f"make={name}: must be importable, as a class or function of a module is, so that "
+            "watch, eval and play can make it again"
+        )
+    return Recipe(group, make.__name__, settings, name)
+
+
+def available(group: str) -> list[str]:
+    """The names of the files of a group."""
+    return sorted(file.stem for file in (CONFIG_FOLDER / group).glob("*.yaml"))
+
+
+def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
+    """The function ``prl.curricula.NAME`` or ``prl.tasks.NAME``, with its file's settings.
+
+    Raises:
+        AttributeError: if there is no such file, with those that there are.
+    """
+    if name.startswith("__") or name not in available(group):
+        known = ", ".join(available(group))
+        raise AttributeError(f"there is no {name!r}; there are: {known}")
+    settings = _settings(group, name)
+    parameters = [
+        inspect.Parameter(
+            key,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if value == MISSING else value,
+        )
+        for key, value in settings.items()
+    ]
+
+    def make(**given: Any) -> Recipe:
+        unknown = [key for key in given if key not in settings]
+        if unknown:
+            raise ArgumentError(f"{unknown[0]}: unknown; there are: {', '.join(settings)}")
+        for key, value in settings.items():
+            if value == MISSING and key not in given:
+                raise ArgumentError(f"{key}: missing")
+        return Recipe(group, name, given)
+
+    make.__name__ = make.__qualname__ = name
+    make.__doc__ = f"{_about(group, name)}\n\nThe settings are those of conf/{group}/{name}.yaml."
+    make.__signature__ = inspect.Signature(parameters, return_annotation=Recipe)  # type: ignore[attr-defined]
+    return make
+
+
+def override_value(value: Any) -> str:
+    r"""A value of Python's as Hydra's grammar of overrides takes it.
+
+    Raises:
+        ArgumentError: if it is neither a number, a text, a list nor a mapping of such.
+
+    Example:
+        >>> override_value({"a": [1, None, True], "b": "it's"})
+        "{a: [1, null, true], b: 'it\\'s'}"
+    """
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str | Path):
+        return "'" + str(value).replace("\\'", "\\\\'").replace("'", r"\'") + "'"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(k)}: {override_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(override_value, value)) + "]"
+    raise ArgumentError(f"{value!r}: must be a number, a text, a list or a mapping of such")
+
+
+def _key(key: Any) -> str:
+    if not isinstance(key, str) or not KEY.fullmatch(key) or key.casefold() in CONSTANTS:
+        raise ArgumentError(
+            f"{key!r}: a name must begin with a letter, and have letters, digits, underscores, "
+            "hyphens and single spaces alone"
+        )
+    return key
+
+
+def _settings(group: str, name: str) -> dict[str, Any]:
+    """The settings in a file and in those that it builds on, the file's own last."""
+    text = (CONFIG_FOLDER / group / f"{name}.yaml").read_text(encoding="utf-8")
+    content = yaml.safe_load(text) or {}
+    settings: dict[str, Any] = {}
+    for default in content.get("defaults", ()):
+        if isinstance(default, str) and default in available(group):
+            settings |= _settings(group, default)
+    settings |= content.get(KEYS[group]) or {}
+    return {key: value for key, value in settings.items() if key != "_target_"}
+
+
+def _about(group: str, name: str) -> str:
+    text = (CONFIG_FOLDER / group / f"{name}.yaml").read_text(encoding="utf-8")
+    lines = (line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+    return next(line for line in lines if not line.startswith("@package"))

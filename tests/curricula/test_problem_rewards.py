@@ -1,0 +1,144 @@
+"""The Proposer that is rewarded for each problem, on Solvers whose best batch is known."""
+
+from __future__ import annotations
+
+import copy
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from proposer_rl.curricula import Filtered, FirstOrderProposer, Student
+from proposer_rl.learning import DivergedError
+from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.models import (
+    ProblemHead,
+    ProposerNetwork,
+    categorical,
+    draw,
+    proposer_actor_critic,
+)
+from proposer_rl.models.actor_critic import ActorCritic
+from proposer_rl.streams import Streams
+from tests.curricula.scripted import GivenScores
+from tests.curricula.test_first_order import BINS, P, Skills, taught
+
+WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
+
+
+class Seen(Skills):
+    """Skills that a Proposer looks at."""
+
+    def probe(self, agent: nn.Module, levels: Tensor) -> Tensor:  # type: ignore[override]
+        return torch.ones(len(self.agent.skills), len(levels), 3)
+
+
+def agent() -> ActorCritic:
+    torch.manual_seed(0)
+    head = ProblemHead(8, P, BINS, hidden=16, bands=4)
+    network = ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
+    return proposer_actor_critic(network, categorical)
+
+
+def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
+    chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
+    return FirstOrderProposer(
+        task.space,
+        task.target,
+        agent(),
+        PPOSettings(**chosen),
+        probe_levels=2,
+        target_levels=3,
+        measure="return",
+    )
+
+
+@pytest.mark.parametrize(
+    ("paid", "told"),
+    [(torch.inf, "copy 0: reward is"), (1e38, "loss_objective of gradient step 0")],
+)
+def test_numbers_that_went_wrong_are_told_where_they_arise(
+    paid: float, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task)
+    monkeypatch.setattr(curriculum, "reward", lambda *_: (torch.full((1, P), paid), {}))
+    with pytest.raises(DivergedError, match=f"^the Proposer: {told}"):
+        curriculum.propose(taught(task), P, [Streams(0, 0)])
+
+
+def test_it_learns_to_choose_what_the_target_needs() -> None:
+    task = Seen(1, WANTED)
+    curriculum = proposer(task)
+    for update in range(60):
+        student = taught(task)
+        batch = curriculum.propose(student, P, [Streams(0, update)])
+    assert batch.levels.shape == (1, P)
+    assert (student.frames, student.evaluations) == (0, 3 + 2 * P)
+    assert (batch.levels == 2).float().mean() > 0.8
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
+    """Also those that the Solver does not train on."""
+    task = Seen(1, WANTED)
+    curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
+    expected, student = copy.deepcopy(curriculum.agent), taught(task)
+    scores = torch.arange(float(times * P)).unsqueeze(0)
+    whole = (
+        curriculum
+        if times == 1
+        else Filtered(curriculum, GivenScores(scores), times=times, temperature=1e-3)
+    )
+    batch = whole.propose(student, P, [Streams(0)])
+    assert student.evaluations == 3 + 2 * P * times
+
+    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
+    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
+    noise = torch.rand(times, 1, P, generator=Streams(0).generator("choices"))
+    choices = draw(policy, noise)  # [times, 1, P]
+    # Of the scores above those of the last are the highest.
+    assert sorted(batch.levels[0].tolist()) == sorted(choices[-1, 0].tolist())
+    paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
+    advantage = (paid - paid.mean()) / paid.std()
+    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
+    by_hand = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
+    loss.backward()
+    by_hand.step()
+    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
+    """The bounds of TorchRL's clipping, and Adam's moments after a checkpoint, read to the CPU."""
+    begun, task = proposer(Seen(1, WANTED)), Seen(1, WANTED)
+    begun.propose(taught(task), P, [Streams(0)])
+    there = SimpleNamespace(sample=lambda count, generator: torch.full((count,), -1, device="meta"))
+    elsewhere = FirstOrderProposer(task.space, there, agent().to("meta"), PPOSettings())
+    elsewhere.load_state_dict(begun.state_dict())
+    assert all(bound.is_meta for bound in elsewhere._loss.buffers())
+    moments = [
+        entry
+        for state in elsewhere._adam.state.values()
+        for key, entry in state.items()
+        if key != "step"  # which Adam counts on the CPU
+    ]
+    assert moments and all(moment.is_meta for moment in moments)
+
+
+def test_a_proposer_that_has_not_begun_resumes_too() -> None:
+    task = Seen(1, WANTED)
+    one, other = proposer(task), proposer(task)
+    other.load_state_dict(one.state_dict())
+    assert one.log() == {}
+    levels = [c.propose(taught(task), P, [Streams(0)]).levels for c in (one, other)]
+    assert torch.equal(*levels)
+
+
+def test_several_solvers_are_refused() -> None:
+    task = Seen(2, WANTED)
+    with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
+        proposer(task).propose(Student(), P, [Streams(0), Streams(1)])

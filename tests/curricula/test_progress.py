@@ -1,0 +1,181 @@
+"""The bandit of learning progress, against averages written out and students that are scripts."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from proposer_rl.curricula.progress import (
+    LearningProgressCurriculum,
+    progress_shares,
+    stretched,
+)
+from proposer_rl.streams import Streams
+from proposer_rl.task import NoSuccessError
+from tests.curricula.scripted import Scripted, reached, step
+
+N = 4
+
+
+def written_out(seen: Tensor, fast: float, slow: float) -> tuple[Tensor, Tensor]:
+    """Both averages after looks [T], as weighted sums of all looks."""
+
+    def average(values: list[Tensor], old: float) -> Tensor:
+        last = len(values) - 1
+        weights = [old**last, *(old ** (last - i) * (1 - old) for i in range(1, last + 1))]
+        return sum((w * v for w, v in zip(weights, values, strict=True)), torch.zeros(()))
+
+    quick = [average(list(seen[: t + 1]), fast) for t in range(len(seen))]
+    return quick[-1], average(quick, slow)
+
+
+@pytest.mark.parametrize("measure", ["success", "return"])
+def test_shares_follow_the_distance_of_two_averages(measure: str) -> None:
+    seen = torch.rand(6, 2, N, generator=torch.Generator().manual_seed(0))
+    task = Scripted(seen[0])
+    curriculum = LearningProgressCurriculum(
+        task.space, probes=3, fast=0.7, slow=0.8, exploration=0.3, measure=measure
+    )
+    for update, skills in enumerate(seen):
+        task.skills = skills
+        step(curriculum, task, update)
+    progress = torch.zeros(2, N)
+    for k in range(2):
+        for n in range(N):
+            fast, slow = written_out(seen[:, k, n], 0.7, 0.8)
+            if measure == "success":  # with q = 0.1
+                fast, slow = (0.9 * p / (0.8 * p + 0.1) for p in (fast, slow))
+            progress[k, n] = abs(fast - slow)
+    expected = 0.7 * progress / progress.sum(1, keepdim=True) + 0.3 / N
+    torch.testing.assert_close(curriculum.shares(), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_first_look_shows_no_progress_and_all_bins_are_alike() -> None:
+    task = Scripted(torch.tensor([[0.1, 0.9, 0.4, 0.0]]), batch_size=8)
+    curriculum = LearningProgressCurriculum(task.space)
+    assert step(curriculum, task, 0)[0].bincount(minlength=N).tolist() == [2] * N
+
+
+def test_small_success_is_stretched() -> None:
+    found = stretched(torch.tensor([0.0, 0.1, 0.5, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(found, torch.tensor([0, 0.5, 0.9, 1], dtype=torch.float64))
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=2, max_size=8), st.floats(0, 1))
+def test_shares_are_a_distribution_with_a_floor(progress: list[float], exploration: float) -> None:
+    shares = progress_shares(torch.tensor([progress]), exploration)
+    torch.testing.assert_close(shares.sum(), torch.tensor(1.0))
+    assert (shares >= exploration / len(progress) - 1e-6).all()
+
+
+@pytest.mark.parametrize("source", ["exact", "episodes"])
+def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
+    """The last two bins: one is learnt from update 10 to 29; the other never changes."""
+    task = Scripted(torch.zeros(1, N), batch_size=40)
+    curriculum = LearningProgressCurriculum(
+        task.space, source=source, fast=0.7, slow=0.9, exploration=0.2, measure="return"
+    )
+    task.skills = torch.tensor([[0.0, 1.0, 0.0, 0.5]])
+    counts = []
+    for update in range(120):
+        task.skills[0, 2] = min(1.0, max(0.0, (update - 9) / 20))
+        counts.append(step(curriculum, task, update)[0].bincount(minlength=N))
+    assert (torch.stack(counts[:10]) == 10).all()
+    learning = torch.stack(counts[13:29])
+    assert (learning[:, 2] == 34).all() and (learning[:, [0, 1, 3]] == 2).all()
+    # All that is left at the end is what the averages still remember of it.
+    told = torch.tensor(curriculum.log()["score"])
+    assert told[0, 2] < 1e-2 and (told[0, [0, 1, 3]] == 0).all()
+
+
+def test_mass_leaves_a_plateau_for_what_is_learnt_next() -> None:
+    task = Scripted(torch.zeros(1, N), batch_size=40)
+    curriculum = LearningProgressCurriculum(task.space, fast=0.7, slow=0.9)
+    shares = []
+    for update in range(60):
+        task.skills = torch.tensor([[0.0, 0.0, min(update, 20) / 20, 0.0]])
+        task.skills[0, 1] = max(update - 40, 0) / 20
+        step(curriculum, task, update)
+        shares.append(curriculum.shares()[0])
+    assert shares[15][2] > 0.8 and shares[15][1] == pytest.approx(0.05)
+    assert shares[59][1] > 0.7 and shares[59][2] < 0.1
+
+
+def test_progress_is_seen_in_either_direction() -> None:
+    task = Scripted(torch.tensor([[0.5, 0.5, 0.5, 0.5]]))
+    curriculum = LearningProgressCurriculum(task.space, exploration=0.0, measure="return")
+    step(curriculum, task, 0)
+    task.skills = torch.tensor([[0.5, 0.9, 0.1, 0.5]])
+    step(curriculum, task, 1)
+    torch.testing.assert_close(curriculum.shares(), torch.tensor([[0.0, 0.5, 0.5, 0.0]]))
+
+
+def test_probes_are_fixed_counted_and_each_students_own() -> None:
+    task = Scripted(torch.rand(2, N))
+    task.space.generate = lambda choices, generators: (
+        choices
+        + N * torch.stack([torch.randint(1000, choices.shape[1:], generator=g) for g in generators])
+    )
+    measured = []
+
+    def performance(levels: Tensor, generator: torch.Generator) -> TensorDict:
+        measured.append(levels)
+        return Scripted.performance(task, levels % N, generator)
+
+    task.performance = performance  # type: ignore[method-assign]
+    for run in range(2):
+        curriculum = LearningProgressCurriculum(task.space, probes=3, every=2)
+        for update in range(4):
+            task.evaluations = 0
+            curriculum.propose(task, 8, [Streams(seed, run, update) for seed in (5, 6)])
+            assert task.evaluations == (3 * N if update % 2 == 0 else 0)
+    first, again, other, _ = measured
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert torch.equal(first[0] % N, torch.arange(N).repeat_interleave(3))
+    assert not torch.equal(first[0], first[1])
+
+
+def test_episodes_are_the_first_ones_since_the_last_look() -> None:
+    generator = torch.Generator().manual_seed(1)
+    task = Scripted(torch.zeros(2, N), batch_size=3)
+    curriculum = LearningProgressCurriculum(
+        task.space, source="episodes", every=3, fast=0.6, slow=0.5, exploration=1.0
+    )
+    averages: dict[tuple[int, int], tuple[float, float]] = {}
+    since: dict[tuple[int, int], list[float]] = {}
+    for update in range(13):
+        streams = [Streams(seed, update) for seed in (0, 1)]
+        batch = curriculum.propose(task, 3, streams)
+        if update % 3 == 0:
+            for place, seen in since.items():
+                mean = sum(seen) / len(seen)
+                fast, slow = averages.get(place, (mean, mean))
+                fast = 0.6 * fast + 0.4 * mean
+                averages[place] = fast, 0.5 * slow + 0.5 * fast
+            since = {}
+        expected = torch.zeros(2, N)
+        for place, (fast, slow) in averages.items():
+            expected[place] = abs(0.9 * fast / (0.8 * fast + 0.1) - 0.9 * slow / (0.8 * slow + 0.1))
+        torch.testing.assert_close(curriculum.scores["score"], expected)
+        solved = torch.rand(2, 3, generator=generator) < 0.5
+        for k in range(2):
+            for p in range(3):
+                place = k, int(batch.levels[k, p])
+                since.setdefault(place, []).append(float(solved[k, p]))
+        curriculum.observe(task, batch, reached(torch.rand(2, 3), solved))
+    assert task.measured == []
+    assert len(averages) > N  # both Solvers' bins were seen
+
+
+def test_a_task_without_success_is_told_what_to_give() -> None:
+    task = Scripted(torch.rand(1, N), told="return")
+    with pytest.raises(
+        NoSuccessError, match=r"this task tells no success.*measure=return"
+    ) as error:
+        step(LearningProgressCurriculum(task.space), task, 0)
+    assert error.value.exit_code == 2
+    step(LearningProgressCurriculum(task.space, measure="return"), task, 0)

@@ -1,0 +1,122 @@
+"""Bounds stand in the signatures, which one validator holds; here is what each curriculum asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from proposer_rl.curricula import (
+    Curriculum,
+    Filtered,
+    FirstOrderCurriculum,
+    FirstOrderProposer,
+    LearningProgressCurriculum,
+    Mixed,
+    MixtureCurriculum,
+    ReplayCurriculum,
+    ReplayRule,
+    SampledFirstOrderCurriculum,
+    SamplingCurriculum,
+    Schedule,
+    Scorer,
+    SomeBins,
+    TransportCurriculum,
+)
+from proposer_rl.settings import ArgumentError
+from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay, selection
+from tests.curricula.scripted import GivenScores
+from tests.tiny import TASK
+
+TWO: list[Curriculum] = [SamplingCurriculum(SPACE)] * 2
+progress = partial(LearningProgressCurriculum, SPACE)
+transport = partial(TransportCurriculum, SPACE, TASK.target_shares)
+gaussians = partial(MixtureCurriculum, SPACE, refit=64, warmup=64)
+first_order = partial(FirstOrderCurriculum, SPACE, TARGET)
+proposer = partial(FirstOrderProposer, SPACE, TARGET, problem_agent(), SETTINGS)
+keep = partial(Filtered, TWO[0], GivenScores(torch.zeros(1, 1)))
+no_edits = partial(ReplayCurriculum, SPACE, Scorer("positive_value_loss", "episodes"))
+
+REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+    (progress, {"every": 0}, "every=0: input should be greater than or equal to 1"),
+    (progress, {"every": 1.5}, "every=1.5: input should be a valid integer"),
+    (progress, {"probes": 10**30}, "probes=1000"),
+    (progress, {"probes": True}, "probes=True: input should be a valid integer"),
+    (progress, {"source": "dreams"}, "source='dreams': input should be 'exact' or 'episodes'"),
+    (progress, {"measure": None}, "measure=None: input should be 'success' or 'return'"),
+    (progress, {"fast": 1.0}, "fast=1.0: input should be less than 1"),
+    (progress, {"slow": -0.1}, "slow=-0.1: input should be greater than or equal to 0"),
+    (progress, {"exploration": float("nan")}, "exploration=nan: input should be"),
+    (progress, {"exploration": "all"}, "exploration='all': input should be a valid number"),
+    (transport, {"epsilon": 0.0}, "epsilon=0.0: input should be greater than 0"),
+    (transport, {"delta": float("inf")}, "delta=inf: input should be a finite number"),
+    (transport, {"probes": 0}, "probes=0: input should be greater"),
+    (transport, {"measure": "joy"}, "measure='joy': input should be 'success' or 'return'"),
+    (
+        partial(TransportCurriculum, SPACE, torch.ones(3)),
+        {},
+        r"target_shares=\[3\]: must be one for each of 4 bins",
+    ),
+    (gaussians, {"source": "both"}, "source='both': input should be 'episodes' or 'exact'"),
+    (gaussians, {"components": 1}, "components=1: input should be greater than or equal to 2"),
+    (gaussians, {"warmup": None}, "warmup=None: input should be a valid integer"),
+    (gaussians, {"exploration": 1.1}, "exploration=1.1: input should be less than or equal to 1"),
+    (gaussians, {"components": 65}, "components=65: must be at most refit=64, and that at most"),
+    (gaussians, {"warmup": 63}, "components=10: must be at most refit=64, .* at most warmup=63"),
+    (first_order, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
+    (first_order, {"step": 0.0}, "step=0.0: input should be greater than 0"),
+    (first_order, {"smoothing": 1.0}, "smoothing=1.0: input should be less than 1"),
+    (first_order, {"candidates": 0}, "candidates=0: input should be greater"),
+    (first_order, {"measure": "luck"}, "measure='luck': input should be 'log_success' or 'return'"),
+    (
+        partial(SampledFirstOrderCurriculum, SPACE, TARGET),
+        {"exploration": 2},
+        "exploration=2: input should be less than or equal to 1",
+    ),
+    (proposer, {"step": -1.0}, "step=-1.0: input should be greater than 0"),
+    (proposer, {"target_levels": 0}, "target_levels=0: input should be greater"),
+    (selection, {"keep": 17}, "keep=17: must be at most candidates=16"),
+    (selection, {"new": -0.1}, "new=-0.1: input should be greater than or equal to 0"),
+    (replay, {"capacity": "lots"}, "capacity='lots': input should be a valid integer"),
+    (replay, {"fill": 0.0}, "fill=0.0: input should be greater than 0"),
+    (replay, {"replay_probability": 0}, "replay_probability=0: input should be greater than 0"),
+    (replay, {"edits": -1}, "edits=-1: input should be greater than or equal to 0"),
+    (replay, {"renew": "no"}, "renew='no': input should be a valid boolean"),
+    (replay, {"parents": "hard"}, "parents='hard': input should be 'batch' or 'easy'"),
+    (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true"),
+    (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true"),
+    (no_edits, {"edits": 1}, "edits=1: the task has no edit"),
+    (ReplayRule, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
+    (ReplayRule, {"staleness": 1.5}, "staleness=1.5: input should be less than or equal to 1"),
+    (ReplayRule, {"best": 0}, "best=0: input should be greater than or equal to 1"),
+    (ReplayRule, {"prioritization": "luck"}, "prioritization='luck': input should be 'rank', 'pro"),
+    (Scorer, {"score": "luck", "source": "exact"}, r"score='luck': from source=exact there are \["),
+    (Scorer, {"score": "regret", "source": "oracle"}, "source='oracle': input should be"),
+    (partial(SomeBins, SPACE), {"values": {"walls": [1]}}, r"values.walls=\[1.0\]: must be among"),
+    (partial(SomeBins, SPACE), {"values": {"path length": [3]}}, r"values.path length=\[3.0\]"),
+    (partial(SomeBins, SPACE), {"values": {"path length": []}}, r"values.path length=\[\]: "),
+    (keep, {"times": 1}, "times=1: input should be greater than or equal to 2"),
+    (keep, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
+    (partial(Mixed, TWO), {"shares": [1.0]}, r"shares=\[1.0\]: 2 curricula need as many"),
+    (partial(Mixed, TWO), {"shares": [1.0, -1.0]}, "shares.1=-1.0: input should be greater"),
+    (partial(Mixed, TWO), {"shares": [0.0, 0.0]}, "shares=.*, not all of them zero"),
+    (partial(Schedule, TWO), {"until": [3, 2]}, r"until=\[3, 2\]: 2 stages need 1 ascending"),
+    (partial(Schedule, TWO), {"until": [0]}, r"until=\[0\]: 2 stages need 1 ascending positive"),
+]
+
+
+@pytest.mark.parametrize(("make", "options", "message"), REFUSED)
+def test_what_is_out_of_bounds_is_named(
+    make: Callable[..., Any], options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ArgumentError, match=message) as refused:
+        make(**options)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_mixture_is_not_filtered() -> None:
+    with pytest.raises(ValueError, match="filter the curricula of a mixture, each by itself"):
+        Filtered(Schedule([Mixed(TWO[:1], [1])], []), GivenScores(torch.zeros(1, 1)))

@@ -1,0 +1,202 @@
+"""Transport to the target: against a grid over all distributions, and with scripted Solvers."""
+
+from __future__ import annotations
+
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from proposer_rl.curricula.transport import TransportCurriculum, step_towards
+from proposer_rl.methods import Components, currot
+from proposer_rl.settings import ProposerSettings
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.mazes import SpecificationSpace
+from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
+from tests.curricula.scripted import Scripted, step
+from tests.tiny import tiny_task
+
+
+def squared(p: np.ndarray, q: np.ndarray, places: np.ndarray) -> float:
+    """W2 squared on a line, as the integral of the squared distance of the quantile functions."""
+    levels = np.unique(np.concatenate([[0.0, 1.0], p.cumsum(), q.cumsum()]).round(12).clip(0, 1))
+    middles = (levels[1:] + levels[:-1]) / 2
+    at = [places[np.searchsorted(x.cumsum().round(12), middles)] for x in (p, q)]
+    return float(((at[0] - at[1]) ** 2 * np.diff(levels)).sum())
+
+
+def grid(size: int, parts: int) -> np.ndarray:
+    """All distributions over bins in multiples of 1 / parts."""
+    counts = [c for c in product(range(parts + 1), repeat=size) if sum(c) == parts]
+    return np.array(counts) / parts
+
+
+def costs_of(places: np.ndarray) -> np.ndarray:
+    return (places[:, None] - places) ** 2
+
+
+PLACES = [np.array([-1.0, 0.1, 1.0]), np.array([-1.0, -0.5, 0.3, 1.0])]
+
+
+@pytest.mark.parametrize("places", PLACES, ids=["3 bins", "4 bins"])
+@pytest.mark.parametrize("reach", [0.2, 0.5, 1.2])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_distribution_of_a_grid_is_better(places: np.ndarray, reach: float, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    size = len(places)
+    allowed = np.ones(size, bool)
+    allowed[generator.integers(size)] = seed % 2 == 0  # with all bins, and with one less
+    every = grid(size, 20)
+    possible = every[(every[:, ~allowed] == 0).all(1)]
+    now = possible[generator.integers(len(possible))]
+    target = every[generator.integers(len(every))]
+    p, left = step_towards(target, now, costs_of(places), allowed, reach)
+    assert p.sum() == pytest.approx(1) and (p >= 0).all() and (p[~allowed] == 0).all()
+    assert squared(p, now, places) <= reach**2 + 1e-6
+    assert left == pytest.approx(squared(p, target, places), abs=1e-6)
+    near = [q for q in possible if squared(q, now, places) <= reach**2]
+    assert left <= min(squared(q, target, places) for q in near) + 1e-6
+
+
+def shares(size: int) -> st.SearchStrategy[np.ndarray]:
+    numbers = st.lists(st.integers(0, 5), min_size=size, max_size=size).filter(any)
+    return numbers.map(lambda n: np.array(n) / sum(n))
+
+
+@given(st.data())
+def test_what_holds_everywhere(data: st.DataObject) -> None:
+    size = 6
+    axes = np.linspace(-1, 1, 2), np.linspace(-1, 1, 3)
+    places = np.array(list(product(*axes)))
+    costs = ((places[:, None] - places) ** 2).sum(-1)
+    target, now = data.draw(shares(size)), data.draw(shares(size))
+    allowed = np.array(data.draw(st.lists(st.booleans(), min_size=size, max_size=size)))
+    assume(allowed.any())
+    reach = data.draw(st.floats(0.01, 4))
+    p, left = step_towards(target, now, costs, allowed, reach)
+    assert p.sum() == pytest.approx(1) and (p >= 0).all() and (p[~allowed] == 0).all()
+    if allowed[now > 0].all():
+        stay = step_towards(target, now, costs, allowed, 0.0)
+        np.testing.assert_allclose(stay[0], now, atol=1e-5)
+        assert left <= stay[1] + 1e-6  # never farther off than before
+    further = step_towards(target, now, costs, allowed, 10.0)
+    assert further[1] <= left + 1e-6
+    # With all within reach, mass of the target goes to the nearest allowed bins.
+    assert further[1] == pytest.approx(costs[allowed].min(0) @ target, abs=1e-6)
+
+
+def test_from_bins_that_are_lost_the_nearest_ones_are_taken() -> None:
+    places = np.array([-1.0, 0.0, 0.2, 1.0])
+    now = np.array([0.0, 0.0, 1.0, 0.0])
+    allowed = np.array([True, True, False, True])
+    p, _ = step_towards(np.eye(4)[3], now, costs_of(places), allowed, 0.1)
+    np.testing.assert_allclose(p, [0, 1, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_it_is_solved_whatever_the_shares(part: int) -> None:
+    """Rounded numbers on the paper's grid: equations that contradict each other by 1e-16."""
+    generator = np.random.default_rng(part)
+    places = np.array(list(product(np.linspace(-1, 1, 6), np.linspace(-1, 1, 8))))
+    costs = ((places[:, None] - places) ** 2).sum(-1)
+    for number in range(40):
+        target, now = generator.dirichlet(np.full(48, 0.1)), generator.dirichlet(np.full(48, 0.5))
+        allowed = generator.random(48) < generator.choice([0.02, 0.1, 0.5, 1])
+        allowed[number] = True
+        p, left = step_towards(target, now, costs, allowed, generator.choice([0.001, 0.3, 1]))
+        assert p.sum() == pytest.approx(1) and (p[~allowed] == 0).all() and (p >= 0).all()
+        assert left >= costs[allowed].min(0) @ target - 1e-6
+
+
+def curriculum(task: Any, **options: Any) -> TransportCurriculum:
+    return TransportCurriculum(
+        task.space, task.target_shares, **{"every": 1, "probes": 2, **options}
+    )
+
+
+def test_a_long_reach_and_nothing_to_master_give_the_target_at_once() -> None:
+    task = Scripted(torch.zeros(1, 5), batch_size=10)
+    task.target_shares = torch.tensor([0.0, 0.3, 0.0, 0.0, 0.7])
+    found = curriculum(task, delta=0.0, epsilon=5.0)
+    assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [0, 3, 0, 0, 7]
+
+
+def test_a_master_is_led_to_the_target_step_by_step() -> None:
+    task = Scripted(torch.ones(1, 5))
+    found = curriculum(task, epsilon=0.3)
+    places = task.space.coordinates[:, 0].double().numpy()
+    before, distances = np.full(5, 0.2), []
+    for update in range(12):
+        step(found, task, update)
+        now = found.shares()[0].numpy()
+        assert squared(now, before, places) <= 0.3**2 + 1e-6
+        told = found.log()
+        assert told["target_distance"] == [
+            pytest.approx(squared(now, np.eye(5)[4], places) ** 0.5, abs=1e-6)
+        ]
+        distances += told["target_distance"]
+        before = now
+    assert distances == sorted(distances, reverse=True)
+    assert distances[3] > 0.1 and distances[-1] == pytest.approx(0, abs=1e-5)
+    np.testing.assert_allclose(before, np.eye(5)[4], atol=1e-6)
+
+
+def test_only_bins_that_are_mastered_are_drawn_from_and_the_way_opens_with_them() -> None:
+    task = Scripted(torch.tensor([[0.9, 0.6, 0.2, 0.1, 0.0], [0.0, 0.1, 0.3, 0.2, 0.0]]))
+    found = curriculum(task, delta=0.5, epsilon=0.4)
+    for update in range(8):
+        bins = step(found, task, update)
+        assert (bins[0] <= 1).all()
+        assert (bins[1] == 2).all()  # nothing is mastered: where it is best
+    assert (bins[0] == 1).all()  # the nearest to the target
+    task.skills[0, 2:4] = 0.7
+    for update in range(8, 16):
+        bins = step(found, task, update)
+    assert (bins[0] == 3).all()
+    assert found.log()["allowed_bins"] == [4, 1]
+
+
+def test_where_all_fails_all_is_searched() -> None:
+    task = Scripted(torch.zeros(1, 5), batch_size=10)
+    found = curriculum(task, delta=0.5, epsilon=0.01)
+    assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [2] * 5
+
+
+def test_scoring_passes_are_counted() -> None:
+    task = Scripted(torch.ones(1, 5))
+    found = curriculum(task, every=3, probes=4)
+    costs = []
+    for update in range(4):
+        task.evaluations = 0
+        found.propose(task, 8, [Streams(update)])
+        costs.append(task.evaluations)
+    assert costs == [20, 0, 0, 20]
+
+
+def test_the_mazes_target_is_rounded_to_bins() -> None:
+    pairs = [(0.2, 4), (0.05, 2), (0.0, 3), (0.9, 2)]
+    task = tiny_task(
+        distributions={"id": DistributionSettings(specifications=pairs[:3])},
+        space=SpaceSettings(obstacle_fractions=[0.0, 0.2], path_lengths=[2, 4, 6]),
+    )
+    # Lengths have a step of 1, fractions one of 2: length 3 is halfway, and rounded down.
+    assert task.target_shares.tolist() == pytest.approx([2 / 3, 0, 0, 0, 1 / 3, 0])
+    assert task.space.nearest(pairs).tolist() == [4, 0, 0, 3]
+    single = SpecificationSpace((0.1,), (2, 4), height=5, width=5)
+    assert single.nearest([(0.0, 4), (0.4, 2)]).tolist() == [1, 0]
+
+
+def test_a_space_finds_its_own_bins() -> None:
+    space = SpecificationSpace((0.0, 0.1, 0.3), (2, 3, 5), height=6, width=6)
+    assert torch.equal(space.nearest(space.specifications), torch.arange(9))
+
+
+def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
+    parts = Components(SimpleNamespace(), ProposerSettings(), [0])
+    with pytest.raises(TypeError, match="SimpleNamespace must define target_shares"):
+        currot(parts)

@@ -1,0 +1,219 @@
+"""The front door: what it shows, and that a run from Python is the run of the command line."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+
+import proposer_rl as prl
+from proposer_rl import api
+from proposer_rl.cli.eval import main as evaluate
+from proposer_rl.cli.play import open_session
+from proposer_rl.cli.report import main as report
+from proposer_rl.cli.watch import main as watch
+from proposer_rl.recipes import (
+    CONFIG_FOLDER,
+    CONSTANTS,
+    KEY,
+    Recipe,
+    override_value,
+    own_recipe,
+    recipe_function,
+)
+from tests.commands import trained_run
+from tests.same_run import assert_same_run
+from tests.tiny import EXAMPLES
+
+SMOKE = {"scale": "smoke", "progress": False}
+CARTPOLE = {
+    "max_steps": 20,
+    "parameters": {"gravity": {"low": 5.0, "high": 25.0, "bins": 2, "target": 25.0}},
+    "success": {"kind": "survived"},
+    "evaluation": {"levels": 4},
+}
+
+
+def test_dir_shows_what_there_is() -> None:
+    assert dir(prl) == sorted(api.__all__) and all(hasattr(prl, name) for name in dir(prl))
+    methods = {file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml")}
+    assert methods < set(dir(prl.curricula)) and {"Filtered", "own"} < set(dir(prl.curricula))
+    tasks = {file.stem for file in (CONFIG_FOLDER / "task").glob("*.yaml")}
+    assert set(dir(prl.tasks)) == tasks - {"gymnasium"} | {"from_gymnasium", "own"}
+    assert all(callable(getattr(prl.curricula, name)) for name in methods)
+
+
+@pytest.mark.parametrize("name", ["plr", "currot", "perf_gain", "target"])
+def test_a_recipe_has_the_settings_of_its_file(name: str) -> None:
+    make = getattr(prl.curricula, name)
+    file = CONFIG_FOLDER / "method" / f"{name}.yaml"
+    settings = yaml.safe_load(file.read_text(encoding="utf-8"))["curriculum"]
+    shown = {p.name: p.default for p in inspect.signature(make).parameters.values()}
+    assert shown == {key: value for key, value in settings.items() if key != "_target_"}
+    assert make(**shown) == Recipe("method", name, shown)
+    assert make.__doc__.partition("\n")[0] in file.read_text(encoding="utf-8")
+
+
+def test_a_recipe_inherits_the_settings_of_the_file_that_it_builds_on() -> None:
+    accel = inspect.signature(prl.curricula.accel).parameters
+    assert accel.keys() == inspect.signature(prl.curricula.plr).parameters.keys()
+    assert accel["edits"].default == 5 and accel["train_on_new"].default is False
+
+
+CLASSES = [
+    name
+    for name, value in vars(api).items()
+    if inspect.isclass(value) and not issubclass(value, Exception) and name in api.__all__
+]
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_signatures_of_classes_are_true(name: str) -> None:
+    """Each argument is named in the signature, and described in the docstring."""
+    made = vars(api)[name]
+    described = " ".join(filter(None, (parent.__doc__ for parent in made.__mro__)))
+    parameters = list(inspect.signature(made).parameters.values())
+    assert all(p.name in described for p in parameters)
+    assert [p.name for p in parameters] != ["args", "kwargs"]
+
+
+def test_a_run_in_a_maze_is_that_of_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    curriculum = prl.curricula.plr(temperature=0.5, score="max_mc")
+    run = prl.train(
+        prl.tasks.maze(evaluation={"levels": 8}),
+        curriculum,
+        filter="learnability",
+        seed=3,
+        settings={"solver": {"ppo": {"learning_rate": 0.002}}},
+        folder=tmp_path / "python",
+        **SMOKE,
+    )
+    same = trained_run(
+        tmp_path / "shell",
+        *("+method=plr", "+scale=smoke", "+filter=learnability", "seed=3", "task=maze"),
+        *("curriculum.temperature=0.5", "curriculum.score=max_mc", "task.evaluation.levels=8"),
+        *("solver.ppo.learning_rate=0.002", "compute.progress=false"),
+    )
+    assert_same_run(run.folder, same)
+    assert (run.folder / "config.json").read_text() == (same / "config.json").read_text()
+    assert run.metrics["updates"].iloc[-1] == run.summary["updates"]
+    assert len(run.training) == len(run.metrics) - 1 and run.picture.parent == run.folder
+    levels = run.task().target.sample(2, __import__("torch").Generator())
+    assert run.solver().copies == 1 and levels.batch_size == (2,)
+    capsys.readouterr()
+    watch([str(run.folder), "--once"])
+    assert "plr" in capsys.readouterr().out
+    evaluate([str(run.folder), "--levels", "id", "-o", str(tmp_path / "rows.json")])
+    report([str(run.folder), "-q", "-o", str(tmp_path / "report")])
+    assert (tmp_path / "report" / "report.html").exists()
+    assert open_session(run.folder).about()["board"] is not None
+
+
+def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
+    def train(updates: int, folder: str) -> prl.Run:
+        task = prl.tasks.from_gymnasium("CartPole-v1", **CARTPOLE)
+        settings = {
+            "solver": {"ppo": {"horizon": 20, "epochs": 1}},
+            "schedule": {"evaluate_every": 2},
+        }
+        return prl.train(
+            task,
+            prl.curricula.learning_progress(source="episodes"),
+            updates=updates,
+            folder=tmp_path / folder,
+            settings=settings,
+            progress=False,
+        )
+
+    train(2, "parts")
+    run = train(4, "parts")
+    assert list(run.metrics["updates"]) == [0, 2, 4]
+    assert_same_run(run.folder, train(4, "whole").folder)
+
+
+def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from own_curriculum import again
+    from own_task import SledgeTask
+
+    sledges = {
+        "solver": {"batch_size": 4, "ppo": {"horizon": 8}},
+        "schedule": {"headline": "target_success"},
+    }
+    task = prl.tasks.own(SledgeTask, levels=8)
+    run = prl.train(task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False)
+    assert "target_success" in run.metrics
+    assert type(run.task()).__name__ == "SledgeTask"
+    curriculum = prl.curricula.own(again, probability=0.5)
+    run = prl.train("maze", curriculum, updates=2, folder=tmp_path / "2", **SMOKE)
+    assert run.summary["method"] == "again"
+
+
+def test_what_cannot_be_imported_again_is_refused() -> None:
+    with pytest.raises(prl.ArgumentError, match="must be importable"):
+        own_recipe("method", lambda parts: None)
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "options", "message"),
+    [
+        ("plrr", {}, "there is no 'plrr'; there are: accel, alp_gmm"),
+        ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
+        ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
+        ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),
+        ("plr", {"settings": {"slover": {}}}, "slover: unknown; there are: method"),
+        ("plr", {"filter": {"times": 1}}, "filter.times=1"),
+        ("plr", {"settings": {"seed": object()}}, "must be a number, a text, a list or a mapping"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    curriculum: str, options: dict, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises((ValueError, AttributeError), match=re.escape(message)) as refused:
+        prl.train("maze", curriculum, folder=tmp_path / "run", **{**SMOKE, **options})
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_settings_of_recipes_are_checked_where_they_are_given() -> None:
+    with pytest.raises(prl.ArgumentError, match="temprature: unknown; there are: score, source"):
+        prl.curricula.plr(temprature=1)
+    with pytest.raises(prl.ArgumentError, match="env_id: missing"):
+        recipe_function("task", "gymnasium")(max_steps=3)
+    with pytest.raises(prl.ArgumentError, match=r"'a\.b': a name must begin with a letter"):
+        override_value({"a.b": 1})
+
+
+def test_a_hydra_around_a_run_is_left_as_it_was(tmp_path: Path) -> None:
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        prl.train("maze", "target", updates=1, folder=tmp_path / "run", **SMOKE)
+        assert compose("train", ["seed=7"]).seed == 7
+    assert not GlobalHydra.instance().is_initialized()
+
+
+KEYS = st.from_regex(KEY, fullmatch=True).filter(lambda key: key.casefold() not in CONSTANTS)
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**9), 10**9)
+    | st.text(max_size=8)
+    | st.floats(allow_nan=False, allow_infinity=False, width=32),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(VALUES)
+def test_values_come_through_hydras_grammar(value: object) -> None:
+    parsed = OverridesParser.create().parse_override(f"key={override_value(value)}")
+    assert parsed.value() == value
