@@ -194,7 +194,7 @@ def saved_config(folder: Path) -> RunConfig:
 
 def _as_today(values: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a run of any version; what only another version has does not count."""
-    absent = {"filter": None, "hand_designed": {"distributions": [], "until": []}}
+    absent: dict[str, Any] = {"filter": None, "hand_designed": {"distributions": [], "until": []}}
     known = {field.name for field in fields(RunConfig)}
     shared = {key: value for key, value in values.items() if key in known}
     # Our tasks' modules have moved; their classes have kept their names.
