@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -44,13 +44,6 @@ OmegaConf.register_new_resolver(
 # No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
 LARGEST = 10**9
 LARGEST_FILE = 10**6
-# Of runs of earlier versions, whose folders stay readable.
-RENAMED, GONE = {"hand_made": "hand_designed"}, ("lifetimes",)
-MOVED = {
-    "proposer_rl.mazes.view.": "proposer_rl.tasks.view_mazes.",
-    "proposer_rl.mazes.": "proposer_rl.tasks.mazes.",
-    "proposer_rl.gymnasium_task.": "proposer_rl.tasks.gymnasium.",
-}
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
 
@@ -72,7 +65,7 @@ class RunConfig:
     scale: str
     ablation: str
     curriculum: dict[str, Any]
-    filter: FilterSettings | None = None
+    filter: FilterSettings | None
     task: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]
@@ -200,13 +193,17 @@ def saved_config(folder: Path) -> RunConfig:
 
 
 def _as_today(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run of any version, under the names that they have today."""
-    named = {RENAMED.get(key, key): value for key, value in values.items() if key not in GONE}
-    target = named["task"]["_target_"]
-    before = next((moved for moved in MOVED if target.startswith(moved)), None)
-    if before is not None:
-        named["task"] = {**named["task"], "_target_": target.replace(before, MOVED[before], 1)}
-    return named
+    """The settings of a run of any version; what only another version has does not count."""
+    absent: dict[str, Any] = {"filter": None, "hand_designed": {"distributions": [], "until": []}}
+    known = {field.name for field in fields(RunConfig)}
+    shared = {key: value for key, value in values.items() if key in known}
+    # Our tasks' modules have moved; their classes have kept their names.
+    target, files = shared["task"]["_target_"], (CONFIG_FOLDER / "task").glob("*.yaml")
+    ours = [OmegaConf.select(OmegaConf.load(file), "task._target_") for file in files]
+    if target.startswith("proposer_rl."):
+        today = {str(name).rpartition(".")[2]: name for name in ours}
+        target = today.get(target.rpartition(".")[2], target)
+    return {**absent, **shared, "task": {**shared["task"], "_target_": target}}
 
 
 def stored_config(file: Path) -> Any:
