@@ -1,4 +1,4 @@
-"""A reward of your own: the Proposer is paid for levels that are solved about half of the time.
+"""A reward of your own: the Proposer is rewarded for levels solved half of the time.
 
 A reward is a function of one training step of K Solvers that gives each of them a number. This one
 is learnability, p (1 - p) with p the success rate on a level (Rutherford et al. 2024, "No Regrets",
@@ -34,7 +34,7 @@ def learnability(step: TrainingStep) -> Tensor:
 
 
 def main(updates: int = 60) -> None:
-    """Train a Solver on the proposals of a Proposer that is paid for learnability."""
+    """Train a Solver on the proposals of a Proposer that is rewarded for learnability."""
     task = small_task()
     curriculum = proposer(Components(task, proposer_settings(), seeds=[0]), reward=learnability)
     report(train(task, curriculum, updates))
