@@ -15,8 +15,7 @@ On the command line, named in a method of your own (examples/conf/method/own_cur
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from small_mazes import report, small_task, train
@@ -25,6 +24,7 @@ from tensordict import TensorDictBase
 from proposer_rl import Batch, Curriculum, Streams
 from proposer_rl.curricula import Inbox, Student
 from proposer_rl.methods import Components
+from proposer_rl.settings import Share, checked
 from proposer_rl.task import Distribution
 
 
@@ -36,9 +36,10 @@ class Again(Curriculum):
         probability: with which a failed level takes the place of a new one.
     """
 
-    def __init__(self, fresh: Distribution, probability: float) -> None:
-        if not 0 <= probability <= 1:
-            raise ValueError(f"probability must be from 0 to 1, got {probability}")
+    remembers = ("_inbox",)  # what a resumed run needs
+
+    @checked
+    def __init__(self, fresh: Distribution, probability: Share) -> None:
         self._fresh, self._probability = fresh, probability
         self._inbox = Inbox(like=fresh.sample(1, torch.Generator())[0])
 
@@ -58,18 +59,10 @@ class Again(Curriculum):
         self._inbox.check(batch, outcome)
         self._inbox.put(batch, level=batch.levels, failed=outcome["success"] == 0)
 
-    def state_dict(self) -> dict[str, Any]:
-        """What has come in."""
-        return self._inbox.state_dict()
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from there."""
-        self._inbox.load_state_dict(state)
-
-
-def again(parts: Components, probability: float) -> Curriculum:
-    """The factory that the configuration names: from a run's parts to its curriculum."""
-    return Again(parts.task.target, probability)
+def again(components: Components, probability: Share) -> Curriculum:
+    """The factory that the configuration names: from a run's components to its curriculum."""
+    return Again(components.task.target, probability)
 
 
 def main(updates: int = 60) -> None:

@@ -1,4 +1,4 @@
-"""A reward of your own: the Proposer is rewarded for levels solved half of the time.
+"""A reward of your own: the Proposer is rewarded for levels that are solved about half of the time.
 
 A reward is a function of one training step of K Solvers that gives each of them a number. This one
 is learnability, p (1 - p) with p the success rate on a level (Rutherford et al. 2024, "No Regrets",

@@ -1,4 +1,12 @@
-"""The names of ``proposer_rl`` itself."""
+"""The front door: training from Python, and the names of ``proposer_rl`` itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from proposer_rl import curricula, tasks
 from proposer_rl.curricula import (
@@ -15,7 +23,6 @@ from proposer_rl.curricula import (
     TaskStudent,
 )
 from proposer_rl.experiment import Experiment
-from proposer_rl.front import Run, train
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -30,11 +37,15 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
+from proposer_rl.recipes import Recipe, override_value, recipe_function
 from proposer_rl.settings import ArgumentError, PPOSettings, ScheduleSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "PPO",
@@ -84,3 +95,115 @@ __all__ = [
     "tasks",
     "train",
 ]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run's folder, read.
+
+    Attributes:
+        folder: what ``bin/watch``, ``bin/report``, ``bin/eval`` and ``bin/play`` take, too.
+    """
+
+    folder: Path
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row for each measurement of each Solver: updates, costs, success and return."""
+        return self._table("metrics.csv")
+
+    @property
+    def training(self) -> pd.DataFrame:
+        """A row for each measurement: the levels that were trained on, and PPO's numbers."""
+        return self._table("training.csv")
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The run's last measurements, its costs, and when it reached the threshold."""
+        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        return content
+
+    @property
+    def picture(self) -> Path:
+        """Learning curves and levels, a PNG."""
+        return self.folder / "run.png"
+
+    def solver(self) -> ActorCritic:
+        """The trained Solvers, from the newest checkpoint; see :meth:`ActorCritic.actor`."""
+        return self._stored()[1]
+
+    def task(self) -> Task:
+        """The task that they were trained on."""
+        return self._stored()[0]
+
+    def _stored(self) -> tuple[Task, ActorCritic]:
+        from proposer_rl.cli.stored import stored_run
+
+        run = stored_run(self.folder)
+        return run.task, run.learner(run.files[-1])[2].agent
+
+    def _table(self, name: str) -> pd.DataFrame:
+        import pandas as pd
+
+        return pd.read_csv(self.folder / name)
+
+
+def train(
+    task: Recipe | str,
+    curriculum: Recipe | str,
+    *,
+    scale: str | None = None,
+    filter: Mapping[str, Any] | str | None = None,
+    updates: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: bool = True,
+) -> Run:
+    """Train a Solver on a task with a curriculum.
+
+    The run is that of ``bin/train`` with the same settings, to the bit on one machine, and so is
+    its folder. Called again with the same folder, it goes on with a run that was interrupted.
+
+    Args:
+        task: ``prl.tasks.NAME(...)``, or the name alone.
+        curriculum: ``prl.curricula.NAME(...)``, or the name alone.
+        scale: how much is computed, for tasks that have scales: ``"smoke"``, ``"quick"``,
+            ``"medium"`` or ``"paper"``; None for the task's own numbers.
+        filter: of the proposed levels: ``"learnability"`` or another name in ``conf/filter``, or
+            its settings; None for what the curriculum has by default.
+        updates: of the Solver; None for the task's or scale's number.
+        seed: of every random draw.
+        folder: where the files go; None for a new one below ``outputs/``.
+        settings: whatever else ``conf/train.yaml`` has, by its top-level keys, for example
+            ``{"solver": {"ppo": {"learning_rate": 1e-3}}}``.
+        progress: whether to draw a progress bar.
+
+    Returns:
+        The run, with its measurements as tables.
+
+    Raises:
+        ValueError: in one line, naming the setting, its value and what is allowed, before anything
+            is written.
+        DivergedError: if a number is not finite; the checkpoint before stays.
+        Interrupted: if a signal asked the run to stop; all is saved then.
+    """
+    from proposer_rl.cli.compose import compose_and_run
+
+    if isinstance(task, str):
+        task = recipe_function("task", task)()
+    if isinstance(curriculum, str):
+        curriculum = recipe_function("method", curriculum)()
+    overrides = [*task.overrides(), *curriculum.overrides()]
+    if scale is not None:
+        overrides.append(f"+scale={scale}")
+    if isinstance(filter, str):
+        overrides.append(f"+filter={filter}")
+    given = {**({} if not isinstance(filter, Mapping) else {"filter": filter}), **(settings or {})}
+    overrides += [f"++{name}={override_value(value)}" for name, value in given.items()]
+    overrides.append(f"seed={override_value(seed)}")
+    overrides.append(f"compute.progress={override_value(progress)}")
+    if updates is not None:
+        overrides.append(f"schedule.updates={override_value(updates)}")
+    own = {**task.own(), **curriculum.own()}
+    return Run(compose_and_run(overrides, own, None if folder is None else Path(folder)))

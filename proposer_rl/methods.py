@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from tensordict import TensorDict
 
@@ -64,6 +64,8 @@ from proposer_rl.settings import (
 )
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Workers(NamedTuple):
@@ -120,18 +122,35 @@ def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculu
         raise ValueError(f"filter.{error}") from error
 
 
+def _takes_numbers_of(make: Callable[..., Curriculum], *given: str) -> Callable[[F], F]:
+    """Put a curriculum's own numbers in the place of ``**numbers`` in its factory's signature.
+
+    Args:
+        make: the curriculum's class.
+        given: those that the factory gives itself.
+    """
+
+    def decorate(factory: F) -> F:
+        own = [p for p in inspect.signature(factory).parameters.values() if p.name != "numbers"]
+        gives = {*given, *(p.name for p in own)}
+        parameters = inspect.signature(make).parameters.values()
+        numbers = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in gives]
+        hints = get_type_hints(make.__init__, include_extras=True)
+        factory.__signature__ = inspect.Signature([*own, *numbers])  # type: ignore[attr-defined]
+        factory.__annotations__ |= {number.name: hints[number.name] for number in numbers}
+        return factory
+
+    return decorate
+
+
 def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curriculum]:
     """The factory of a curriculum of which the task gives the first arguments, by these names."""
 
+    @_takes_numbers_of(make)
     def factory(run: Components, /, **numbers: Any) -> Curriculum:
         return make(*(getattr(run.task, part) for part in parts), **numbers)
 
-    run, *_ = inspect.signature(factory).parameters.values()
-    numbers = [*inspect.signature(make).parameters.values()][len(parts) :]
-    hints = get_type_hints(make.__init__, include_extras=True)
     factory.__doc__ = make.__doc__
-    factory.__signature__ = inspect.Signature([run, *numbers])  # type: ignore[attr-defined]
-    factory.__annotations__ = {number.name: hints[number.name] for number in numbers}
     return factory
 
 
@@ -251,6 +270,7 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
     )
 
 
+@_takes_numbers_of(TransportCurriculum)
 def currot(components: Components, **numbers: Any) -> TransportCurriculum:
     """Train on the way to the target; see :class:`TransportCurriculum` for the numbers.
 
@@ -265,6 +285,7 @@ def currot(components: Components, **numbers: Any) -> TransportCurriculum:
     return TransportCurriculum(components.task.space, components.task.target_shares, **numbers)
 
 
+@_takes_numbers_of(ReplayCurriculum, "edit")
 def replay(
     components: Components,
     score: str,
@@ -298,6 +319,7 @@ def replay(
     return curriculum
 
 
+@_takes_numbers_of(SelectionCurriculum)
 def learnability(
     components: Components, score: str, source: Source, rollouts: int, **numbers: Any
 ) -> SelectionCurriculum:
@@ -308,6 +330,7 @@ def learnability(
     return SelectionCurriculum(components.task.space, Scorer(score, source, rollouts), **numbers)
 
 
+@_takes_numbers_of(FirstOrderProposer, "probe_levels")
 def first_order_proposer(
     components: Components,
     epochs: Count,

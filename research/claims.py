@@ -26,8 +26,7 @@ from proposer_rl.report.comparisons import (
     outcomes,
     primary,
 )
-from proposer_rl.report.proposals import axis_means
-from proposer_rl.report.records import numbers, words
+from proposer_rl.report.records import Record, numbers, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_interval, mean_of
 from proposer_rl.report.studies import Group, Study
@@ -152,13 +151,13 @@ def _started(study: Study, group: Group) -> tuple[int, int, str]:
     """How many runs of a group learnt at once, of how many, and both in words."""
     first = max(run.metrics["updates"][:2][-1] for run in group.runs)
     limit = max(SOON * study.horizon, float(first))  # no run can be seen to be faster
-    known = [run.waiting(study.headline, STARTED) for run in group.runs]
-    soon = sum(run.reached and run.updates <= limit for run in known)
+    known = [run.reached(study.headline, STARTED) for run in group.runs]
+    soon = sum(updates <= limit for updates in known)
     text = (
         f"{group.label} gets to {STARTED:.0%} within {limit:.0f} updates in {soon} of {len(known)} "
         "runs (tested against a half)"
     )
-    reached = sorted(run.updates for run in known if run.reached)
+    reached = sorted(updates for updates in known if not math.isnan(updates))
     if reached:
         span = dict.fromkeys(f"{updates:.0f}" for updates in (reached[0], reached[-1]))
         text += f", in {len(reached)} after {' to '.join(span)}"
@@ -382,3 +381,15 @@ def _frames(one: Group, others: Sequence[Group]) -> str:
         float(np.mean([r.total_frames[-1] for r in g.runs])) / 1e6 for g in (one, *others)
     )
     return f"cost: {write(own)} million frames, theirs {write(min(rest))} to {write(max(rest))}"
+
+
+def axis_means(run: Run, cycle: Record) -> list[float] | None:
+    """Mean value of a cycle's proposals along each axis; None without a histogram."""
+    shares = run.shares(cycle)
+    if shares is None:
+        return None
+    sides = range(shares.ndim)
+    return [
+        float(shares.sum(tuple(other for other in sides if other != side)) @ values)
+        for side, values in zip(sides, run.task.space.values(), strict=True)
+    ]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from PIL import Image
-
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.report import curves, page, proposals
+from proposer_rl.report import curves, page, pictures
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
@@ -48,7 +45,7 @@ SCARCE = ("updates of the Solver", "environment frames", "seconds")
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.learning_curves,
     curves.cost_curves,
-    proposals.heat_maps,
+    pictures.heat_maps,
     curves.difficulty,
 )
 
@@ -243,8 +240,7 @@ def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
 
 def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
     path = f"{FIGURES}/{drawing.name}.png"
-    with Image.open(io.BytesIO(render(drawing).png)) as image:
-        files[path] = in_few_colours(image)
+    files[path] = in_few_colours(render(drawing).png)
     return f"![{escape_markdown(drawing.title)}]({path})"
 
 

@@ -41,7 +41,7 @@ def test_bash_completes_the_name_of_a_method(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("+ablation=observes", "+ablation=observes_nothing +ablation=observes_probes"),
+        ("+scale=", "+scale=medium +scale=paper +scale=quick +scale=smoke"),
         ("+method=target solver.ppo.la", ""),
         ("+method=target solver.ppo.lm", "solver.ppo.lmbda="),
     ],

@@ -17,13 +17,14 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import build, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
-from proposer_rl.cli.errors import UNFORESEEN, exit_code, lacks_memory
+from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config, saved_config
+from proposer_rl.cli.errors import BAD_INPUT, UNFORESEEN, exit_code, lacks_memory, one_line
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
@@ -36,9 +37,10 @@ from tests.tiny import composed
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
+PARSER = OverridesParser.create()
 METHODS = ", ".join(sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml")))
 
-# Changes to +method=target, and what the line must say.
+# Changes to the settings of +method=target, and what the line must say.
 WRONG = [
     # types
     ("seed=many", "seed='many': input should be a valid integer"),
@@ -136,7 +138,6 @@ WRONG = [
     ("compute.device=abacus", "compute.device='abacus': must be auto, cpu or a usable one"),
     ("compute.device=''", "compute.device='': must be auto, cpu or a usable one"),
     ("compute.device=meta", "compute.device='meta': must be auto, cpu or a usable one"),
-    ("logger=paper", "logger/paper: unknown; choose one of: csv, tensorboard, wandb"),
     ("logger.type=paper", "logger.type='paper': input should be 'csv', 'tensorboard' or 'wandb'"),
     (
         "task.evaluation.evaluator=guess",
@@ -156,17 +157,14 @@ WRONG = [
     ),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
-    ("sede=1", "sede: unknown; there are: ablation, checkpoint, compute, curriculum"),
     ("solver.ppo.gama=1", "solver.ppo.gama: unknown; there are: adam_eps, clip_"),
     ("solver.x.y=1", "solver.x: unknown; there are: batch_size, ppo"),
-    ("curriculum.tempo=3", "curriculum.tempo: unknown; there are: _target_"),
     ("+sede=1", "sede: unknown; there are: method, scale"),
     ("+solver.x=1", "solver.x: unknown; there are: batch_size, ppo"),
     (
         "+task.distributions.id.x=1",
         "task.distributions.id.x: unknown; there are: mechanism",
     ),
-    ("seed", "Error parsing override 'seed' missing EQUAL"),
     ("seed=${nowhere}", "seed=${nowhere}: Interpolation key 'nowhere' not found"),
     ("seed=???", "seed=???: missing"),
     ("task.target=???", "task.target=???: missing"),
@@ -223,9 +221,19 @@ WRONG = [
         "curriculum._target_=os.system",
         "curriculum._target_=os.system: Target 'os.system' is blocklisted",
     ),
-    ("+curriculum.x=1", "curriculum.x: unknown; there are: filter"),
+    ("+curriculum.x=1", "curriculum.x: unknown; there are none"),
 ]
 WRONG_COMMANDS = [
+    (
+        ["+method=target", "logger=paper"],
+        "logger/paper: unknown; choose one of: csv, tensorboard, wandb",
+    ),
+    (
+        ["+method=target", "sede=1"],
+        "sede: unknown; there are: ablation, checkpoint, compute, curriculum",
+    ),
+    (["+method=target", "curriculum.tempo=3"], "curriculum.tempo: unknown; there are: _target_"),
+    (["+method=target", "seed"], "Error parsing override 'seed' missing EQUAL"),
     (["+method=target", "seeds=0"], "seeds=0: input should be a valid array"),
     (
         ["task=cartpole", "+method=target", "+scale=medium"],
@@ -247,10 +255,10 @@ WRONG_COMMANDS = [
         ["+method=target", "task=none"],
         "task/none: unknown; choose one of: cartpole, gymnasium, lunar",
     ),
-    (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: action_repeat"),
+    (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: paper_literal"),
     (["+method=plr", "+as=none"], "as/none: unknown; choose one of: dcd, dcd_accel, jaxued"),
     (["+method=plr", "+score=none"], "score/none: unknown; choose one of: sampled"),
-    (["+sweep=none"], "sweep/none: unknown; choose one of: ablations, curricula, gymnasium"),
+    (["+sweep=none"], "sweep/none: unknown; choose one of: curricula, gymnasium"),
     (["curriculum.tempo=3"], "curriculum.tempo: unknown; there are: none"),
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
     (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),
@@ -271,24 +279,29 @@ WRONG_COMMANDS = [
         "curriculum.until=3: input should be a valid array",
     ),
     (
-        ["+method=perf_gain", "checkpoint=lives/0"],
-        "checkpoint=lives/0: method=perf_gain takes none; frozen_proposer does, "
+        ["+method=target", "checkpoint=other"],
+        "checkpoint=other: method=target takes none; those with a Proposer do, "
         "and a run goes on with hydra.run.dir=FOLDER",
     ),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
+    (
+        ["+method=plr", "+curriculum.x=1"],
+        "curriculum.x: unknown; there are: score, source, rollouts, prioritization",
+    ),
+    (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
     (
-        ["+method=perf_gain", "+ablation=meta_episode_length_10", "+scale=quick"],
+        ["+method=perf_gain", "+ablation=paper_literal", "+scale=quick"],
         "+scale: must come before +ablation, or it would undo it",
     ),
     (
-        ["+ablation=reward_return", "+method=perf_gain"],
+        ["+ablation=paper_literal", "+method=perf_gain"],
         "+method: must come before +ablation, or it would undo it",
     ),
     (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
     (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
     (
-        ["+method=task_difficulty", *SMOKE, "curriculum._target_=builtins.len"],
+        ["+method=target", *SMOKE, "curriculum._target_=builtins.len"],
         "curriculum: must make a Curriculum, but makes int",
     ),
     (
@@ -313,7 +326,7 @@ WRONG_COMMANDS = [
         "schedule.cycle_length=5 must equal proposer.meta_episode_length=3",
     ),
     (
-        ["+method=perf_gain", *SMOKE, "+ablation=advance_best", "schedule.updates=7"],
+        ["+method=perf_gain", *SMOKE, "proposer.advance=best", "schedule.updates=7"],
         "schedule.updates=7 must be a multiple of proposer.meta_episode_length=3",
     ),
     (
@@ -334,7 +347,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
-        "curriculum.reward: unknown; there are none",
+        "curriculum.reward: unknown; there are: checkpoint",
     ),
     (
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
@@ -357,10 +370,28 @@ def begun(*arguments: Any) -> float:
     raise AssertionError("the input was taken for valid")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [*((["+method=target", change], message) for change, message in WRONG), *WRONG_COMMANDS],
-)
+@pytest.fixture(scope="module")
+def target() -> dict[str, Any]:
+    """The settings of ``+method=target``, as they stand in its files."""
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        return OmegaConf.to_container(compose("train", ["+method=target"]))
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG)
+def test_a_wrong_value_is_refused_in_a_line_that_names_it(
+    change: str, message: str, target: dict[str, Any]
+) -> None:
+    config = OmegaConf.create(target)
+    override = PARSER.parse_override(change)
+    OmegaConf.update(config, override.key_or_group, override.value(), force_add=True)
+    with pytest.raises(Exception) as refused:
+        parts(read_config(config), StopSignals())
+    assert exit_code(refused.value) == BAD_INPUT
+    assert message in one_line(refused.value)
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG_COMMANDS)
 def test_bad_input_gets_one_line_and_exit_code_2(
     arguments, message, train, capsys, monkeypatch
 ) -> None:
@@ -417,7 +448,7 @@ def test_a_folder_that_was_there_stays(train) -> None:
     [
         ("+method=plr", "+as=dcd", "curriculum.temperature"),
         ("+method=sfl", "+score=sampled", "curriculum.source"),
-        ("+method=perf_gain", "+ablation=reward_return", "curriculum.reward"),
+        ("+method=perf_gain", "+ablation=paper_literal", "curriculum.reward"),
     ],
 )
 def test_an_order_that_is_refused_would_undo_something(late: str, early: str, key: str) -> None:
@@ -566,6 +597,17 @@ def test_a_stored_configuration_instantiates_nothing(finished: Path, train, caps
     assert not Path("executed").exists()
 
 
+def test_the_settings_of_an_earlier_version_stay_readable(finished: Path) -> None:
+    """It had several lives and no filter, and other names for a curriculum and the task's class."""
+    folder = copy_of(finished)
+    stored = json.loads((folder / "config.json").read_text())
+    earlier = {**stored, "lifetimes": 1, "hand_made": stored.pop("hand_designed")}
+    del earlier["filter"], earlier["hand_designed"]
+    earlier["task"]["_target_"] = "proposer_rl.mazes.task.MazeTask"
+    (folder / "config.json").write_text(json.dumps(earlier))
+    assert saved_config(folder) == saved_config(finished)
+
+
 def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> None:
     Path("run").mkdir()
     Path("run/years.csv").write_text("year\n1\n")
@@ -667,7 +709,7 @@ def little_memory() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("little_memory")
-@hypothesis.settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis.settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
     smoke: dict[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory

@@ -27,7 +27,7 @@ SPENT = {
     "improve": ["+method=perf_gain"],
     "improve, of which one copy is the Solver": [
         "+method=perf_gain",
-        "+ablation=advance_best",
+        "proposer.advance=best",
         "schedule.cycle_length=3",
     ],
     "nowhere": ["+method=target"],
@@ -57,7 +57,7 @@ def test_the_frames_are_the_steps_that_were_made_also_after_a_resume(
     assert summary["frames"] + summary["curriculum_frames"] == sum(made)
     assert (summary["curriculum_frames"] > 0) == (arguments != SPENT["nowhere"])
     with pytest.raises(Interrupted):
-        few = "+ablation=advance_best" in arguments  # of safe points: one for each cycle
+        few = "proposer.advance=best" in arguments  # of safe points: one for each cycle
         experiment(tmp_path / "again", arguments, StopAt(2 if few else 5)).run()
     assert len(read_csv(tmp_path / "again" / "metrics.csv")) < 4
     experiment(tmp_path / "again", arguments, StopSignals()).run()

@@ -8,10 +8,7 @@ from signal import SIGKILL
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
-from proposer_rl.cli.config import methods
-from proposer_rl.cli.places import CONFIG_FOLDER
 from tests.processes import Ended, Processes
 from tests.same_run import assert_same_run
 
@@ -19,19 +16,18 @@ from tests.same_run import assert_same_run
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.checkpoint_seconds=1e-6"]
 SMOKE += ["proposer.meta_episode_length=5"]
 # At any time; before any write; in the middle of a checkpoint's temporary file; before it gets its
-# name. Methods that follow one another meet others of them, every third one after another.
+# name. A method meets some of them, one after another; which ones, methods have no part in.
 MOMENTS = ["", "", "fsync .step_", "replace .step_"]
-KINDS = [[0, 2], [1], [3]]
-
-
-def factory(method: str) -> str:
-    """What makes a method's curriculum, which one that is built on another takes over."""
-    config = OmegaConf.load(CONFIG_FOLDER / "method" / f"{method}.yaml")
-    return OmegaConf.select(config, "curriculum._target_") or factory(config.defaults[0])
-
-
-# Methods of one factory differ in numbers; that each of them resumes is tested without processes.
-METHODS = list({factory(method): method for method in reversed(methods())}.values())
+# In one process every curriculum is taken up from its state, in tests/curricula/test_contract.py.
+# These differ in what a checkpoint holds of them: nothing, a buffer, bins of episodes, a Proposer
+# that learns, one that another run has trained.
+METHODS = {
+    "target": [0, 2],
+    "plr": [1],
+    "alp_gmm": [3],
+    "perf_gain": [0, 2],
+    "frozen_proposer": [1],
+}
 
 
 def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:
@@ -61,7 +57,7 @@ def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
         command.append(f"checkpoint={learnt}")
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
-    kinds, attempt = [*KINDS[METHODS.index(method) % len(KINDS)]], 0
+    kinds, attempt = [*METHODS[method]], 0
     while kinds:
         folder = tmp_path / str(attempt)
         options = moment(draw, kinds[-1], whole)

@@ -16,7 +16,7 @@ from proposer_rl.cli.play import open_session
 from proposer_rl.cli.report import main as report
 from proposer_rl.cli.watch import main as watch
 from proposer_rl.play.requests import Drawn, OfCurriculum
-from proposer_rl.report.levels import along_training, side_by_side
+from proposer_rl.report.pictures import along_training, side_by_side
 from proposer_rl.runs.folder import read_csv
 from tests.commands import trained_run
 from tests.processes import Processes
@@ -92,4 +92,4 @@ def test_the_shortest_task_has_every_command(
         assert all(level["picture"] and "wind" in level["text"][1] for level in shown["levels"])
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [along_training])
     report([str(run), "-q", "-o", str(tmp_path / "report")])
-    assert "Sledges along training" in (tmp_path / "report" / "report.html").read_text("utf-8")
+    assert "Sledges of that batch" in (tmp_path / "report" / "report.html").read_text("utf-8")

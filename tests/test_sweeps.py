@@ -9,17 +9,16 @@ from pathlib import Path
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
-from proposer_rl.cli.config import CONFIG_FOLDER, RunConfig
+from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
-from proposer_rl.report.sweeps import PLAN, Left, left
+from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
 from tests.commands import call
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
-ABLATIONS = [file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml")]
 
 
 @pytest.fixture
@@ -145,7 +144,7 @@ def test_a_run_counts_as_finished_if_it_was_given_the_same(
     (tmp_path / PLAN).write_text(PLANNED.format(scale=scale, given=", ".join(given)))
     own = ["+method=perf_gain", "+scale=medium", *more]
     others = {
-        "+ablation=probes_0": [*own, "seed=0", "+ablation=probes_0"],
+        "+ablation=other": [*own, "seed=0", "+ablation=other"],
         "+filter=learnability": [*own, "seed=0", "+filter=learnability"],
         "another number": [*own, "seed=0", "pool.capacity=7"],
         "another method": ["+method=sfl", *own[1:], "seed=0"],
@@ -155,11 +154,11 @@ def test_a_run_counts_as_finished_if_it_was_given_the_same(
     for name, overrides in others.items():
         finished(tmp_path / name, 1000.0, *overrides)
     # Four are left, of which two are like one that took 1000 seconds with another seed.
-    assert left(tmp_path, planned(tmp_path)) == Left(4, 4, pytest.approx(4000), 1, 2)
+    assert left(tmp_path, planned(tmp_path)) == Left(4, 4, pytest.approx(4000), 1)
     finished(tmp_path / "alone", 10.0, "seed=0", *reversed(own))
     finished(tmp_path / "of the sweep", 20.0, *own, "seed=1", "+sweep=medium")
     mean = (6 * 1000 + 30) / 8
-    assert left(tmp_path, planned(tmp_path)) == Left(2, 4, pytest.approx(2 * mean), 1, 2)
+    assert left(tmp_path, planned(tmp_path)) == Left(2, 4, pytest.approx(2 * mean), 1)
 
 
 def test_what_is_computed_alike_counts_where_it_is_swept(tmp_path: Path) -> None:
@@ -176,7 +175,7 @@ def test_a_sweep_of_seeds_alone_is_that_of_its_method(tmp_path: Path) -> None:
     (tmp_path / PLAN).write_text(plan)
     for seed, method in enumerate(["target", "perf_gain"]):
         finished(tmp_path / method, 9.0, f"+method={method}", "+scale=medium", f"seed={seed}")
-    assert left(tmp_path, planned(tmp_path)) == Left(1, 2, pytest.approx(9.0), 1, 0)
+    assert left(tmp_path, planned(tmp_path)) == Left(1, 2, pytest.approx(9.0), 1)
 
 
 def test_a_failed_run_is_listed_and_tried_again(
@@ -274,16 +273,9 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
 
     monkeypatch.setattr("proposer_rl.cli.run.parts", note)
     assert train("+sweep=medium_frozen", "seed=107") == 1
-    assert train("+sweep=ablations", "+scale=medium", "+ablation=paper_literal", "seed=107") == 1
+    assert train("+sweep=medium", "+method=perf_gain", "+ablation=paper_literal", "seed=107") == 1
     frozen = "sweeps/medium/frozen_proposer-none-seed_107"
     assert made == [
         (frozen, "results/medium/proposer.pt", 107, "none"),
         ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
     ]
-
-
-def test_a_family_of_ablations_is_one_command(composed) -> None:
-    """Beside the experiment's own runs, at the same scale."""
-    made = composed("+sweep=ablations", "+scale=quick", "+ablation=glob(probes_*)", "seed=1")
-    family = [name for name in ABLATIONS if name.startswith("probes_")]
-    assert family and made == {("quick", "perf_gain", name, 1) for name in family}

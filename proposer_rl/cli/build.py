@@ -107,6 +107,8 @@ def make_task(config: RunConfig) -> Task:
     context = ComputeContext(device, config.precision, compute.cores)
     try:
         task = task_maker(config.task)(solver=config.solver, context=context)
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError(f"task.{one_line(error)}") from error
     return recorded(task) if compute.graphs else task
@@ -130,11 +132,11 @@ def _curriculum(
         tell(done)
         signals.check()
 
-    chosen = Components(
+    components = Components(
         task, config.proposer, config.seeds, on_update, _workers(config, task, tell)
     )
     try:
-        curriculum = curriculum_maker(config.curriculum)(chosen)
+        curriculum = curriculum_maker(config.curriculum)(components)
     except ArgumentError as error:
         raise ConfigError(f"curriculum.{one_line(error)}") from error
     except ConfigError:
@@ -145,7 +147,7 @@ def _curriculum(
         kind = type(curriculum).__name__
         raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
-    if chosen.workers is not None and not learned:
+    if components.workers is not None and not learned:
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"

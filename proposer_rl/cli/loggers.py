@@ -83,7 +83,7 @@ def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[n
         if tiles:
             yield name, _sheet(tiles)
     if "histogram" in row:
-        from proposer_rl.report.proposals import last_map  # figures, which other loggers need not
+        from proposer_rl.report.pictures import last_map  # figures, which other loggers need not
 
         image = last_map(path)
         if image is not None:

@@ -22,7 +22,7 @@ examples:
   bin/report outputs results/medium        your runs beside published ones
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
-figures/ (SVG, PNG, animations) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
+figures/ (SVG, PNG) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
 Runs that were measured on different levels come in sections of their own. Unfinished runs are in
 the figures as far as they got, not in the comparisons, and the report says so."""
 

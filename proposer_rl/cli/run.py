@@ -17,7 +17,7 @@ from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
-from proposer_rl.report.levels import draw_run
+from proposer_rl.report.pictures import draw_run
 from proposer_rl.runs.checkpoint import (
     checkpoint_bytes,
     checkpoint_files,

@@ -21,9 +21,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from proposer_rl.report.progress import find_progress
+from proposer_rl.report.progress import PLAN, find_progress, left
 from proposer_rl.report.reading import FAILURE
-from proposer_rl.report.sweeps import PLAN, left
 from proposer_rl.report.terminal import overview
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.lock import InUseError
@@ -63,7 +62,7 @@ class SweepSummary(Callback):
 
 
 def planned(folder: Path) -> list[tuple[str, ...]]:
-    """The runs of a sweep, as its folder says: of each the settings that not all of them have.
+    """The runs of a sweep, as its folder says: of each the settings.
 
     Empty where it does not say, or what it says is not understood.
     """
@@ -79,8 +78,8 @@ def planned(folder: Path) -> list[tuple[str, ...]]:
         return []
     except HydraException:  # files of a glob are looked for where Hydra composes
         return []
-    varying = [[f"{key}={one}" for one in found] for key, found in values.items() if len(found) > 1]
-    return list(product(*varying)) if math.prod(map(len, varying)) < MOST_RUNS else []
+    settings = [[f"{key}={one}" for one in found] for key, found in values.items()]
+    return list(product(*settings)) if math.prod(map(len, settings)) < MOST_RUNS else []
 
 
 def _values(override: Override) -> Iterator[str]:

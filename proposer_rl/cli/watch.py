@@ -15,8 +15,7 @@ from rich.text import Text
 
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
-from proposer_rl.report.progress import find_progress
-from proposer_rl.report.sweeps import PLAN, left
+from proposer_rl.report.progress import PLAN, find_progress, left
 from proposer_rl.report.terminal import overview, screen
 
 EPILOG = """\

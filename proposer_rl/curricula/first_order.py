@@ -25,23 +25,10 @@ class _AlignedBins(BinCurriculum):
     With s_n the exponential moving average of the n-th bin's score, its share of the batch is
 
         q_n  proportional to  exp( s_n / (temperature * max over n of |s_n|) ).
-
-    Args:
-        space: that has the bins.
-        target: the distribution that is to be mastered.
-        every: batches between two scoring passes.
-        temperature: of the shares.
-        smoothing: share of the old score in the average.
     """
 
     def __init__(
-        self,
-        space: Space,
-        target: Distribution,
-        *,
-        every: int,
-        temperature: float,
-        smoothing: float,
+        self, space: Space, target: Distribution, every: int, temperature: float, smoothing: float
     ) -> None:
         super().__init__(space, every=every)
         self._target, self._temperature, self.smoothing = target, temperature, smoothing
@@ -88,7 +75,7 @@ class FirstOrderCurriculum(_AlignedBins):
         smoothing: Decay = 0.9,
         measure: Measure = "log_success",
     ) -> None:
-        super().__init__(space, target, every=every, temperature=temperature, smoothing=smoothing)
+        super().__init__(space, target, every, temperature, smoothing)
         self._target_levels, self._candidates = target_levels, candidates
         self._step, self._measure = step, measure
 
@@ -155,7 +142,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         smoothing: Decay = 0.9,
         exploration: Share = 0.2,
     ) -> None:
-        super().__init__(space, target, every=every, temperature=temperature, smoothing=smoothing)
+        super().__init__(space, target, every, temperature, smoothing)
         self._exploration = exploration
         self._direction: dict[str, Tensor] = {}
         self._device = device_of(target.sample(1, torch.Generator()))

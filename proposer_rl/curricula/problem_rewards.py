@@ -23,11 +23,7 @@ class FirstOrderProposer(ProblemProposer):
     """A problem's reward is its alignment with the target direction.
 
     Args:
-        space: see :class:`ProblemProposer`.
-        target: the distribution that is to be mastered.
-        agent: see :class:`ProblemProposer`.
-        settings: the same.
-        probe_levels: probes C.
+        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
         target_levels: fresh levels E of the target that the direction is taken from.
         step: of the differences that tell the alignments, in learning rates.
         measure: of the target's performance; see
@@ -79,12 +75,8 @@ class PairedProposer(ProblemProposer):
     cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back.
 
     Args:
-        space: see :class:`ProblemProposer`.
-        target: the same.
-        agent: the same.
-        settings: the same.
+        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
         antagonist: the second student.
-        probe_levels: probes C.
     """
 
     needs = ("probe", "performance")

@@ -28,7 +28,7 @@ from proposer_rl.task import Task
 
 def meta_env(
     task: Task,
-    chosen: ProposerSettings,
+    config: ProposerSettings,
     streams: Streams,
     reward: rewards.Reward,
     share: range,
@@ -39,7 +39,7 @@ def meta_env(
 
     Args:
         task: that they learn.
-        chosen: what is seen of them, how actions are drawn and how long they hold.
+        config: what is seen of them, how actions are drawn and how long they hold.
         streams: of the run's Proposer.
         reward: of an update.
         share: numbers of the copies.
@@ -48,11 +48,11 @@ def meta_env(
     """
     return kind(
         task.learner([streams] * len(share)),
-        view=solver_view(task, chosen),
-        actions=proposer_actions(task, chosen),
+        view=solver_view(task, config),
+        actions=proposer_actions(task, config),
         reward=reward,
-        meta_episode_length=chosen.meta_episode_length,
-        action_repeat=chosen.action_repeat,
+        meta_episode_length=config.meta_episode_length,
+        action_repeat=config.action_repeat,
         first_copy=share.start,
         on_update=on_update,
     )
@@ -60,7 +60,7 @@ def meta_env(
 
 def worker_env(
     make_task: Callable[[str], Task],
-    chosen: ProposerSettings,
+    config: ProposerSettings,
     streams: Streams,
     reward: rewards.Reward,
     *,
@@ -69,41 +69,41 @@ def worker_env(
     kind: type[SolverTrainingEnv],
 ) -> SolverTrainingEnv:
     """The same in another process, whose task is made there, on its device."""
-    return meta_env(make_task(device), chosen, streams, reward, share, kind=kind)
+    return meta_env(make_task(device), config, streams, reward, share, kind=kind)
 
 
-def solver_view(task: Task, chosen: ProposerSettings) -> SolverView:
+def solver_view(task: Task, config: ProposerSettings) -> SolverView:
     """What a Proposer sees of a Solver."""
     return SolverView(
-        task, validation_levels=chosen.validation_levels, probe_levels=chosen.probe_levels
+        task, validation_levels=config.validation_levels, probe_levels=config.probe_levels
     )
 
 
-def proposer_actions(task: Task, chosen: ProposerSettings) -> Actions:
+def proposer_actions(task: Task, config: ProposerSettings) -> Actions:
     """What its actions mean."""
     kinds = {MixtureSettings: Mixture, ProblemSettings: ProblemChoices}
-    return kinds[type(chosen.action)](task.space)
+    return kinds[type(config.action)](task.space)
 
 
-def proposer_agent(task: Task, chosen: ProposerSettings) -> ActorCritic:
+def proposer_agent(task: Task, config: ProposerSettings) -> ActorCritic:
     """The Proposer, with weights from torch's default generator."""
-    width = chosen.context + len(chosen.observes)
-    head, distribution = _head(task, chosen, width)
+    width = config.context + len(config.observes)
+    head, distribution = _head(task, config, width)
     network = ProposerNetwork(
         head,
-        task.probe_encoder(chosen.context),
-        context=chosen.context,
-        numbers=len(chosen.observes),
-        hidden=chosen.hidden,
+        task.probe_encoder(config.context),
+        context=config.context,
+        numbers=len(config.observes),
+        hidden=config.hidden,
     ).to(task.device)
-    return proposer_actor_critic(network, distribution, ["probes", *chosen.observes])
+    return proposer_actor_critic(network, distribution, ["probes", *config.observes])
 
 
 def _head(
-    task: Task, chosen: ProposerSettings, width: int
+    task: Task, config: ProposerSettings, width: int
 ) -> tuple[nn.Module, Callable[..., Distribution]]:
     """From a context of that width to the parameters of the action's distribution."""
-    action, hidden = chosen.action, chosen.hidden
+    action, hidden = config.action, config.hidden
     if isinstance(action, MixtureSettings):
         directions = task.space.coordinates.shape[1]
         return MixtureHead(width, directions, hidden=hidden, spread=action.spread), normal

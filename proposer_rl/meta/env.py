@@ -32,7 +32,7 @@ class SolverTrainingEnv(EnvBase):
     told from chance.
 
     Observations: those of :meth:`~proposer_rl.meta.view.SolverView.observation`, and ``proposed``
-    int64 [K, N], how often each bin was chosen in the step before. Actions: ``action``, as
+    int64 [K, N], how often each bin was drawn in the step before. Actions: ``action``, as
     ``actions`` defines them. Episodes end by ``terminated``.
 
     Args:
@@ -130,16 +130,16 @@ class SolverTrainingEnv(EnvBase):
         rewards, choices = [], []
         for update in range(self.action_repeat):
             last = update == self.action_repeat - 1
-            reward, chosen = self._train(tensordict["action"], measure=last)
+            reward, drawn = self._train(tensordict["action"], measure=last)
             rewards.append(reward)
-            choices.append(chosen)
+            choices.append(drawn)
             self.on_update(self._updates)
         proposed = _count(torch.cat(choices, -1), self.actions.bins).to(self.device)
         state = self._observation(*self._seen, proposed)
         return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))
 
     def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
-        """One update of every Solver: its reward [K], and the bins that were chosen [K, P]."""
+        """One update of every Solver: its reward [K], and the bins that were drawn [K, P]."""
         streams = [self.streams.within(self._episode, self._updates, k) for k in self._copies]
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)

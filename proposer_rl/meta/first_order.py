@@ -150,7 +150,7 @@ def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[Non
 
 @torch.no_grad()
 def alignment(
-    agent: ActorCritic, direction: Direction, step: float, worth: Callable[[], Tensor]
+    agent: ActorCritic, direction: Direction, step: float, gained: Callable[[], Tensor]
 ) -> Tensor:
     """The slope along a direction of what K Solvers get, by a central difference.
 
@@ -161,7 +161,7 @@ def alignment(
         agent: the Solvers.
         direction: as :func:`target_direction` makes it.
         step: of the difference, such as the learning rate.
-        worth: what the agent gets as it stands, such as the exact return of levels, or
+        gained: what the agent gets as it stands, such as the exact return of levels, or
             :func:`surrogate`: float [K, E].
 
     Returns:
@@ -178,9 +178,9 @@ def alignment(
         tensor([[6.]])
     """
     with moved(agent, direction, step):
-        ahead = worth()
+        ahead = gained()
     with moved(agent, direction, -step):
-        behind = worth()
+        behind = gained()
     return (ahead - behind) / (2 * step)
 
 

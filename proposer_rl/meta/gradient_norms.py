@@ -106,7 +106,7 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
                 parameters[name].copy_(parameter[solver])
 
     def lengths(learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
-        found = []
+        parts = []
         for solver in range(solvers):
             become(learner, solver)
             for start in range(0, count, AT_ONCE):
@@ -122,7 +122,7 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
                         materialize_grads=True,
                     )
                 named = dict(zip(parameters, gradients, strict=True))
-                found.append(squared_length(named)[: count - start])
-        return torch.cat(found).unflatten(0, (solvers, count))
+                parts.append(squared_length(named)[: count - start])
+        return torch.cat(parts).unflatten(0, (solvers, count))
 
     return lengths

@@ -1,4 +1,4 @@
-"""What a reader needs first: the results in two sentences, and what the words mean."""
+"""What a reader needs first: the results in two sentences, and what each method does."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from proposer_rl.report.comparisons import TOO_FEW, Decision, between, decisions, primary
-from proposer_rl.report.records import LONGEST_TEXT, printable, words
+from proposer_rl.report.records import LONGEST_TEXT, printable
 from proposer_rl.report.statistics import FEWEST, mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
-from proposer_rl.runs.columns import is_rate
 
 # What methods and ablations do, by ``method`` or ``ablation`` and name.
 Meanings = Mapping[str, Mapping[str, str]]
@@ -36,37 +35,6 @@ def answer(study: Study) -> tuple[str, str]:
         f"{_shown(best, [between(found, best, other) for other in others])}."
     )
     return first, _against(baseline, [group for group in ranked if group is not baseline], found)
-
-
-def glossary(study: Study) -> list[tuple[str, str]]:
-    """The words that a reader needs, for those who have not seen any of this before."""
-    levels, measured = study.example.task.levels, study.headline
-    text = f"what is measured of the Solver on the distribution {measured.rpartition('_')[0]!r}"
-    if is_rate(measured):
-        text += f": the share of its {levels} that the Solver solves, from 0 to 1"
-    return [
-        (
-            "Solver",
-            f"the agent that is trained on batches of {levels}, with reinforcement learning (PPO). "
-            "It is the same under every method; one update is one training step on one batch.",
-        ),
-        (
-            "Proposer",
-            f"a second agent, whose actions are the {levels} of the next batches; it is rewarded "
-            "with what the Solver learns from them. Not every method has one.",
-        ),
-        (
-            "Method",
-            f"what decides which {levels} the Solver trains on. Nothing else differs between "
-            "methods.",
-        ),
-        (
-            "Seed",
-            "one independent run of a method. [a, b] is a 95 % interval over seeds, given from "
-            f"{FEWEST} seeds on.",
-        ),
-        (words(measured), f"{text}. Methods are compared by its mean along training."),
-    ]
 
 
 def meaning(group: Group, meanings: Meanings) -> str:

@@ -5,28 +5,26 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from proposer_rl.report import (
     curves,
-    levels,
-    markdown,
     outcomes,
     page,
-    proposals,
+    pictures,
     tidy,
 )
-from proposer_rl.report.answer import Meanings, answer, glossary
+from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.records import words
-from proposer_rl.report.stages import stages
+from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
-from proposer_rl.runs.columns import can_reach
+from proposer_rl.runs.columns import can_reach, is_rate
 from proposer_rl.runs.folder import write_atomically
 
 PAGE = "report.html"
@@ -40,18 +38,16 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.worst_curves,
     curves.level_by_level,
     curves.difficulty,
-    proposals.gains,
-    proposals.heat_maps,
-    levels.along_training,
-    levels.side_by_side,
-    levels.recorded_by_curricula,
+    curves.gains_of_replicas,
+    pictures.heat_maps,
+    pictures.along_training,
+    pictures.side_by_side,
+    pictures.recorded_by_curricula,
     curves.diagnostics,
 )
 
-# Of these the page has pictures alone, and of others charts only where levels of several stages
-# can be shown.
-STILL = {levels.side_by_side, levels.recorded_by_curricula}
-STAGED = {proposals.heat_maps, levels.along_training}
+# These are no charts, so that the page has them as pictures.
+STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
 
 
 def read_checked(
@@ -118,17 +114,15 @@ def write_report(
     title = "Curricula: what the runs show"
     command = page.report_command("bin/report", folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
-    if len(html) > page.LARGEST:  # the figures that are charts there, too, are files anyway
-        for section in sections:
-            section["figures"] = [one for one in section["figures"] if not one["charted"]]
-        html = page.render(title=title, command=command, sections=sections, notes=notes)
     parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
-    parts += [
-        markdown.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)
-    ]
-    files["report.md"] = markdown.document(parts, command, notes).encode()
-    write_files(output, files, (FIGURES, TABLES))
-    write_atomically(output / PAGE, html.encode())
+    parts += [page.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)]
+    files["report.md"] = page.document(parts, command, notes).encode()
+    for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        path.mkdir(parents=True)
+    for name, content in {**files, PAGE: html.encode()}.items():
+        write_atomically(output / name, content)
     return output / PAGE
 
 
@@ -160,32 +154,29 @@ def _section(
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = tidy.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}
-    staged = stages(study)
-    still = STILL if staged else STILL | STAGED
     figures = []
     for draw in DRAWINGS:
-        bar.set_postfix_str(draw.__name__.replace("_", " "))
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
             drawn = render(drawing)
-            figures.append(page.figure(drawing, drawn, draw not in still))
+            if draw in STILL:
+                figures.append(page.figure(drawing, drawn.png))
             files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
-            animations = [panel.animation for panel in drawing.panels if panel.animation]
-            files |= {f"{path}_{_slug(name)}.gif": make() for name, make in animations}
         bar.update()
-    data = {**charts(study), "stages": staged}
+    data = charts(study)
     return {
         "study": study,
         "headline": words(study.headline),
         "answer": answer(study),
-        "glossary": glossary(study),
+        "rate": is_rate(study.headline),
+        "few": FEWEST,
         "facts": page.facts(study),
         "origin": page.origin(study),
         "incomplete": page.incomplete(study),
         "looks": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
-        "staged": staged is not None,
+        "staged": data["stages"] is not None,
         "single": bool(data["levels"]),
         "methods": methods,
         "figures": figures,
@@ -193,17 +184,6 @@ def _section(
         "commands": page.commands(study),
         "configs": page.configs(study),
     }
-
-
-def write_files(output: Path, files: Mapping[str, bytes], folders: Sequence[str]) -> None:
-    """Replace a report's files; those of a former one in these folders are removed."""
-    for folder in folders:
-        path = output / folder
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        path.mkdir(parents=True)
-    for name, content in files.items():
-        write_atomically(output / name, content)
 
 
 def _slug(text: str) -> str:

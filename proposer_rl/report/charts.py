@@ -1,10 +1,15 @@
-"""The numbers of the page's charts as JSON: those of the figures, with every single run."""
+"""The page's charts and its slider as JSON: the numbers of the figures, with every single run."""
 
 from __future__ import annotations
 
+import base64
+import io
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from proposer_rl.report.comparisons import Outcome, outcomes, updates_needed, waiting_outcome
 from proposer_rl.report.measures import (
@@ -22,8 +27,8 @@ from proposer_rl.report.measures import (
     trained,
     worst,
 )
-from proposer_rl.report.records import Column
-from proposer_rl.report.runs import Run
+from proposer_rl.report.records import LevelRecord, number, picture
+from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import mean_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
@@ -31,19 +36,24 @@ from proposer_rl.runs.columns import is_rate
 Json = Any
 DIGITS = 5
 DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
+LEVELS = 4  # of a batch
+SIDE = 160  # pixels of a picture, at most
+# How many stages of a method are shown: as many as fit.
+STAGES = (40, 20, 10, 5)
+MOST_BYTES = 2**20  # of all pictures of a study
 
 
 def charts(study: Study) -> dict[str, Json]:
-    """All that the page draws of a study, but for what :mod:`~proposer_rl.report.stages` has.
+    """All that the page draws of a study.
 
     Returns:
         ``methods``: each with its look and seeds. ``axes``: what can be on the abscissa.
-        ``places``: of every method's runs where they were evaluated, by axis. ``measures``: each
-        by axis with mean and interval of every method, and with ``rows`` of its runs, at their
-        places or, where they are another table's, at the means' own; null where there is none.
+        ``measures``: each by axis with mean and interval of every method, and with ``rows`` of its
+        runs and their ``seeds``; null where there is none.
         ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
         that two methods have for single levels what each reaches there, null without records.
         ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
+        ``stages``: what the slider shows, null without any.
     """
     return {
         "methods": [
@@ -56,7 +66,6 @@ def charts(study: Study) -> dict[str, Json]:
             for group in study.groups
         ],
         "axes": [UPDATES, *COSTS],
-        "places": [[_places(run) for run in group.runs] for group in study.groups],
         "measures": [
             _measure(study, each)
             for each in (
@@ -71,6 +80,7 @@ def charts(study: Study) -> dict[str, Json]:
         "levels": _levels(study),
         "baseline": [group.label for group in study.groups].index(study.baseline.label),
         "headline": {"name": axis_text(study.headline), "rate": is_rate(study.headline)},
+        "stages": _stages(study),
     }
 
 
@@ -79,31 +89,11 @@ def plain(values: Iterable[float]) -> list[float | None]:
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in map(float, values)]
 
 
-def _places(run: Run) -> Json:
-    costs = {axis: plain(cost(run)) for axis, cost in COSTS.items()}
-    return {UPDATES: plain(run.metrics["updates"]), **costs}
-
-
 def _measure(study: Study, measure: Measure) -> Json:
-    """Means and intervals by axis, and the rows of single runs.
-
-    Those of a column of ``metrics`` stand at the runs' own places, others at the means'.
-    """
-    found = {axis: [of(group) for group in study.groups] for axis, of in measure.axes.items()}
-    first = next(iter(found.values()))
-    if measure.column:
-        rows = [[_row(r.metrics.get(measure.column)) for r in g.runs] for g in study.groups]
-    else:
-        rows = [
-            [_row(_of_run(series, run)) for run in group.runs]
-            for group, series in zip(study.groups, first, strict=True)
-        ]
     return {
         "kind": measure.kind,
         "name": measure.name,
-        "axes": {axis: [_means(one) for one in series] for axis, series in found.items()},
-        "rows": rows,
-        "own": not measure.column,
+        "axes": {axis: [_series(of(g)) for g in study.groups] for axis, of in measure.axes.items()},
         "rate": measure.rate,
         "log": measure.log,
     }
@@ -126,7 +116,7 @@ def _levels(study: Study) -> list[Json]:
     ]
 
 
-def _means(series: Series | None) -> Json:
+def _series(series: Series | None) -> Json:
     if series is None:
         return None
     found = band(series.rows)
@@ -136,16 +126,9 @@ def _means(series: Series | None) -> Json:
         "whole": found.whole.tolist(),
         "low": plain(found.low),
         "high": plain(found.high),
+        "seeds": [run.seed for run in series.runs],
+        "rows": [plain(row) for row in series.rows],
     }
-
-
-def _of_run(series: Series | None, run: Run) -> Column | None:
-    rows = () if series is None else zip(series.runs, series.rows, strict=True)
-    return next((row for one, row in rows if one is run), None)
-
-
-def _row(values: Column | None) -> Json:
-    return None if values is None else plain(values)
 
 
 def _outcomes(study: Study) -> list[Json]:
@@ -174,3 +157,98 @@ def _estimate(study: Study, group: Group | None, outcome: Outcome) -> Sequence[f
         return updates_needed(study, group) or ()
     values = outcome.values(group)
     return mean_interval(values) if values else ()
+
+
+def _stages(study: Study) -> dict[str, Json] | None:
+    """What the page's slider shows: of every method one run, the first that recorded levels.
+
+    Where none of a method's runs did, the first that recorded proposals.
+
+    Returns:
+        ``axes``: names and values of the space of levels, at most two. ``pictures``: each once, a
+        PNG in base64. ``methods``: for every method null or the ``seed``, the ``curve`` of its
+        headline and the ``stages``: updates, ``levels`` (the number of a picture, or lines of
+        text) and ``map``, the last record of what was proposed (rows of shares) or null.
+        ``first``: the number of the method to begin with. None where no run recorded either, or
+        the pictures are too large for a page.
+    """
+    like = study.example
+    runs = [
+        next((run for run in group.runs if run.samples), None)
+        or next(
+            (run for run in group.runs if any(like.shares(c) is not None for c in run.cycles)), None
+        )
+        for group in study.groups
+    ]
+    for most in STAGES:
+        pictures: dict[str, int] = {}
+        methods = [None if run is None else _method(run, study, most, pictures) for run in runs]
+        if sum(map(len, pictures)) <= MOST_BYTES:
+            break
+    else:
+        return None
+    shown = {number: method for number, method in enumerate(methods) if method is not None}
+    if not shown:
+        return None
+    proposed = [number for number, method in shown.items() if method["stages"][-1]["map"]]
+    axes = [
+        {"name": name, "values": plain(values)}
+        for name, values in list(like.task.space.items())[:2]
+    ]
+    return {
+        "axes": axes,
+        "pictures": list(pictures),
+        "methods": methods,
+        "first": next(iter([*proposed, *shown])),
+    }
+
+
+def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict[str, Json]:
+    moments: list[tuple[int, Sequence[LevelRecord]]] = [(s.updates, s.levels) for s in run.samples]
+    if not moments:
+        recorded = [c for c in run.cycles if number(c.get("seed", run.seed)) == run.seed]
+        moments = [
+            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in recorded})
+        ]
+    last = len(moments) - 1
+    chosen = np.unique(np.linspace(0, last, min(most, len(moments))).round()).astype(int)
+    curve = (run.metrics["updates"], run.metrics[study.headline])
+    return {
+        "seed": run.seed,
+        "curve": [plain(values) for values in curve],
+        "stages": [
+            {
+                "updates": moments[i][0],
+                "levels": [_level(level, pictures) for level in moments[i][1][:LEVELS]],
+                "map": _map(run, study.example, moments[i][0]),
+            }
+            for i in chosen
+        ],
+    }
+
+
+def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
+    image = picture(level.picture)
+    if image is None:
+        return level.text
+    return pictures.setdefault(_small(image), len(pictures))
+
+
+def _small(pixels: Any) -> str:
+    """A picture as PNG in base64, no larger than what is shown of it."""
+    image, file = Image.fromarray(pixels), io.BytesIO()
+    image.thumbnail((SIDE, SIDE))
+    image.save(file, format="PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def _map(run: Run, like: Run, updates: int) -> Json:
+    """The last shares of proposals that were on record after that many updates."""
+    shares = [
+        found
+        for cycle in run.cycles
+        if number(cycle["updates"]) <= updates
+        and number(cycle.get("seed", run.seed)) == run.seed
+        and (found := like.shares(cycle)) is not None
+    ]
+    return [plain(row) for row in share_map(shares[-1])] if shares else None

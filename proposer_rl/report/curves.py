@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from textwrap import fill
 
@@ -17,17 +17,19 @@ from proposer_rl.report.measures import (
     Measure,
     Series,
     band,
+    gains,
     level_means,
     measured,
     of_levels,
     own_numbers,
     trained,
     worst,
+    worst_tenths,
 )
-from proposer_rl.report.records import level_text, words
+from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import Drawing, Look, Panel, axes_of, finish, style
+from proposer_rl.report.style import PANEL, Drawing, Look, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
 
 MOST_PANELS = 12
@@ -49,11 +51,6 @@ def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
     every = measured(study)
     panels = [_panel(study, every[name]) for name in study.measurements[:MOST_PANELS]]
-    bars = Panel(
-        f"Updates until {words(study.headline)} reached "
-        f"{level_text(study.headline, study.threshold)}, by method, the soonest first.",
-        partial(_draw_bars, study=study),
-    )
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
@@ -62,24 +59,9 @@ def learning_curves(study: Study) -> Drawing:
         "runs of the method are that long. Bars: mean number of "
         "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
         "runs, which never got there.",
-        [*panels, bars],
+        [*panels, partial(_draw_bars, study=study)],
         3,
         study.legend,
-    )
-
-
-def worst_levels(study: Study) -> Drawing | None:
-    """The tenth of the levels where the Solver is worst; None where that was not measured."""
-    levels, every = study.example.task.levels, measured(study)
-    names = [f"{name}_worst10" for name in study.measurements[:MOST_PANELS]]
-    return _drawing(
-        study,
-        "worst_levels",
-        f"The worst tenth of the {levels} (CVaR)",
-        f"Mean over the 10 % of the {levels} where the Solver is worst at that "
-        "moment: a policy that gives up on hard ones shows here first.",
-        [every[name] for name in names if name in every],
-        2,
     )
 
 
@@ -106,47 +88,6 @@ def cost_curves(study: Study) -> Drawing:
     )
 
 
-def difficulty(study: Study) -> Drawing | None:
-    """What the Solver trained on, by the task's own statistics."""
-    return _drawing(
-        study,
-        "difficulty",
-        "What the Solver trained on",
-        "Statistics of the task over the batch of each evaluated update: means, or where a name "
-        "says so standard deviations (sd). Lines and bands as above.",
-        trained(study)[:MOST_PANELS],
-    )
-
-
-def diagnostics(study: Study) -> Drawing | None:
-    """How the curricula's own training goes: whatever numbers they recorded."""
-    return _drawing(
-        study,
-        "diagnostics",
-        "The curricula's own numbers",
-        "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, "
-        "mean over standard deviation between the replicas: where it is large, all replicas gain "
-        "alike whatever they are proposed, and there is little to learn from.",
-        own_numbers(study),
-        size=SMALL,
-    )
-
-
-def worst_curves(study: Study) -> Drawing | None:
-    """Mean over the worst levels against their share, of each distribution; None without any."""
-    levels = study.example.task.levels
-    return _drawing(
-        study,
-        "worst_share",
-        f"The worst share of the {levels} at the end (CVaR)",
-        f"Mean over the share of the {levels} where a Solver is worst, after {study.horizon} "
-        "updates: at 100 % the mean over all. Each seed has worst levels of its own. Lines: mean "
-        f"over seeds, with bands as above. {SELECTION[study.example.task.exact]}",
-        worst(study),
-        2,
-    )
-
-
 def level_by_level(study: Study) -> Drawing | None:
     """Every method against the baseline on each level; None where there are no two."""
     names = of_levels(study)
@@ -169,15 +110,9 @@ def level_by_level(study: Study) -> Drawing | None:
         f"{words(name)} on each of the {task.levels}, against {label}",
         f"Dots: {task.levels}, each the mean over seeds after {study.horizon} updates. Above the "
         f"line the method is better there, below it {label} is.{more}",
-        [
-            Panel(
-                f"{words(name)} of {group.label} against that of {label}, on each level.",
-                partial(_draw_scatter, study=study, group=group, name=name),
-                (SIDE, SIDE),
-            )
-            for _, group in best
-        ],
+        [partial(_draw_scatter, study=study, group=group, name=name) for _, group in best],
         4,
+        size=(SIDE, SIDE),
     )
 
 
@@ -198,41 +133,9 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
     return mean
 
 
-def _drawing(
-    study: Study,
-    name: str,
-    title: str,
-    caption: str,
-    measures: Iterable[Measure],
-    columns: int = 3,
-    size: tuple[float, float] | None = None,
-) -> Drawing | None:
-    """A panel for each measure, with the methods that have any in the legend; None without any."""
-    panels, shown = [], set()
-    for measure in measures:
-        (series,) = [of for axis, of in measure.axes.items() if axis == next(iter(measure.axes))]
-        having = {group.label for group in study.groups if series(group) is not None}
-        if having:
-            panels.append(_panel(study, measure, size=size))
-            shown |= having
-    if not panels:
-        return None
-    legend = {label: look for label, look in study.legend.items() if label in shown}
-    return Drawing(name, title, caption, panels, columns, legend)
-
-
-def _panel(
-    study: Study,
-    measure: Measure,
-    axis: str | None = None,
-    size: tuple[float, float] | None = None,
-) -> Panel:
+def _panel(study: Study, measure: Measure, axis: str = "") -> Callable[[FigureBase], None]:
     axis = axis or next(iter(measure.axes))
-    panel = Panel(
-        f"{measure.name} against {axis}, by method.",
-        partial(_draw_curves, study=study, measure=measure, axis=axis),
-    )
-    return panel if size is None else panel._replace(size=size)
+    return partial(_draw_curves, study=study, measure=measure, axis=axis)
 
 
 def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str) -> None:
@@ -267,16 +170,15 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     found.sort(key=lambda each: -each[0].estimate)
     groups = [group for _, group in found]
     for place, (interval, group) in enumerate(found):
-        waiting = group.waiting(study.headline, study.threshold)
+        waiting = [run.reached(study.headline, study.threshold) for run in group.runs]
         colour = group.look.colour
         axes.barh(place, interval.estimate, 0.62, color=colour, alpha=0.35)
         axes.plot(interval[1:], [place] * 2, color=colour, linewidth=2.5)
         offsets = place + np.linspace(-0.2, 0.2, len(waiting)) * (len(waiting) > 1)
-        for run, y in zip(waiting, offsets, strict=True):
-            marker = "o" if run.reached else ">"
-            face = colour if run.reached else "white"
-            axes.plot(min(run.updates, horizon), y, marker, ms=4.5, mfc=face, mec=colour, mew=0.9)
-        censored = sum(not run.reached for run in waiting)
+        for reached, y in zip(waiting, offsets, strict=True):
+            marker, face = (">", "white") if np.isnan(reached) else ("o", colour)
+            axes.plot(np.fmin(reached, horizon), y, marker, ms=4.5, mfc=face, mec=colour, mew=0.9)
+        censored = int(np.isnan(waiting).sum())
         axes.annotate(
             f"{censored} of {len(waiting)} censored" if censored else "all reached it",
             (horizon * 1.03, place),
@@ -289,3 +191,80 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
     axes.set_xlabel(waiting_outcome(study).name)
+
+
+def _of_measures(
+    name: str,
+    title: str,
+    caption: str,
+    measures: Callable[[Study], Iterable[Measure]],
+    columns: int = 3,
+    size: tuple[float, float] = PANEL,
+) -> Callable[[Study], Drawing | None]:
+    """A figure with a panel for each measure that a method has; None without any.
+
+    Title and caption may name what ``levels`` are called, the ``horizon``, and what ``selection``
+    does to the worst of them.
+    """
+
+    def draw(study: Study) -> Drawing | None:
+        panels, shown = [], set()
+        for measure in measures(study):
+            series = next(iter(measure.axes.values()))
+            having = {group.label for group in study.groups if series(group) is not None}
+            if having:
+                panels.append(_panel(study, measure))
+                shown |= having
+        if not panels:
+            return None
+        task = study.example.task
+        selection = SELECTION[task.exact]
+        terms = {"levels": task.levels, "horizon": study.horizon, "selection": selection}
+        legend = {label: look for label, look in study.legend.items() if label in shown}
+        head, text = title.format_map(terms), caption.format_map(terms)
+        return Drawing(name, head, text, panels, columns, legend, size)
+
+    return draw
+
+
+worst_levels = _of_measures(
+    "worst_levels",
+    "The worst tenth of the {levels} (CVaR)",
+    "Mean over the 10 % of the {levels} where the Solver is worst at that moment: a policy that "
+    "gives up on hard ones shows here first.",
+    worst_tenths,
+    2,
+)
+worst_curves = _of_measures(
+    "worst_share",
+    "The worst share of the {levels} at the end (CVaR)",
+    "Mean over the share of the {levels} where a Solver is worst, after {horizon} updates: at "
+    "100 % the mean over all. Each seed has worst levels of its own. Lines: mean over seeds, with "
+    "bands as above. {selection}",
+    worst,
+    2,
+)
+difficulty = _of_measures(
+    "difficulty",
+    "What the Solver trained on",
+    "Statistics of the task over the batch of each evaluated update: means, or where a name says "
+    "so standard deviations (sd). Lines and bands as above.",
+    trained,
+)
+gains_of_replicas = _of_measures(
+    "gains",
+    "Total gain of the replicas in each cycle (the paper's Figure 4)",
+    "The total gain on the target of the replicas over one meta-episode: maximum and mean over a "
+    "cycle's replicas. Lines and bands as above.",
+    gains,
+    2,
+)
+diagnostics = _of_measures(
+    "diagnostics",
+    "The curricula's own numbers",
+    "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, mean "
+    "over standard deviation between the replicas: where it is large, all replicas gain alike "
+    "whatever they are proposed, and there is little to learn from.",
+    own_numbers,
+    size=SMALL,
+)

@@ -87,7 +87,6 @@ class Measure:
         kind: what it is listed under.
         name: as an axis is named.
         axes: by the axis the method's series; None where it has none.
-        column: of the runs' ``metrics``; empty for what does not stand there.
         rate: whether it goes from 0 to 1.
         log: whether the axis is logarithmic.
     """
@@ -95,7 +94,6 @@ class Measure:
     kind: str
     name: str
     axes: Mapping[str, Callable[[Group], Series | None]]
-    column: str = ""
     rate: bool = False
     log: bool = False
 
@@ -113,11 +111,16 @@ def measured(study: Study) -> dict[str, Measure]:
                 UPDATES: partial(over_updates, name=name),
                 **{axis: partial(over_cost, name=name, cost=cost) for axis, cost in COSTS.items()},
             },
-            name,
             is_rate(name),
         )
         for name in [name for name in every if name in known][:MOST]
     }
+
+
+def worst_tenths(study: Study) -> list[Measure]:
+    """Of what was measured along training that on the worst tenth of the levels."""
+    every = measured(study)
+    return [every[n] for name in study.measurements if (n := f"{name}_worst10") in every]
 
 
 def trained(study: Study) -> list[Measure]:
@@ -278,14 +281,9 @@ def level_means(study: Study, group: Group, name: str) -> Column | None:
 
 def recorded_gain(group: Group) -> str | None:
     """Which gain of the replicas a group has on record; None without one."""
-    return next((name for name in GAINS if lists(group, name)), None)
-
-
-def lists(group: Group, name: str) -> list[tuple[float, Column]]:
-    """A list of numbers of every cycle that has it, with the Solver's updates."""
     cycles = [cycle for run in group.logs for cycle in run.cycles]
-    found = [(number(cycle["updates"]), numbers(cycle.get(name))) for cycle in cycles]
-    return [(updates, values) for updates, values in found if values is not None]
+    every = (name for name in GAINS if any(numbers(c.get(name)) is not None for c in cycles))
+    return next(every, None)
 
 
 def of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], float]) -> float:

@@ -100,7 +100,7 @@ def group_table(study: Study) -> Table:
     for group in study.groups:
         whole = study.group(group.label) or replace(group, runs=())
         runs, begun = whole.runs, len(group.runs)
-        reached = sum(run.reached for run in whole.waiting(headline, threshold))
+        reached = sum(run.reached(headline, threshold) >= 0 for run in runs)
         row: dict[str, Cell] = {
             "method": group.label,
             "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
@@ -160,7 +160,8 @@ def run_table(study: Study) -> Table:
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         for run in group.runs:
-            waiting = run.waiting(study.headline, study.threshold)
+            reached = run.reached(study.headline, study.threshold)
+            censored = math.isnan(reached)
             last = {name: float(values[-1]) for name, values in run.metrics.items()}
             rows.append(
                 {
@@ -170,11 +171,9 @@ def run_table(study: Study) -> Table:
                     "state": "finished" if run.finished else "unfinished",
                     "updates": run.updates,
                     f"updates to {level_text(study.headline, study.threshold)}": (
-                        int(waiting.updates) if waiting.reached else None
+                        None if censored else int(reached)
                     ),
-                    "threshold": (
-                        "reached" if waiting.reached else f"censored at {waiting.updates:.0f}"
-                    ),
+                    "threshold": f"censored at {run.updates}" if censored else "reached",
                     **{f"last {words(name)}": last[name] for name in study.measurements},
                     "frames": int(last["frames"]),
                     "the curriculum's frames": int(last["curriculum_frames"]),

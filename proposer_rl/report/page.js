@@ -57,11 +57,10 @@
       if (!series.whole.every(Boolean))
         lines.push({ ...look, x: series.x, y: series.mean, line: { ...line, width: 0.8 }, ...hover });
       lines.push({ ...look, x: series.x, y: series.mean.map(whole), line, ...hover, meta: "mean" });
-      measure.rows[m].forEach((row, r) => {
-        if (!row || !seeds.has(method.seeds[r])) return;
-        const x = measure.own ? series.x : data.places[m][r][along];
-        single.push({ ...look, x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
-          hovertemplate: `<b>${name}</b>, seed ${method.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
+      series.rows.forEach((row, r) => {
+        if (!seeds.has(series.seeds[r])) return;
+        single.push({ ...look, x: series.x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
+          hovertemplate: `<b>${name}</b>, seed ${series.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
       });
     });
     return [...bands, ...single, ...lines];
@@ -117,6 +116,7 @@
     const stage = found.stages[number], [x, y] = found.curve, [rows, columns] = data.stages.axes.length > 1
       ? data.stages.axes : [null, data.stages.axes[0]];
     const reached = y[x.indexOf(stage.updates)] ?? null;
+    parts.levels.parentElement.hidden = !found.stages.some((each) => each.levels.length);
     parts.moment.textContent = `update ${stage.updates}: ${short(reached)}`;
     parts.levels.replaceChildren(...stage.levels.map((level, i) => {
       const name = `number ${i + 1} of the batch at update ${stage.updates}`;
@@ -263,6 +263,6 @@
     for (const section of document.querySelectorAll("section.study")) await study(section);
     document.documentElement.dataset.ready = "1";
   };
-  // A browser that cannot do this shows the still figures.
+  // A browser that cannot do this shows tables, and where the figures are.
   start().catch(() => document.documentElement.classList.remove("live-page"));
 })();

@@ -1,10 +1,11 @@
-"""The page: one study is one section, and the page holds all that it shows."""
+"""The page and the same in short: one study is one section, and the page holds all it shows."""
 
 from __future__ import annotations
 
 import base64
 import gzip
 import hashlib
+import io
 import json
 import shlex
 from collections.abc import Sequence
@@ -15,16 +16,16 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
-from proposer_rl.report.answer import Meanings, meaning
+from proposer_rl.report.answer import Meanings, answer, meaning
+from proposer_rl.report.outcomes import against_baseline, group_table
 from proposer_rl.report.records import anywhere, level_text, words
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import DPI, Drawing, Drawn, Look, in_few_colours
+from proposer_rl.report.style import DPI, Drawing, in_few_colours
+from proposer_rl.report.tables import escape_markdown
 
 PIXELS = 78  # of an inch of a figure
-LARGEST = 8 * 2**20  # bytes of a page
 LONGEST_WORD = 2000  # of a command
-WIDE = 7.0  # inches from which a panel is scrolled, not shrunk, on a phone
 DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
 MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
 
@@ -58,37 +59,31 @@ def pack(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def figure(drawing: Drawing, drawn: Drawn, charted: bool = False) -> Section:
-    """A figure as the page shows it: each panel an image of its own, so that they can wrap.
-
-    Args:
-        drawing: the figure.
-        drawn: the same.
-        charted: whether the page has a chart of the same, which stands in for it in a browser.
-    """
-    legend = [{"label": label, **_look(look)} for label, look in drawing.legend.items()]
+def figure(drawing: Drawing, png: bytes) -> Section:
+    """A figure that is none of the charts, as the page shows it."""
+    with Image.open(io.BytesIO(png)) as image:
+        width = round(image.width * PIXELS / DPI)
+    content = base64.b64encode(in_few_colours(png)).decode()
     return {
         "title": drawing.title,
         "caption": drawing.caption,
-        "images": [
-            _image(panel.description, picture)
-            for panel, picture in zip(drawing.panels, drawn.panels, strict=True)
-        ],
-        "legend": legend,
-        "charted": charted,
+        "address": f"data:image/png;base64,{content}",
+        "width": width,
     }
 
 
 def methods(study: Study, meanings: Meanings) -> list[Section]:
     """The methods with their looks and what they do, in their order in the charts."""
     return [
-        {"label": group.label, "meaning": meaning(group, meanings), **_look(group.look)}
+        {
+            "label": group.label,
+            "meaning": meaning(group, meanings),
+            "colour": group.look.colour,
+            "dash": DASHES[group.look.dash],
+            "mark": MARKS[group.look.mark],
+        }
         for group in study.groups
     ]
-
-
-def _look(look: Look) -> Section:
-    return {"colour": look.colour, "dash": DASHES[look.dash], "mark": MARKS[look.mark]}
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
@@ -144,18 +139,6 @@ def configs(study: Study) -> list[tuple[str, str]]:
         (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
         for group in study.groups
     ]
-
-
-def _image(description: str, picture: Image.Image) -> Section:
-    content = base64.b64encode(in_few_colours(picture)).decode()
-    width, height = (side / DPI for side in picture.size)
-    return {
-        "address": f"data:image/png;base64,{content}",
-        "description": description,
-        "width": round(width * PIXELS),
-        "height": round(height * PIXELS),
-        "wide": width >= WIDE,
-    }
 
 
 def _digest(script: str) -> str:
@@ -223,3 +206,36 @@ def _hardware(run: Run) -> str:
 
 def _distinct(runs: Sequence[Run], text: Any) -> str:
     return "; ".join(sorted({text(run) for run in runs}))
+
+
+def section(study: Study, figures: str) -> str:
+    """What was compared, the answer, and the tables.
+
+    Args:
+        study: the runs.
+        figures: how the addresses of its figures begin.
+    """
+    about = facts(study) + origin(study)
+    if short := incomplete(study):
+        text = f"Not finished, or shorter than {study.horizon} updates"
+        about = [*about, (text, ", ".join(short))]
+    methods, pairs = group_table(study), against_baseline(study)
+    parts = [
+        f"## {escape_markdown(study.title)}",
+        escape_markdown(" ".join(answer(study))),
+        "\n".join(f"- {escape_markdown(f'{name}: {text}')}" for name, text in about),
+        f"![Learning curves and updates to the threshold]({figures}learning_curves.png)",
+    ]
+    for table in (methods, pairs):
+        if table.rows:
+            parts += [f"### {escape_markdown(table.title)}", escape_markdown(table.note)]
+            parts.append(table.to_markdown().strip())
+    made = "\n".join(commands(study))
+    return "\n\n".join([*parts, "### Commands", f"```bash\n{made}\n```"])
+
+
+def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:
+    """Parts of a page, and how it is made."""
+    left_out = "\n".join(f"- Left out: {escape_markdown(note)}" for note in notes)
+    made = f"The whole report is written by\n\n```bash\n{command}\n```"
+    return "\n\n".join(filter(None, [*parts, left_out, made])) + "\n"

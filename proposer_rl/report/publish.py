@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -10,10 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
-from proposer_rl.report.markdown import document, section
-from proposer_rl.report.page import report_command
+from proposer_rl.report.page import document, report_command, section
 from proposer_rl.report.reading import OutputError, find_runs, read_run
 from proposer_rl.report.records import anywhere
 from proposer_rl.report.runs import Run
@@ -69,7 +65,7 @@ def write_page(folder: Path) -> None:
     What the page says above :data:`MARK` is its authors' and stays.
     """
     from proposer_rl.report.curves import learning_curves
-    from proposer_rl.report.proposals import heat_maps
+    from proposer_rl.report.pictures import heat_maps
     from proposer_rl.report.style import in_few_colours, render
 
     studies, _ = read_studies([folder], None)
@@ -81,8 +77,7 @@ def write_page(folder: Path) -> None:
         (folder / "figures").mkdir(exist_ok=True)
         drawings = [each for each in (learning_curves(study), heat_maps(study)) if each]
         for drawing in drawings:
-            with Image.open(io.BytesIO(render(drawing).png)) as image:
-                picture = in_few_colours(image)
+            picture = in_few_colours(render(drawing).png)
             write_atomically(folder / f"{prefix}{drawing.name}.png", picture)
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]

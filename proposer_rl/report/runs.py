@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,18 +24,6 @@ COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
-
-
-class Waiting(NamedTuple):
-    """Updates until a threshold, of one run.
-
-    Attributes:
-        updates: when it was reached or, for a censored run, how long the run was.
-        reached: whether it was; False for a censored run.
-    """
-
-    updates: float
-    reached: bool
 
 
 @dataclass(frozen=True)
@@ -147,12 +135,10 @@ class Run:
             sheets={},
         )
 
-    def waiting(self, measurement: str, threshold: float) -> Waiting:
-        """Updates until a measurement first reached a threshold, or censored."""
-        reached = np.flatnonzero(self.metrics[measurement] >= threshold)
-        if len(reached):
-            return Waiting(float(self.metrics["updates"][reached[0]]), True)
-        return Waiting(float(self.updates), False)
+    def reached(self, measurement: str, threshold: float) -> float:
+        """Updates until a measurement first reached a threshold; NaN where it never did."""
+        reached = self.metrics["updates"][self.metrics[measurement] >= threshold]
+        return float(reached[0]) if len(reached) else math.nan
 
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
         """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.
@@ -160,10 +146,9 @@ class Run:
         Also where it was reached: short runs that did would else count, and those that did not
         would not.
         """
-        waiting = self.waiting(measurement, threshold)
         if self.updates < horizon:
             return math.nan
-        return min(waiting.updates, horizon) if waiting.reached else horizon
+        return float(np.fmin(self.reached(measurement, threshold), horizon))
 
     def at(self, measurement: str, updates: float) -> float:
         """A measurement after exactly that many updates; NaN where there was none."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from proposer_rl.report.reading import UnreadableRun, read_run
 from proposer_rl.report.records import Column
-from proposer_rl.report.runs import Run, Waiting
+from proposer_rl.report.runs import Run
 from proposer_rl.report.style import Look, looks
 
 USUAL_BASELINE = "domain_randomization"
@@ -60,10 +60,6 @@ class Group:
     def logs(self) -> list[Run]:
         """A run of each folder: seeds that were trained together have one curriculum's cycles."""
         return list({run.folder: run for run in self.runs if run.cycles}.values())
-
-    def waiting(self, measurement: str, threshold: float) -> list[Waiting]:
-        """Updates of each run until a measurement reached a threshold."""
-        return [run.waiting(measurement, threshold) for run in self.runs]
 
 
 @dataclass(frozen=True)

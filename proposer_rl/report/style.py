@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase, SubFigure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from PIL import Image
 
@@ -65,22 +65,6 @@ class Look(NamedTuple):
     mark: str = ""
 
 
-class Panel(NamedTuple):
-    """A part of a figure that can stand alone.
-
-    Attributes:
-        description: what is to be seen, for those who cannot see it.
-        draw: draws it.
-        size: width and height in inches.
-        animation: makes a GIF of the same, with a name for its file; None without one.
-    """
-
-    description: str
-    draw: Callable[[FigureBase], None]
-    size: tuple[float, float] = PANEL
-    animation: tuple[str, Callable[[], bytes]] | None = None
-
-
 class Drawing(NamedTuple):
     """A figure of the report.
 
@@ -88,17 +72,19 @@ class Drawing(NamedTuple):
         name: of its files.
         title: above it.
         caption: below it.
-        panels: its parts, at least one.
-        columns: how many of them stand side by side in the file of all.
+        panels: each draws a part, at least one.
+        columns: how many of them stand side by side.
         legend: looks of the methods by their labels; empty where none is needed.
+        size: width and height of a panel in inches.
     """
 
     name: str
     title: str
     caption: str
-    panels: Sequence[Panel]
+    panels: Sequence[Callable[[FigureBase], None]]
     columns: int = 2
     legend: Mapping[str, Look] = {}
+    size: tuple[float, float] = PANEL
 
 
 def looks(labels: Iterable[str]) -> dict[str, Look]:
@@ -164,31 +150,23 @@ def finish(
 
 
 class Drawn(NamedTuple):
-    """A figure with all of its panels and its legend.
-
-    Attributes:
-        svg: as a file.
-        png: the same.
-        panels: each cut out of it, without the legend.
-    """
+    """A figure with all of its panels and its legend, as two files."""
 
     svg: bytes
     png: bytes
-    panels: list[Image.Image]
 
 
 def render(drawing: Drawing) -> Drawn:
     """Draw a figure, once: to lay it out takes longer than all else."""
     columns = min(drawing.columns, len(drawing.panels))
     rows = -(-len(drawing.panels) // columns)
-    width, height = drawing.panels[0].size
+    width, height = drawing.size
     legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
     with rc_context(SETTINGS):
         figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
         grid = figure.subfigures(rows, columns, squeeze=False)
-        parts = list(zip(drawing.panels, grid.flat, strict=False))
-        for panel, part in parts:
-            panel.draw(part)
+        for draw, part in zip(drawing.panels, grid.flat, strict=False):
+            draw(part)
         if drawing.legend:
             handles = [Line2D([], [], label=n, **style(one)) for n, one in drawing.legend.items()]
             figure.legend(
@@ -196,29 +174,16 @@ def render(drawing: Drawing) -> Drawn:
             )
         png = _render(figure, "png")
         figure.set_layout_engine("none")  # it stands
-        with Image.open(io.BytesIO(png)) as image:
-            panels = [image.crop(_place(part, image)) for _, part in parts]
-        return Drawn(_render(figure, "svg"), png, panels)
+        return Drawn(_render(figure, "svg"), png)
 
 
-def _place(part: SubFigure, image: Image.Image) -> tuple[int, int, int, int]:
-    """Where a part of a figure is in a picture of it: left, upper, right and lower pixel."""
-    box, whole = part.bbox, part.figure.bbox
-    across, down = image.width / whole.width, image.height / whole.height
-    return (
-        round(box.x0 * across),
-        round(image.height - box.y1 * down),
-        round(box.x1 * across),
-        round(image.height - box.y0 * down),
-    )
-
-
-def in_few_colours(image: Image.Image) -> bytes:
-    """A picture as PNG in a third of its size: a page of vectors is five times as large."""
+def in_few_colours(png: bytes) -> bytes:
+    """A PNG in a third of its size: a page of vectors is five times as large."""
     file = io.BytesIO()
     # The other ways to choose colours make those of two methods one.
     far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
-    few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
+    with Image.open(io.BytesIO(png)) as image:
+        few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
     few.save(file, format="PNG", optimize=True)
     return file.getvalue()
 

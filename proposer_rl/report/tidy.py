@@ -8,7 +8,6 @@ Every number is written so that it reads back bit for bit.
 
 from __future__ import annotations
 
-import csv
 import gzip
 import io
 import json
@@ -16,8 +15,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import read_bounded, write_atomically
@@ -64,12 +61,11 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, Rows]
 
 def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """Rows as CSV; an empty cell where a row has nothing, or no number, under a column."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(name)) for name in columns] for row in rows)
-    return file.getvalue().encode()
+    import pandas as pd  # only now: what looks at runs without writing any comes at once
+
+    # As objects, so that whole numbers stay whole in columns with empty cells.
+    text: str = pd.DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
+    return text.encode()
 
 
 def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
@@ -115,12 +111,11 @@ def read_table(file: Path) -> Iterator[dict[str, str]]:
         raise ValueError(f"{file.name} is not packed by gzip: {error}") from None
     if len(text) > LARGEST_FILE or not unpacker.eof:
         raise ValueError(f"{file.name} is cut off, or larger than {LARGEST_FILE // 2**20} MiB")
-    csv.field_size_limit(LARGEST_FILE)
-    try:
-        for row in csv.DictReader(io.StringIO(text.decode(), newline=""), strict=True):
-            yield {key: cell for key, cell in row.items() if key and cell}
-    except csv.Error as error:
-        raise ValueError(f"{file.name} is no CSV: {error}") from None
+    import pandas as pd
+
+    frame = pd.read_csv(io.BytesIO(text), dtype=str, keep_default_na=False, index_col=False)
+    for row in frame.fillna("").to_dict("records"):
+        yield {str(key): cell for key, cell in row.items() if cell}
 
 
 def _cycle(cycle: Mapping[str, Any]) -> dict[str, str]:
@@ -130,7 +125,3 @@ def _cycle(cycle: Mapping[str, Any]) -> dict[str, str]:
 def _plain(value: Any) -> float | int:
     number = float(value)
     return int(number) if number.is_integer() and abs(number) < 2**53 else number
-
-
-def _cell(value: Any) -> Any:
-    return "" if value is None or (isinstance(value, float) and np.isnan(value)) else value

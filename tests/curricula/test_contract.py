@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from proposer_rl import curricula
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
@@ -196,6 +199,12 @@ def test_an_inbox_hands_out_in_order_and_waits_for_what_is_incomplete() -> None:
     taken = inbox.take(whole=True)
     assert [evidence["seen"][1].tolist() for evidence in taken] == [[0, 1, 2, 3], [0, 1, 2]]
     assert inbox.take() == []
+
+
+def test_no_module_hides_a_method() -> None:
+    """``proposer_rl.curricula.NAME`` is the method of that name."""
+    modules = {path.stem for path in Path(curricula.__path__[0]).glob("*.py")}
+    assert not modules & {path.stem for path in CONFIG_FOLDER.glob("method/*.yaml")}
 
 
 def test_a_curriculum_must_propose() -> None:

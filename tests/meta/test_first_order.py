@@ -78,7 +78,7 @@ def some_levels(copies: int, count: int) -> Level:
 
 def performance(agent: ActorCritic, levels: Level) -> TensorDict:
     logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
-    return EVALUATE.differentiable(levels, logits)
+    return EVALUATE(levels, logits)
 
 
 def exact_direction(ppo: PPO, levels: Level, measure: str = "log_success") -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
-from time import monotonic, sleep
+from time import sleep
 from typing import NamedTuple
 
 from proposer_rl.cli.play import open_session
@@ -52,8 +52,7 @@ def served(run: Path) -> Iterator[Page]:
         running = server(application(open_session(run), TOKEN))
         thread = Thread(target=running.run, kwargs={"sockets": [listening]})
         thread.start()
-        until = monotonic() + 60
-        while not running.started and monotonic() < until:
+        while not running.started and thread.is_alive():
             sleep(0.01)
         try:
             yield Page(port, f"http://127.0.0.1:{port}/{TOKEN}/", run)

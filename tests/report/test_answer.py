@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from proposer_rl.report.answer import answer, glossary, meaning
+from proposer_rl.report.answer import answer, meaning
 from proposer_rl.report.studies import Study, read_studies
-from tests.report.folders import write_rockets, write_run
+from tests.report.folders import write_run
 
 NOISE = np.random.default_rng(1).normal(0, 0.01, (8, 6))
 
@@ -64,17 +64,6 @@ def test_few_seeds_decide_nothing(tmp_path: Path) -> None:
 def test_a_method_alone_is_compared_with_nothing(tmp_path: Path) -> None:
     first, second = told(tmp_path, {"ours": 0.9})
     assert first.startswith("ours is the only method here") and "Nothing is compared" in second
-
-
-def test_the_words_are_those_of_the_task(tmp_path: Path) -> None:
-    (mazes,), _ = read_studies([write_run(tmp_path / "a")], None)
-    (rockets,), _ = read_studies([write_rockets(tmp_path / "b", "plr", 0)], None)
-    for study, there, missing in ((mazes, "mazes", "rockets"), (rockets, "rockets", "mazes")):
-        words = dict(glossary(study))
-        assert {"Solver", "Proposer", "Method", "Seed"} < set(words)
-        assert there in words["Solver"] and missing not in "".join(words.values())
-    assert "from 0 to 1" in dict(glossary(mazes))["ID success"]
-    assert "from 0 to 1" not in dict(glossary(rockets))["target return"]
 
 
 def test_what_a_method_does_is_what_its_run_recorded(tmp_path: Path) -> None:

@@ -17,8 +17,7 @@ from PIL import Image
 
 from proposer_rl.report import build, page
 from proposer_rl.report.build import write_report
-from proposer_rl.report.curves import cost_curves, learning_curves
-from proposer_rl.report.levels import side_by_side
+from proposer_rl.report.curves import learning_curves
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import render
 from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run
@@ -88,7 +87,8 @@ def test_lines_and_bands_are_mean_and_interval_of_the_files(
         ]
         found = np.transpose([series["mean"], series["low"], series["high"]])
         assert found == pytest.approx(np.array(expected), abs=2e-5)
-        assert measure["rows"][place] == [[r["id_success"] for r in rows] for rows in folders]
+        assert series["rows"] == [[r["id_success"] for r in rows] for rows in folders]
+        assert series["seeds"] == list(range(SEEDS))
 
 
 def test_against_a_cost_runs_stand_between_their_measurements(
@@ -101,13 +101,13 @@ def test_against_a_cost_runs_stand_between_their_measurements(
     }
     folders = [rows_of(runs / f"mine{seed}") for seed in range(SEEDS)]
     for axis, cost in costs.items():
-        series, places = measure["axes"][axis][0], data["places"][0]
-        assert [run[axis] for run in places] == [[cost(r) for r in rows] for rows in folders]
+        series = measure["axes"][axis][0]
         for i in (1, 20, 50, 98):
             values = [
                 between(series["x"][i], [cost(r) for r in rows], [r["id_success"] for r in rows])
                 for rows in folders
             ]
+            assert [row[i] for row in series["rows"]] == pytest.approx(values, abs=1e-4)
             found = [series["mean"][i], series["low"][i], series["high"][i]]
             assert found == pytest.approx(mean_and_interval(values), abs=1e-4)
 
@@ -136,6 +136,8 @@ def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         "whole": [True, True, False],
         "low": [None] * 3,
         "high": [None] * 3,
+        "seeds": [0, 1],
+        "rows": [[0, 0.5, 0.9], [0, 0.1, None]],
     }
     assert data["outcomes"][0]["methods"][0]["values"][1] is None
 
@@ -163,12 +165,18 @@ def test_stages_move_proposals_levels_and_success_together(
     assert data["stages"]["first"] == 0
     axes = {axis["name"]: axis["values"] for axis in data["stages"]["axes"]}
     assert axes == {"obstacle fraction": [0, 0.2], "path length": [2, 3, 4]}
+    # Without levels, as in a published study, the map moves alone.
+    (tmp_path / "p" / "curriculum.jsonl").unlink()
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    alone = data["stages"]["methods"][0]["stages"]
+    assert [stage["map"] and stage["map"][0][0] for stage in alone] == [1, 0]
+    assert [(stage["updates"], stage["levels"]) for stage in alone] == [(0, []), (20, [])]
 
 
 def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:
     (study,), _ = read_studies(sorted(runs.iterdir()), None)
     drawing = learning_curves(study)
-    image = page.figure(drawing, render(drawing))["images"][0]
+    image = page.figure(drawing, render(drawing).png)
     content = base64.b64decode(image["address"].removeprefix("data:image/png;base64,"))
     with Image.open(io.BytesIO(content)) as file:
         found = np.asarray(file.convert("RGB")).astype(int)
@@ -204,7 +212,8 @@ def test_a_page_of_many_long_runs_stays_small(
         write_jsonl(tmp_path / f"m{number}-0" / "curriculum.jsonl", lines)
     written = write_report([tmp_path], tmp_path / "out", progress=False)
     (data,) = page_data(written)
-    assert len(data["methods"]) == 18 and len(data["places"][0]) == 10
+    assert len(data["methods"]) == 18
+    assert len(data["measures"][0]["axes"][UPDATES][0]["rows"]) == 10
     assert written.stat().st_size < SIZE - FIGURES
 
 
@@ -231,14 +240,3 @@ def test_pictures_that_are_too_large_are_fewer_or_none(
         (data,) = page_data(write_report([folder], tmp_path / f"o{count}", progress=False))
         shown = data["stages"] and data["stages"]["methods"][0]["stages"]
         assert (shown and len(shown)) == expected
-
-
-def test_a_page_over_its_limit_leaves_out_figures_that_are_charts(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [cost_curves, side_by_side])
-    whole = write_report([runs], tmp_path / "whole", progress=False).read_text(encoding="utf-8")
-    monkeypatch.setattr(page, "LARGEST", len(whole) - 1)
-    left = write_report([runs], tmp_path / "left", progress=False).read_text(encoding="utf-8")
-    assert (whole.count("<figure"), left.count("<figure")) == (2, 1)
-    assert (tmp_path / "left" / "figures" / "cost.svg").is_file()

@@ -170,7 +170,7 @@ def test_two_methods_are_compared_level_by_level(seen: Seen) -> None:
 
 
 def test_the_gains_of_the_copies_are_told(seen: Seen) -> None:
-    seen.page.select_option(".measure", label="total gain in log success, maximum of the copies")
+    seen.page.select_option(".measure", label="total gain in log success, maximum of the replicas")
     means = {trace["name"]: trace["y"] for trace in seen.traces(".curves", "mean")}
     assert means == {"perf_gain": [0.2, 0.2]}
     seen.page.select_option(".measure", label="ID success rate")
@@ -227,13 +227,12 @@ def test_it_needs_no_network_and_nothing_goes_wrong(seen: Seen, written: Path) -
     assert not seen.said
 
 
-def test_what_is_not_drawn_is_a_still_figure(seen: Seen, written: Path) -> None:
-    """In a browser without scripts, and on paper."""
-    figure, chart = ".drawn img", ".curves"
-    assert seen.page.locator(figure).first.is_hidden() and seen.page.locator(chart).is_visible()
+def test_without_scripts_a_reader_is_told_where_the_figures_are(seen: Seen, written: Path) -> None:
+    note = "The charts need a browser"
+    assert seen.page.get_by_text(note).is_hidden() and seen.page.locator(".curves").is_visible()
     seen.page.emulate_media(media="print")
-    assert seen.page.locator(figure).first.is_visible() and seen.page.locator(chart).is_hidden()
+    assert seen.page.locator(".curves").is_visible() and seen.page.locator(".measure").is_hidden()
     seen.page.emulate_media(media="screen")
     still = seen.page.context.browser.new_context(java_script_enabled=False).new_page()
     still.goto(written.as_uri())
-    assert still.locator(figure).first.is_visible() and still.locator(chart).is_hidden()
+    assert still.get_by_text(note).is_visible() and still.locator(".curves").is_hidden()

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from proposer_rl.report import reading
-from proposer_rl.report.proposals import axis_means
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
-from proposer_rl.report.runs import Waiting, share_map
+from proposer_rl.report.runs import share_map
+from research.claims import axis_means
 from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 
@@ -28,8 +28,7 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert run.finished and run.cycles == cycles
     assert run.metrics["id_success"].tolist() == [0.0, 0.5, 0.9]
     assert run.total_frames.tolist() == [0, 7000, 14000]
-    assert run.waiting("id_success", 0.5) == Waiting(10, True)
-    assert run.waiting("id_success", 0.95) == Waiting(20, False)
+    assert run.reached("id_success", 0.5) == 10 and np.isnan(run.reached("id_success", 0.95))
     waited = [run.waited("id_success", level, 20) for level in (0.5, 0.95)]
     assert waited == [10, 20] and run.waited("id_success", 0.9, 15) == 15
     assert np.isnan(run.waited("id_success", 0.5, 30))

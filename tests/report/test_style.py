@@ -12,13 +12,10 @@ from hypothesis import strategies as st
 from proposer_rl.cli.config import methods
 from proposer_rl.report.style import (
     DASHES,
-    DPI,
     FURTHER,
     METHODS,
-    PANEL,
     Drawing,
     Look,
-    Panel,
     axes_of,
     looks,
     render,
@@ -76,28 +73,7 @@ def test_a_figure_is_the_same_file_every_time() -> None:
     def draw(figure) -> None:
         axes_of(figure).plot([0, 1], [1, 0], **style(Look("#332288", "--", "s")))
 
-    drawing = Drawing("d", "D", "", [Panel("P", draw)], legend={"plr": Look("#332288", "--", "s")})
+    drawing = Drawing("d", "D", "", [draw], legend={"plr": Look("#332288", "--", "s")})
     one, two = render(drawing), render(drawing)
     assert (one.svg, one.png) == (two.svg, two.png)
     assert b"<dc:date>" not in one.svg
-
-
-def test_panels_are_cut_out_of_the_figure_without_its_legend() -> None:
-    """Each is of one colour, as is the legend: a panel shows its own and no other."""
-    colours = ["#ff0000", "#00ff00", "#0000ff"]
-
-    def filled(colour: str) -> Panel:
-        return Panel("P", lambda figure: axes_of(figure).set_facecolor(colour))
-
-    drawing = Drawing("d", "D", "", list(map(filled, colours)), legend={"plr": Look("#ffff00")})
-    panels = render(drawing).panels
-    assert len(panels) == 3
-    for panel in panels:
-        width, height = (side / DPI for side in panel.size)
-        assert width == pytest.approx(PANEL[0], abs=0.1)
-        assert height == pytest.approx(PANEL[1], abs=0.3)
-    names = ["#ffff00", *colours]
-    for colour, panel in zip(colours, panels, strict=True):
-        pixels = np.asarray(panel.convert("RGB")).reshape(-1, 3)
-        shown = [n for n in names if (pixels == list(bytes.fromhex(n[1:]))).all(-1).mean() > 0.001]
-        assert shown == [colour]

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.watch import main
-from proposer_rl.report.progress import find_progress, read_progress
-from proposer_rl.report.sweeps import Left, left
+from proposer_rl.report.progress import Left, find_progress, left, read_progress
 from proposer_rl.report.terminal import BLOCKS, sparkline
 from tests.report.folders import TASK, cycle, write_run
 
@@ -127,21 +126,20 @@ def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> Non
         finish(write_planned(tmp_path, method, seed), seconds)
         assert "sweep: " in watch(capsys, str(tmp_path))  # of the first run, too
     assert sorted(planned(tmp_path)) == sorted(
-        (f"seed={seed}", f"+method={method}")
+        (f"seed={seed}", f"+method={method}", "+scale=quick", "+sweep=x", "compute.threads=1")
         for seed in (4, 5)
         for method in ("target", "plr", "sfl")
     )
     # target: 100; sfl twice: the mean of all, 4100 / 3
-    assert left(tmp_path, planned(tmp_path)) == Left(3, 6, pytest.approx(100 + 8200 / 3), 1, 2)
-    for seed, rest in ((4, 500.0), (5, 700.0)):
+    assert left(tmp_path, planned(tmp_path)) == Left(3, 6, pytest.approx(100 + 8200 / 3), 1)
+    for seed in (4, 5):
         folder = write_planned(tmp_path, "sfl", seed, finished=False)
-        said = {"doing": "", "done": 0, "of": 0, "seconds_left": rest, "at_least": False}
-        (folder / "progress.json").write_text(json.dumps(said))
+        (folder / "progress.json").touch()
     text = " ".join(watch(capsys, str(tmp_path)).split())
-    assert "sweep: 3 of 6 runs left, about 11 min, 2 at a time" in text  # (100 + 500 + 700) / 2
+    assert "sweep: 3 of 6 runs left, about 24 min, 2 at a time" in text  # (100 + 8200 / 3) / 2
     (folder / "error.json").write_text("{}")  # it has failed since, and is to be made anew
     text = " ".join(watch(capsys, str(tmp_path)).split())
-    assert "sweep: 3 of 6 runs left, about 33 min" in text  # 100 + 500 + 4100 / 3
+    assert "sweep: 3 of 6 runs left, about 47 min, 1 at a time" in text
     for name in ("progress.json", "error.json"):
         (folder / name).unlink()
     write_planned(tmp_path, "target", 5, finished=False)

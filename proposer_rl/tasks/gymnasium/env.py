@@ -21,8 +21,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.tasks.gymnasium.networks import checked_spaces
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
-from proposer_rl.tasks.gymnasium.success import Rule, Steps
+from proposer_rl.tasks.gymnasium.settings import Flags, ParameterSettings, Steps
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
@@ -41,7 +40,7 @@ class GymnasiumEnv(EnvBase):
         levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B].
         make: makes one environment.
         parameters: what differs between levels, by name.
-        success: when an episode is one.
+        success: whether each step ended an episode that is one.
         reward_scale: rewards are multiplied with it.
         vectorization: one after another, or each in a process of its own.
         once: play one episode of each level, and then stand still, without reward.
@@ -53,7 +52,7 @@ class GymnasiumEnv(EnvBase):
         make: MakeEnvironment,
         parameters: Mapping[str, ParameterSettings],
         *,
-        success: Rule,
+        success: Callable[[Steps], Flags],
         reward_scale: float = 1.0,
         vectorization: Vectorization = "sync",
         once: bool = False,

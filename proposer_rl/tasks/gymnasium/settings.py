@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+import torch
 from annotated_types import Ge, Gt, Len
+from numpy.typing import NDArray
 
 from proposer_rl.settings import settings
-from proposer_rl.tasks.parameters import Number
+from proposer_rl.tasks.parameters import Bins, Number, intervals, points
 
+Flags = NDArray[np.bool_]
 Widths = list[Annotated[int, Ge(1)]]
 
 
@@ -39,10 +44,52 @@ class ParameterSettings:
     bins: Annotated[int, Ge(1)] | None = None
     target: Number | Annotated[list[Number], Len(1)]
 
+    def space_bins(self) -> Bins:
+        """The bins of the parameter.
+
+        Raises:
+            ValueError: if it has neither values nor a range, both, or they do not rise.
+        """
+        low, high, bins = self.low, self.high, self.bins
+        if self.values is not None:
+            if (low, high, bins) != (None, None, None):
+                raise ValueError("either values, or low, high and bins")
+            return points(self.values)
+        if low is None or high is None or bins is None:
+            raise ValueError("needs values, or low, high and bins")
+        return intervals(low, high, bins)
+
+    def target_bins(self) -> Bins:
+        """What of the parameter the Solver is to master.
+
+        Raises:
+            ValueError: if it is no part of a line.
+        """
+        target = self.target if isinstance(self.target, list) else [self.target]
+        kind = self.space_bins().low.dtype
+        if self.values is not None or len(target) == 1:
+            single = points(target, "target")
+            if kind == torch.int64 and single.low.dtype != kind:
+                raise ValueError(f"target={target} must be whole, as values={self.values} are")
+            return Bins(*(end.to(kind) for end in single))
+        if len(target) > 2 or not target[0] < target[1]:
+            raise ValueError(f"target={target} must be a number or [from, to]")
+        low, high = torch.tensor(target, dtype=kind)
+        return Bins(low.view(1), high.view(1))
+
+
+class Steps(NamedTuple):
+    """A step of n environments: how it ended, and the returns of the episodes so far, each [n]."""
+
+    terminated: Flags
+    truncated: Flags
+    returns: NDArray[np.float64]
+    info: Mapping[str, Any]
+
 
 @settings
 class SuccessSettings:
-    """When an episode counts as a success, which is known at its end.
+    """When an episode counts as a success, which is known at its end; it is called to know it.
 
     Attributes:
         kind: ``return``: it has at least the return ``least``; ``survived``: the time limit ended
@@ -55,6 +102,32 @@ class SuccessSettings:
     kind: Literal["return", "survived", "terminated", "info"]
     least: float | None = None
     key: str | None = None
+
+    def check(self) -> None:
+        """Refuse a kind that lacks what it needs, or has more.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        needed = {"return": "least", "info": "key"}.get(self.kind)
+        for name in ("least", "key"):
+            given = getattr(self, name) is not None
+            if given != (name == needed):
+                verb = "has no effect" if given else "missing"
+                raise ValueError(f"success.{name}: {verb} with success.kind={self.kind}")
+
+    def __call__(self, step: Steps) -> Flags:
+        """Whether a step ended an episode that is a success, [n]; an info's entry may be absent."""
+        over = step.terminated | step.truncated
+        if self.kind == "return":
+            return over & (step.returns >= (self.least or 0.0))
+        if self.kind == "survived":
+            return step.truncated & ~step.terminated
+        if self.kind == "terminated":
+            return step.terminated
+        return over & np.asarray(step.info.get(self.key or "", np.zeros_like(over))).astype(
+            np.bool_
+        )
 
 
 @settings

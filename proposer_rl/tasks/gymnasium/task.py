@@ -23,7 +23,6 @@ from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization, plays
-from proposer_rl.tasks.gymnasium.levels import space_bins, target_bins
 from proposer_rl.tasks.gymnasium.networks import Acts, SolverNetwork, checked_spaces
 from proposer_rl.tasks.gymnasium.pictures import KEY, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
@@ -39,7 +38,6 @@ from proposer_rl.tasks.gymnasium.settings import (
     ParameterSettings,
     SuccessSettings,
 )
-from proposer_rl.tasks.gymnasium.success import success_rule
 from proposer_rl.tasks.parameters import SEED, ParameterSpace
 
 # Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
@@ -96,7 +94,8 @@ class GymnasiumTask(Task):
     ) -> None:
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
-        self._success, self._rule = success, success_rule(success)
+        success.check()
+        self._success = success
         self.reward_scale = reward_scale
         self._network = network
         self._evaluation = evaluation
@@ -202,7 +201,7 @@ class GymnasiumTask(Task):
             levels,
             self._make,
             self._parameters,
-            success=self._rule,
+            success=self._success,
             reward_scale=self.reward_scale,
             **how,
         )
@@ -257,7 +256,7 @@ def _spaces(
                 raise ValueError("is a column of training.csv; choose another name")
             if not re.fullmatch(r"\w[\w .-]*", name):
                 raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
-            bins[name], target[name] = space_bins(settings), target_bins(settings)
+            bins[name], target[name] = settings.space_bins(), settings.target_bins()
         except ValueError as error:
             raise ValueError(f"parameters.{name}: {error}") from error
     return ParameterSpace(bins), ParameterSpace(target)

@@ -30,6 +30,6 @@ __all__ = [
 # By name, so that Gymnasium's environments are imported when one is made.
 register(
     "proposer_rl/Maze-v0",
-    entry_point="proposer_rl.tasks.mazes.as_gymnasium:make_maze",
-    vector_entry_point="proposer_rl.tasks.mazes.as_gymnasium:make_mazes",
+    entry_point="proposer_rl.tasks.mazes.as_gymnasium:SingleMaze",
+    vector_entry_point="proposer_rl.tasks.mazes.as_gymnasium:VectorMaze",
 )

@@ -30,14 +30,6 @@ class LevelDistribution:
 
     Raises:
         ValueError: If a specification cannot be met, or there is none.
-
-    Example:
-        >>> easy_and_hard = LevelDistribution([(0.0, 2), (0.4, 12)])
-        >>> fractions, lengths = easy_and_hard.decode(torch.tensor([0, 1]))
-        >>> lengths
-        tensor([ 2, 12])
-        >>> easy_and_hard.sample((4, 8)).batch_size
-        torch.Size([4, 8])
     """
 
     def __init__(
@@ -80,14 +72,9 @@ class LevelDistribution:
         )
 
     def generate(self, index: Tensor, generator: Generators = None) -> Level:
-        """Draws one level for each number.
+        """Draws a level of each numbered specification, int64 ``[*B]``, in their order: ``[*B]``.
 
-        Args:
-            index: int64 ``[*B]``, in 0 ... size - 1.
-            generator: As in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
-
-        Returns:
-            Levels ``[*B]``, in the order of the numbers.
+        The generators are as in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
 
         Raises:
             ValueError: If a number is out of range.
@@ -99,12 +86,7 @@ class LevelDistribution:
     def sample(
         self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Level:
-        """Draws levels ``[*B]`` of uniformly random specifications.
-
-        Args:
-            batch_shape: ``[*B]``; a number for ``[B]``.
-            generator: Source of randomness; None for the default one.
-        """
+        """Draws levels ``[*B]``, a number standing for ``[B]``, of random specifications."""
         shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
         place = "cpu" if generator is None else generator.device
         index = torch.randint(self.size, shape, generator=generator, device=place)

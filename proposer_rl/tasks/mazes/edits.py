@@ -82,14 +82,14 @@ def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
     rank = (place * choices).int().minimum(choices - 1)
     cell = (marked <= rank.unsqueeze(1)).sum(1)  # [C]
 
-    def chosen(which: int) -> Tensor:
+    def applies(which: int) -> Tensor:
         return (operator == which) & (choices > 0)
 
-    flipped = torch.zeros_like(walls).scatter(1, cell.unsqueeze(1), chosen(FLIP_WALL).unsqueeze(1))
+    flipped = torch.zeros_like(walls).scatter(1, cell.unsqueeze(1), applies(FLIP_WALL).unsqueeze(1))
     position = cell_position(cell, width)  # [C, 2]
     edited: L = levels.replace(  # of the levels' own class: a direction stays
         walls=(walls ^ flipped).view_as(levels.walls),
-        start=position.where(chosen(MOVE_START).unsqueeze(1), levels.start),
-        goal=position.where(chosen(MOVE_GOAL).unsqueeze(1), levels.goal),
+        start=position.where(applies(MOVE_START).unsqueeze(1), levels.start),
+        goal=position.where(applies(MOVE_GOAL).unsqueeze(1), levels.goal),
     )
     return edited

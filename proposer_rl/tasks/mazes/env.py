@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded
 
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.dynamics import MOVES, successors
@@ -30,17 +30,9 @@ class MazeEnv(LevelEnv):
     - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
       elsewhere. A step that reaches the goal at the limit is terminated and not truncated, since
       nothing was cut off. ``done`` is either.
-    - Reset: the agent goes back to the start of the *same* level, also when TorchRL resets finished
-      mazes by itself. Levels change only by
-      :meth:`~proposer_rl.tasks.mazes.level_env.LevelEnv.set_levels`.
-
-    The dynamics are deterministic and depend on the tensordict that is stepped and on the levels
-    alone; nothing is drawn at random.
 
     Args:
-        levels: Levels of any batch shape ``[*B]``, which with their device become the
-            environment's. They must be valid; see
-            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-designed ones.
+        levels: As of :class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`.
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
         observe_agent: Whether the planes show the agent.
@@ -70,7 +62,8 @@ class MazeEnv(LevelEnv):
         self.observe_agent = observe_agent
         self._constant = () if observe_agent else ("planes",)
         super().__init__(levels, max_steps)
-        self._make_specs()
+        shape = (*self.batch_size, 3 + observe_agent, *self._grid)
+        self._specify(actions=len(MOVES), planes=Bounded(0.0, 1.0, shape))
 
     def render(self, mode: str = "rgb_array", cell: int = 16) -> Any:
         """Draws the mazes as they are now.
@@ -99,19 +92,6 @@ class MazeEnv(LevelEnv):
             for level, agent in zip(levels, agents, strict=True)
         ]
         return torch.stack(pictures).reshape(*self.batch_size, *pictures[0].shape)
-
-    def _make_specs(self) -> None:
-        batch, (height, width) = self.batch_size, self._grid
-        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
-        self.observation_spec = Composite(
-            planes=Bounded(0.0, 1.0, (*batch, 3 + self.observe_agent, height, width)),
-            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
-            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
-            shape=batch,
-        ).to(self.device)
-        self.action_spec = Categorical(len(MOVES), shape=batch, device=self.device)
-        self.reward_spec = Unbounded((*batch, 1), device=self.device)
-        self.done_spec = self._ends()
 
     def _tabulate(self, levels: Level) -> None:
         self._planes = planes(levels)

@@ -1,13 +1,13 @@
 """How well a per-cell policy does on fixed mazes, exactly or by playing.
 
 Both evaluators have one signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W], generator)``
-gives a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The generator is the
-source of randomness, None for the evaluator's own; the exact evaluator draws nothing.
+gives a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The exact evaluator
+draws nothing from the generator.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
@@ -54,11 +54,13 @@ class ExactEvaluator:
     step_penalty: float = 0.01
     greedy: bool = False
 
-    @torch.no_grad()
     def __call__(
         self, levels: Level, cell_logits: Tensor, generator: torch.Generator | None = None
     ) -> TensorDict:
         """Evaluates one policy in each maze.
+
+        Logits that require gradients get them where these are enabled; that takes the memory of
+        ``max_steps`` distributions over the cells instead of two. A greedy policy has none.
 
         Args:
             levels: Levels ``[*B]``.
@@ -66,32 +68,9 @@ class ExactEvaluator:
             generator: Unused.
 
         Returns:
-            ``"return"`` and ``"success"``, float32 ``[*B]`` each, without gradients.
-        """
-        return self._push(levels, cell_logits)
-
-    def differentiable(self, levels: Level, cell_logits: Tensor) -> TensorDict:
-        """Evaluates one policy in each maze, with gradients to its logits where they are enabled.
-
-        They take the memory of ``max_steps`` distributions over the cells instead of two.
-
-        Args:
-            levels: Levels ``[*B]``.
-            cell_logits: float ``[*B, 4, H, W]``.
-
-        Returns:
             ``"return"`` and ``"success"``, ``[*B]`` each: float64 of float64 logits, else float32.
-
-        Raises:
-            ValueError: If the policy is greedy, which has no gradient.
         """
-        if self.greedy:
-            raise ValueError("a greedy policy has no gradient: differentiate the sampled one's")
         keep = cell_logits.requires_grad and torch.is_grad_enabled()
-        return self._push(levels, cell_logits, keep=keep)
-
-    def _push(self, levels: Level, cell_logits: Tensor, keep: bool = False) -> TensorDict:
-        """Pushes the distribution over cells; ``keep`` writes each step into memory of its own."""
         height, width = levels.walls.shape[-2:]
         goal = cell_index(levels.goal, width).flatten()  # [N]
         stay, leave = _transitions(levels, _policy(cell_logits, self.greedy), goal)
@@ -103,12 +82,12 @@ class ExactEvaluator:
         for _ in range(self.max_steps):
             steps = steps + (1 - success)
             origin = here[1:-1, 1:-1]
-            if keep:
+            if keep:  # each step in memory of its own
                 after = pad(origin * stay, (0, 0, 1, 1, 1, 1))
             else:
                 torch.mul(origin, stay, out=after[1:-1, 1:-1])
-            for move, chosen in zip(MOVES, leave, strict=True):
-                _shifted(after, move).addcmul_(origin, chosen)
+            for move, chance in zip(MOVES, leave, strict=True):
+                _shifted(after, move).addcmul_(origin, chance)
             here, after = after, here
             success = here.flatten(0, 1).gather(0, goal).squeeze(0)
         return _result(levels, success - self.step_penalty * steps, success)
@@ -125,21 +104,12 @@ class RolloutEvaluator:
     Attributes:
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
-        episodes: Episodes played in each maze.
-        greedy: Whether the policy takes the most probable action (of equal ones the first) or
-            samples.
-        generator: Source of randomness, on the CPU; None for the default one.
+        episodes: Episodes played in each maze, at least one; their actions are drawn.
     """
 
     max_steps: int = 25
     step_penalty: float = 0.01
     episodes: int = 1
-    greedy: bool = False
-    generator: torch.Generator | None = field(default=None, compare=False)
-
-    def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
 
     @torch.no_grad()
     def __call__(
@@ -150,17 +120,16 @@ class RolloutEvaluator:
         Args:
             levels: Levels ``[*B]``.
             cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
-            generator: Source of randomness, on the CPU; None for the evaluator's own.
+            generator: Source of randomness, on the CPU; None for torch's default one.
 
         Returns:
             ``"return"`` and ``"success"``, float32 ``[*B]`` each.
         """
-        generator = self.generator if generator is None else generator
         batch = (self.episodes, *levels.batch_size)
         env = MazeEnv(
             levels.expand(batch), max_steps=self.max_steps, step_penalty=self.step_penalty
         )
-        policy = _policy(cell_logits, self.greedy).flatten(-2).movedim(-2, -1)  # [*B, H*W, 4]
+        policy = _policy(cell_logits).flatten(-2).movedim(-2, -1)  # [*B, H*W, 4]
         cumulative = policy.cumsum(-1).expand(self.episodes, *policy.shape)
         shared = [1] * (len(batch) - 2)
         noise = (self.max_steps, self.episodes, *shared, *levels.batch_size[-1:])
@@ -255,7 +224,7 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
     return (values.sort(-1).values * weight).sum(-1) / count
 
 
-def _policy(cell_logits: Tensor, greedy: bool) -> Tensor:
+def _policy(cell_logits: Tensor, greedy: bool = False) -> Tensor:
     """Action probabilities ``[*B, 4, H, W]``; of a policy that samples as precise as its logits."""
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)

@@ -44,6 +44,8 @@ class GridTask(Task):
     Attributes:
         level: class of the levels.
         suffixes: of files of levels.
+        read_file: reads such a file: levels [] by their names.
+        fewest_steps: of a shortest way to the goal of levels [*B]: int64 [*B], -1 for none.
         probe_planes: of a probe.
         steps_name: what the steps of a shortest way are called in results.
         counting: what of an episode's steps a reader must know.
@@ -57,6 +59,8 @@ class GridTask(Task):
     key = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
     level: ClassVar[type[Level]] = Level
     suffixes: ClassVar[Sequence[str]]
+    read_file: Callable[[str], Mapping[str, Any]]
+    fewest_steps: Callable[[Any], Tensor]
     probe_planes: ClassVar[int]
     steps_name: ClassVar[str]
     counting: ClassVar[str] = ""
@@ -162,16 +166,8 @@ class GridTask(Task):
         """The Proposer's bins."""
 
     @abstractmethod
-    def fewest_steps(self, levels: Level) -> Tensor:
-        """Steps of a shortest way to the goal of levels [*B]: int64 [*B], -1 for none."""
-
-    @abstractmethod
     def describe(self, name: str) -> str:
         """A distribution's settings in words."""
-
-    @abstractmethod
-    def read_file(self, path: str) -> dict[str, Any]:
-        """The levels of a file, by their names."""
 
     @abstractmethod
     def results_on(
@@ -254,7 +250,7 @@ class GridTask(Task):
         if Path(name).suffix in self.suffixes:
             if not Path(name).exists():
                 raise ValueError(f"--levels {name}: there is no such file")
-            return self.read_file(name), SLACK
+            return dict(self.read_file(name)), SLACK
         asked = _ON_A_GRID.fullmatch(name)
         for known, kind in self._kinds.items():
             if asked is None or known.casefold() != asked[1].casefold():

@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.tasks.mazes.levels import Level
@@ -116,11 +116,21 @@ class LevelEnv(EnvBase):
         self._play(self._levels.to(self.device))
         return self
 
-    def _ends(self) -> Composite:
-        """The specification of how episodes end."""
-        batch = self.batch_size
+    def _specify(self, actions: int, **observed: TensorSpec) -> None:
+        """Make the specifications: of one of so many actions, and of what else is observed."""
+        batch, (height, width) = self.batch_size, self._grid
+        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
+        self.observation_spec = Composite(
+            **observed,
+            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
+            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
+            shape=batch,
+        ).to(self.device)
+        self.action_spec = Categorical(actions, shape=batch, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
         flag = Binary(1, (*batch, 1), dtype=torch.bool, device=self.device)
-        return Composite({key: flag.clone() for key in ENDS}, shape=batch, device=self.device)
+        ends = {key: flag.clone() for key in ENDS}
+        self.done_spec = Composite(ends, shape=batch, device=self.device)
 
     def _play(self, levels: Level) -> None:
         self._levels = levels

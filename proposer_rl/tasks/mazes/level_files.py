@@ -7,9 +7,9 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from proposer_rl.runs.folder import read_bounded, write_atomically
+from proposer_rl.settings import arguments, settings
 from proposer_rl.tasks.mazes import Level, shortest_path_length
 from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
@@ -21,6 +21,19 @@ LONGEST_NAME = 80
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
 _RECORD = re.compile(r"path_length *[:=] *(\d{1,9})")
+
+
+@settings
+class Item:
+    """A level in JSON: its name, the rows of its drawing, and the moves of its shortest path."""
+
+    name: str
+    level: list[str]
+    path_length: int | None = None
+
+
+def _items(levels: list[Item]) -> None:
+    """What a file in JSON holds."""
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -134,10 +147,10 @@ def levels_from_json(text: str, kind: type[Level] = Level) -> dict[str, Level]:
         content = json.loads(text)
     except (ValueError, RecursionError):
         raise ValueError("is no JSON") from None
-    items = content.get("levels") if isinstance(content, dict) else None
-    if not isinstance(items, list):
+    if not isinstance(content, dict) or "levels" not in content:
         raise ValueError('must be an object with a list "levels"')
-    return named_levels([_from_item(number, item) for number, item in enumerate(items, 1)], kind)
+    items: list[Item] = arguments(_items, {"levels": content["levels"]})["levels"]
+    return named_levels([(item.name, item.level, item.path_length) for item in items], kind)
 
 
 def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]:
@@ -165,11 +178,11 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
                 drawn = "\n".join(recorded_drawing(level))
                 levels[seed, f"update_{updates:05}_{nth}"] = kind.from_text(drawn)
         except (
-            KeyError,
+            LookupError,
             TypeError,
             AttributeError,
+            ArithmeticError,
             ValueError,
-            OverflowError,
             RecursionError,
         ) as error:
             raise ValueError(f"line {number} is no record of mazes") from error
@@ -194,22 +207,6 @@ def levels_to_json(levels: Mapping[str, Level]) -> str:
         for name, level, length in _checked(levels)
     ]
     return json.dumps({"levels": items}, indent=1) + "\n"
-
-
-def _from_item(number: int, item: Any) -> tuple[str, list[str], int | None]:
-    if not isinstance(item, dict) or not {"name", "level"} <= item.keys():
-        raise ValueError(f'level {number}: must be an object with a "name" and a "level"')
-    unknown = sorted(item.keys() - {"name", "level", "path_length"})
-    if unknown:
-        raise ValueError(f"level {number}: there is no such key as {unknown[0]!r}")
-    name, rows, length = item["name"], item["level"], item.get("path_length")
-    if not isinstance(name, str):
-        raise ValueError(f"level {number}: its name must be text, got {name!r:.80}")
-    if not isinstance(rows, list) or not all(isinstance(row, str) for row in rows):
-        raise ValueError(f"level {name!r:.80}: must be a list of rows, each of them text")
-    if length is not None and type(length) is not int:
-        raise ValueError(f"level {name!r:.80}: path_length must be whole, got {length!r:.80}")
-    return name, rows, length
 
 
 def named_levels(

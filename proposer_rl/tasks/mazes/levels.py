@@ -121,7 +121,8 @@ def validate_levels(level: Level) -> None:
 
     Raises:
         ValueError: If a shape or dtype is wrong, or if a start or goal lies outside the grid or on
-            an obstacle, or if they coincide; the message says which and how many.
+            an obstacle, or if they coincide, or if a direction is none; the message says which and
+            how many.
     """
     batch, walls = level.batch_size, level.walls
     if walls.dtype != torch.bool or walls.ndim != len(batch) + 2:
@@ -140,6 +141,13 @@ def validate_levels(level: Level) -> None:
         index = cell_index(cell, width).unsqueeze(-1)
         _refuse(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
     _refuse((level.start == level.goal).all(-1), "start and goal on the same cell")
+    if (direction := getattr(level, "direction", None)) is not None:
+        if direction.dtype != torch.int64 or direction.shape != batch:
+            raise ValueError(
+                f"direction must be int64 {list(batch)}, "
+                f"got {direction.dtype} {list(direction.shape)}"
+            )
+        _refuse((direction < 0) | (direction > 3), "direction outside 0..3")
 
 
 def _refuse(bad: Tensor, fault: str) -> None:

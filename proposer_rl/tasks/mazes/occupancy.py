@@ -35,9 +35,9 @@ def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
     """
     goal = cell_plane(level.goal, level.walls.shape)
     following = successors(level)  # [4, H*W]
-    chosen, reached = policy.flatten(1), goal.flatten()
+    chances, reached = policy.flatten(1), goal.flatten()
     for _ in range(max_steps):
-        after = (chosen * reached[following]).sum(0)
+        after = (chances * reached[following]).sum(0)
         reached = after.where(goal.flatten() == 0, goal.flatten())
     return reached.view_as(goal)
 

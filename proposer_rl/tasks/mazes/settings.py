@@ -11,6 +11,8 @@ from proposer_rl.settings import settings
 Mechanism = Literal["uniform", "path_first"]
 Fraction = Annotated[float, Interval(ge=0, lt=1)]
 PathLength = Annotated[int, Ge(1)]
+Fractions = Fraction | Annotated[list[Fraction], Len(1)]
+PathLengths = PathLength | Annotated[list[PathLength], Len(1)]
 Channels = Annotated[list[Annotated[int, Ge(1)]], Len(1)]
 
 

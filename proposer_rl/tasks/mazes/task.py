@@ -75,6 +75,8 @@ class MazeTask(GridTask, ExactTask):
 
     exact_metrics = True  # whatever the evaluator of the Proposer's reward is
     suffixes = (*SUFFIXES, RECORD)
+    read_file = staticmethod(read_levels)
+    fewest_steps = staticmethod(shortest_path_length)
     probe_planes = PLANES + ACTIONS
     steps_name = "path_length"
     text_key = f"S start, G goal, {EPISODE} the Solver's episode"
@@ -185,7 +187,7 @@ class MazeTask(GridTask, ExactTask):
     def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
         """Exact return and success of K Solvers, each on its own levels [K, E], with gradients."""
         logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
-        return self._sampled.differentiable(levels, logits)
+        return self._sampled(levels, logits)
 
     def optimal_return(self, levels: Level) -> Tensor:
         """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
@@ -229,14 +231,6 @@ class MazeTask(GridTask, ExactTask):
             name: self._sampled(*_with_logits(agent, levels))
             for name, levels in self.evaluated_on.items()
         }
-
-    def fewest_steps(self, levels: Level) -> Tensor:
-        """Moves on a shortest path of levels [*B]: int64 [*B], -1 where there is none."""
-        return shortest_path_length(levels)
-
-    def read_file(self, path: str) -> dict[str, Level]:
-        """The levels of a file, by their names."""
-        return read_levels(path)
 
     def check_level(self, name: str, level: Level) -> None:
         """Refuse a level that the U-Net cannot see; what another network sees, nobody knows."""

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical
 
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.level_env import LevelEnv
@@ -45,8 +45,7 @@ class ViewMazeEnv(LevelEnv):
       elsewhere.
 
     Args:
-        levels: Levels of any batch shape ``[*B]``, valid
-            (:func:`~proposer_rl.tasks.view_mazes.levels.validate_view_levels`).
+        levels: As of :class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`.
         max_steps: Step limit of an episode.
 
     Raises:
@@ -63,22 +62,13 @@ class ViewMazeEnv(LevelEnv):
 
     def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
         super().__init__(levels, max_steps)
-        self._make_specs()
-
-    def _make_specs(self) -> None:
-        batch, (height, width) = self.batch_size, self._grid
-        last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
-        self.observation_spec = Composite(
+        batch = self.batch_size
+        self._specify(
+            actions=FORWARD + 1,
             view=Bounded(EMPTY, GOAL, (*batch, VIEW, VIEW), dtype=torch.uint8),
             direction=Categorical(len(AHEAD), shape=batch),
-            agent=Bounded(torch.zeros_like(last_cell), last_cell, dtype=torch.int64),
-            step_count=Bounded(0, self.max_steps, (*batch, 1), dtype=torch.int64),
             is_init=Binary(1, (*batch, 1), dtype=torch.bool),
-            shape=batch,
-        ).to(self.device)
-        self.action_spec = Categorical(3, shape=batch, device=self.device)
-        self.reward_spec = Unbounded((*batch, 1), device=self.device)
-        self.done_spec = self._ends()
+        )
 
     def _tabulate(self, levels: ViewLevel) -> None:
         """Takes levels up as one line of objects, of all grids with their rims one after another.

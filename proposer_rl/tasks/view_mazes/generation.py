@@ -75,12 +75,12 @@ def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -
         beside = here.unsqueeze(1) + step  # [N, 4, 2]
         open_ = new[levels.unsqueeze(1), beside[..., 0], beside[..., 1]]
         chance = torch.rand(number, len(AHEAD), generator=draw)
-        chosen = step[chance.where(open_, -1.0).argmax(1)]
+        moved = step[chance.where(open_, -1.0).argmax(1)]
         on = open_.any(1)
         trail[depth, levels] = here
         depth = torch.where(on, depth + 1, (depth - 1).clamp(min=0))
-        there = torch.where(on.unsqueeze(1), here + chosen, trail[depth, levels])
-        between = 2 * here - 2 + chosen * on.unsqueeze(1)
+        there = torch.where(on.unsqueeze(1), here + moved, trail[depth, levels])
+        between = 2 * here - 2 + moved * on.unsqueeze(1)
         free[levels, between[:, 0], between[:, 1]] = True
         new[levels, there[:, 0], there[:, 1]] = False
         here = there

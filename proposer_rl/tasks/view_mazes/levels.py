@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.levels import START, Level, validate_levels
+from proposer_rl.tasks.mazes.levels import START, Level
 
 AGENTS = (">", "v", "<", "^")
 """The agent in a drawing, by its direction: 0 right, 1 down, 2 left, 3 up."""
@@ -72,25 +72,6 @@ def directed(level: Level, direction: Tensor) -> ViewLevel:
         direction=direction,
         batch_size=level.batch_size,
     )
-
-
-def validate_view_levels(level: ViewLevel) -> None:
-    """Checks hand-designed levels.
-
-    Raises:
-        ValueError: As :func:`~proposer_rl.tasks.mazes.levels.validate_levels`, or if there is no
-        such
-            direction.
-    """
-    validate_levels(level)
-    direction = level.direction
-    if direction.dtype != torch.int64 or direction.shape != level.batch_size:
-        raise ValueError(
-            f"direction must be int64 {list(level.batch_size)}, "
-            f"got {direction.dtype} {list(direction.shape)}"
-        )
-    if count := int(((direction < 0) | (direction >= len(AGENTS))).sum()):
-        raise ValueError(f"{count} of {direction.numel()} levels have a direction that is not 0..3")
 
 
 def _split(drawing: str) -> tuple[str, int]:

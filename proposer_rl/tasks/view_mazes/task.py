@@ -65,6 +65,8 @@ class ViewMazeTask(GridTask):
 
     level = ViewLevel
     suffixes = SUFFIXES
+    read_file = staticmethod(read_view_levels)
+    fewest_steps = staticmethod(fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
     steps_name = "fewest_actions"
     counting = ", turns included"
@@ -144,14 +146,6 @@ class ViewMazeTask(GridTask):
         drawn = planes(for_copies(agent, levels))
         went = visits(agent, levels, self.maze.max_steps)
         return torch.cat([drawn, went.unsqueeze(-3)], -3)
-
-    def fewest_steps(self, levels: ViewLevel) -> Tensor:
-        """Actions on a shortest way, turns included, of levels [*B]: int64 [*B], -1 for none."""
-        return fewest_actions(levels)
-
-    def read_file(self, path: str) -> dict[str, ViewLevel]:
-        """The levels of a file, by their names."""
-        return read_view_levels(path)
 
     def at_once(self, cells: int) -> int:
         """How many levels are evaluated together."""

@@ -14,20 +14,18 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
-from proposer_rl.tasks.gymnasium.levels import space_bins
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.gymnasium.settings import SuccessSettings
-from proposer_rl.tasks.gymnasium.success import Steps, success_rule
+from proposer_rl.tasks.gymnasium.settings import Steps, SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 
 K, P, T = 2, 3, 20
-SPACE = ParameterSpace({name: space_bins(settings) for name, settings in PARAMETERS.items()})
+SPACE = ParameterSpace({name: settings.space_bins() for name, settings in PARAMETERS.items()})
 LEVELS = SPACE.sample(K * P, Streams(0).generator()).reshape(K, P)
 
 
 def make(**more: Any) -> GymnasiumEnv:
-    rule = success_rule(SuccessSettings(kind="terminated"))
+    rule = SuccessSettings(kind="terminated")
     return GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, **more)
 
 
@@ -121,7 +119,7 @@ STEPS = Steps(
     ],
 )
 def test_successes(settings: Any, expected: list[bool]) -> None:
-    assert success_rule(SuccessSettings(**settings))(STEPS).tolist() == expected
+    assert SuccessSettings(**settings)(STEPS).tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -135,12 +133,12 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        success_rule(SuccessSettings(**settings))
+        SuccessSettings(**settings).check()
 
 
 def test_returns_count_from_the_start_of_each_episode() -> None:
     least = 3.0
-    rule = success_rule(SuccessSettings(kind="return", least=least))
+    rule = SuccessSettings(kind="return", least=least)
     env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, reward_scale=0.1)
     rollout = env.rollout(5 * LIMIT, break_when_any_done=False)
     found = set()

@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.levels import space_bins, target_bins
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from proposer_rl.tasks.parameters import Bins, ParameterSpace
 from tests.tasks.gymnasium.toys import PARAMETERS
 
-BINS = {name: space_bins(settings) for name, settings in PARAMETERS.items()}
-TARGET = {name: target_bins(settings) for name, settings in PARAMETERS.items()}
+BINS = {name: settings.space_bins() for name, settings in PARAMETERS.items()}
+TARGET = {name: settings.target_bins() for name, settings in PARAMETERS.items()}
 SPACE = ParameterSpace(BINS)
 
 
@@ -61,7 +60,7 @@ def intervals(pair: tuple[float, float]) -> Bins:
 def test_a_value_counts_for_the_nearest_one(values: list[float], target: float) -> None:
     values = sorted(values)
     settings = ParameterSettings(values=values, target=target)
-    shares = space_bins(settings).shares(target_bins(settings))
+    shares = settings.space_bins().shares(settings.target_bins())
     nearest = min(abs(value - target) for value in values)
     (chosen,) = shares.nonzero().flatten().tolist()
     assert shares[chosen] == 1 and abs(values[chosen] - target) == pytest.approx(nearest)
@@ -71,7 +70,7 @@ def test_a_value_counts_for_the_nearest_one(values: list[float], target: float) 
 def test_a_range_is_divided_among_the_bins_that_it_covers(
     bins: int, pair: tuple[float, float]
 ) -> None:
-    space = space_bins(ParameterSettings(low=-3.0, high=2.0, bins=bins, target=0.0))
+    space = ParameterSettings(low=-3.0, high=2.0, bins=bins, target=0.0).space_bins()
     shares = space.shares(intervals(pair))
     # An even grid within the target, each point counted for its bin.
     low, high = sorted(pair)
@@ -91,7 +90,7 @@ def test_shares_of_several_parameters_multiply() -> None:
 
 
 def test_a_single_bin_lies_in_the_middle() -> None:
-    only = space_bins(ParameterSettings(values=[3], target=3))
+    only = ParameterSettings(values=[3], target=3).space_bins()
     assert ParameterSpace({"a": only}).coordinates.tolist() == [[0.0]]
     both = ParameterSpace({"a": only, "b": BINS["width"]})
     assert both.coordinates.tolist() == [[0.0, -1.0], [0.0, 1.0]]
@@ -113,4 +112,4 @@ def test_a_single_bin_lies_in_the_middle() -> None:
 def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
     settings = ParameterSettings(**given_)
     with pytest.raises(ValueError, match=message):
-        space_bins(settings), target_bins(settings)
+        settings.space_bins(), settings.target_bins()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,9 +22,9 @@ from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import pictures
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
-from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import PARAMETERS, TINY, Walk, walk_task
-from tests.test_docs import TRAIN, write_files
+from tests.test_docs import TRAIN
+from tests.test_readme import ROOT, write_files
 from tests.tiny import composed
 
 NO_BOX2D = pytest.mark.skipif(
@@ -78,14 +77,6 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         (
             {"parameters": {"a": ParameterSettings(set="call", values=[1], target=1)}},
             "parameters.a.name: missing",
-        ),
-        (
-            {"parameters": {"updates": PARAMETERS["width"]}},
-            "parameters.updates: is a column of training.csv",
-        ),
-        (
-            {"parameters": {"entropy": PARAMETERS["width"]}},
-            "parameters.entropy: is a column of training.csv",
         ),
         (
             {"wrappers": ["tests.tasks.gymnasium.test_task.with_whole_actions"]},
@@ -265,9 +256,8 @@ def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: i
 
 
 METHODS = [
-    "perf_gain", "target", "domain_randomization", "hand_designed", "plr", "robust_plr", "alp_gmm",
-    "learning_progress curriculum.source=episodes", "first_order_sampled", "currot", "paired",
-    "sfl +score=sampled", "ncc +score=sampled", "regret +score=sampled", "pace +score=sampled",
+    "perf_gain", "domain_randomization", "plr", "alp_gmm", "first_order_sampled", "currot",
+    "learning_progress curriculum.source=episodes", "paired", "sfl +score=sampled",
 ]  # fmt: skip
 
 
@@ -283,44 +273,11 @@ def test_curricula_run_from_the_command_line(method: str, train: Any) -> None:
     assert told["title"] == "CartPole-v1" and told["exact"] is False
 
 
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize(
-    ("method", "message"),
-    [
-        ("regret", "GymnasiumTask must define optimal_return"),
-        ("pace", "GymnasiumTask must define differentiable_performance"),
-        ("first_order_gain", "must define differentiable_performance"),
-        ("first_order_proposer", "must define differentiable_performance"),
-        ("accel", "the task has no edit("),
-    ],
-)
-def test_what_the_task_cannot_tell_is_refused(
-    method: str, message: str, train: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert train("task=cartpole", f"+method={method}", *TINY, "hydra.run.dir=run") == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
-    assert not Path("run").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("own_folder")
-def test_an_interrupted_run_goes_on_as_if_it_had_not_been(train: Any) -> None:
-    run = ("task=cartpole", "+method=perf_gain", "schedule.checkpoint_every=2", *TINY)
-    assert train(*run, "hydra.run.dir=whole") == 0
-    shutil.copytree("whole", "run")
-    Path("run/summary.json").unlink()
-    newest = max(Path("run/checkpoints").glob("*.pt"), key=lambda path: path.stat().st_mtime)
-    newest.unlink()  # as if the run had been killed after the one before
-    assert train(*run, "hydra.run.dir=run") == 0
-    assert_same_run(Path("whole"), Path("run"))
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_folder")
 def test_the_file_that_the_page_shows_is_all_that_is_needed(train: Any) -> None:
     (command,) = [call for call in TRAIN if "task=hill" in call]
-    write_files(Path())
+    write_files((ROOT / "docs/how_to/gymnasium_environment.md").read_text(), Path())
     assert train(*command, *TINY, "hydra.run.dir=run") == 0
     told = json.loads(Path("run/run.json").read_text())["task"]
     assert told["title"] == "MountainCar-v0"

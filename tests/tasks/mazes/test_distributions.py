@@ -24,16 +24,6 @@ def test_distribution_gives_its_specification(shape: tuple[int, ...] | int, mech
     assert (levels == distribution.sample(shape, seeded())).all()
 
 
-def test_specifications_are_equally_likely() -> None:
-    distribution = LevelDistribution([(0.0, 2), (0.25, 3), (0.5, 5)], height=6, width=6)
-    levels = distribution.sample((50, 60), seeded())
-    lengths = shortest_path_length(levels).flatten()
-    walls = levels.walls.sum((-1, -2)).flatten()
-    counts = [int(((lengths == d) & (walls == n)).sum()) for d, n in ((2, 0), (3, 9), (5, 18))]
-    assert sum(counts) == 3000
-    assert chisquare(counts).pvalue > 1e-3
-
-
 def test_impossible_distribution_is_refused_at_once() -> None:
     with pytest.raises(ValueError, match=r"0\.95.*path_length=12"):
         LevelDistribution([(0.1, 3), (0.95, 12)])
@@ -46,14 +36,6 @@ def test_numbers_run_through_lengths_first() -> None:
     assert fraction.dtype == torch.float64
     assert fraction.tolist() == [[0.0, 0.0], [0.25, 0.25], [0.5, 0.5]]
     assert length.tolist() == [[2, 5]] * 3
-
-
-def test_generated_levels_keep_the_order_of_their_numbers() -> None:
-    index = torch.randint(6, (4, 30), generator=seeded())
-    levels = SPACE.generate(index, seeded())
-    fraction, length = SPACE.decode(index)
-    assert torch.equal(levels.walls.sum((-1, -2)), (fraction * 36).long())
-    assert torch.equal(shortest_path_length(levels), length)
 
 
 def test_sampling_is_uniform_over_the_space() -> None:

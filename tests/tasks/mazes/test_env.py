@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy, check_env_specs
@@ -43,22 +43,6 @@ def test_successors_agree_with_moves_one_by_one() -> None:
                 assert cells[cell] == row * 3 + column
 
 
-def test_walk_to_the_goal() -> None:
-    env = MazeEnv(ROOM, step_penalty=0.125)
-    state = env.reset()
-    assert state["agent"].tolist() == [0, 0] and not state["done"]
-    walk = [(UP, [0, 0]), (LEFT, [0, 0]), (RIGHT, [0, 1]), (RIGHT, [0, 1]), (DOWN, [1, 1])]
-    for count, (action, cell) in enumerate(walk, start=1):
-        state = step(env, state, action)
-        assert state["agent"].tolist() == cell
-        assert state["reward"].tolist() == [-0.125]
-        assert not state["done"] and state["step_count"].item() == count
-    state = step(env, state, RIGHT)
-    assert state["agent"].tolist() == [1, 2]
-    assert state["reward"].tolist() == [0.875]
-    assert state["terminated"] and state["done"] and not state["truncated"]
-
-
 def test_agent_is_observed_on_demand_only() -> None:
     seeing, blind = MazeEnv(ROOM, observe_agent=True), MazeEnv(ROOM)
     shown, state = seeing.reset(), blind.reset()
@@ -68,15 +52,6 @@ def test_agent_is_observed_on_demand_only() -> None:
         assert shown["planes"][3].nonzero().tolist() == [shown["agent"].tolist()]
         shown, state = step(seeing, shown, action), step(blind, state, action)
     assert shown["planes"][3].nonzero().tolist() == [[0, 1]]
-
-
-def test_truncation_at_the_step_limit() -> None:
-    env = MazeEnv(ROOM, max_steps=3)
-    state = env.reset()
-    for expected in (False, False, True):
-        state = step(env, state, UP)
-        assert state["truncated"].item() == state["done"].item() == expected
-        assert not state["terminated"]
 
 
 def test_goal_at_the_step_limit_terminates_and_does_not_truncate() -> None:
@@ -123,23 +98,6 @@ def test_rollouts_agree_with_a_simulator(
         assert torch.equal(steps[i]["planes"], planes(level).expand(20, -1, -1, -1))
 
 
-def test_levels_change_only_when_they_are_set() -> None:
-    first, second = (random_levels(3, 4, 4, 0.2, seed) for seed in (0, 1))
-    env = MazeEnv(first, max_steps=4)
-    policy = RandomPolicy(env.action_spec)
-    assert (
-        env.rollout(15, policy, break_when_any_done=False)["planes"][:, -1] == planes(first)
-    ).all()
-    env.set_levels(second)
-    assert (env.levels == first).all()
-    state = env.reset()
-    assert (env.levels == second).all()
-    assert torch.equal(state["agent"], second.start)
-    steps = env.rollout(15, policy, break_when_any_done=False)
-    assert torch.equal(steps["planes"], planes(second).unsqueeze(1).expand(-1, 15, -1, -1, -1))
-    assert torch.equal(steps["next", "planes"], steps["planes"])
-
-
 def test_unfinished_episodes_end_on_the_levels_they_began_on() -> None:
     old = Level.from_text(["S.G", "SG."])
     new = Level.from_text(["G.S", ".GS"])
@@ -166,9 +124,11 @@ def test_levels_of_another_shape_are_refused(levels: Level) -> None:
         env.set_levels(levels)
 
 
-def test_no_steps_at_all_are_refused() -> None:
+def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
         MazeEnv(ROOM, max_steps=0)
+    with pytest.raises(ValueError, match="'human'"):
+        MazeEnv(ROOM).render("human")
 
 
 def test_what_is_stepped_decides_where_the_agent_is() -> None:
@@ -237,19 +197,6 @@ def test_render_of_a_batch() -> None:
     assert env.render("ansi") == ["A.G", "G.A", ".AG", "AG."]
     _, state = env.step_and_maybe_reset(state.set("action", torch.full((2, 2), RIGHT)))
     assert env.render("ansi") == ["SAG", "G.A", ".AG", "AG."]  # the last two were reset
-
-
-def test_render_refuses_other_modes() -> None:
-    with pytest.raises(ValueError, match="'human'"):
-        MazeEnv(ROOM).render("human")
-
-
-def test_seeding_changes_nothing() -> None:
-    env = MazeEnv(ROOM)
-    env.set_seed(1)
-    first = env.reset()
-    env.set_seed(2)
-    assert isinstance(first, TensorDict) and (first == env.reset()).all()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from proposer_rl.tasks.mazes import Level, MazeEnv
-from proposer_rl.tasks.vector_env import AHEAD
+from proposer_rl.tasks.mazes.as_gymnasium import AHEAD
 from tests.tasks.mazes.oracles import path_length, play
 
 ID = "proposer_rl/Maze-v0"
@@ -229,20 +229,17 @@ def test_gymnasiums_wrappers_take_the_batch() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"obstacle_fraction": 1.5}, "obstacle_fraction must be at least 0 and below 1, got 1.5"),
-        ({"obstacle_fraction": "0.4"}, "obstacle_fraction must be one number or several"),
-        ({"obstacle_fraction": []}, "obstacle_fraction must be one number or several"),
-        ({"obstacle_fraction": None}, "obstacle_fraction must be a finite number, got None"),
-        ({"step_penalty": "x"}, "step_penalty must be a finite number, got 'x'"),
-        ({"observe_agent": 2}, "observe_agent must be one of"),
-        ({"path_length": 0}, "path_length must be a whole number of at least 1, got 0"),
-        ({"path_length": 2.5}, "path_length must be a whole number of at least 1, got 2.5"),
+        ({"obstacle_fraction": 1.5}, "obstacle_fraction=1.5: input should be less than 1"),
+        ({"obstacle_fraction": []}, r"obstacle_fraction=\[\]: input should be"),
+        ({"step_penalty": "x"}, "step_penalty='x': input should be a valid number"),
+        ({"observe_agent": 2}, "observe_agent=2: input should be a valid boolean"),
+        ({"path_length": 2.5}, "path_length=2.5: input should be a valid integer"),
         ({"path_length": 30}, "max_steps=25: must be at least the path length 30"),
         ({"height": 2, "width": 2, "path_length": 5}, "cannot make levels with"),
-        ({"height": 4.0}, "height must be a whole number"),
-        ({"max_steps": True}, "max_steps must be a whole number of at least 1, got True"),
-        ({"mechanism": "maze"}, "mechanism must be one of"),
-        ({"render_mode": "gif"}, "render_mode must be one of"),
+        ({"max_steps": True}, "max_steps=True: input should be a valid integer"),
+        ({"mechanism": "maze"}, "mechanism='maze': input should be 'uniform' or 'path_first'"),
+        ({"render_mode": "gif"}, "render_mode='gif': input should be 'rgb_array' or 'ansi'"),
+        ({"hight": 3}, "hight: unknown; there are: height, width"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own remark, before ours
@@ -251,12 +248,6 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> N
         make(**arguments)
     with pytest.raises(ValueError, match=message):
         make_vec(2, **arguments)
-
-
-def test_unknown_arguments_are_refused() -> None:
-    for build in (make, lambda **arguments: make_vec(2, **arguments)):
-        with pytest.raises(TypeError, match="unexpected keyword argument 'hight'"):
-            build(hight=3)
 
 
 @pytest.mark.parametrize(
@@ -283,16 +274,14 @@ def test_bad_calls_of_a_batch_are_refused() -> None:
     for actions in ([0], [0, 4], [0.5, 1.0], [[0, 1]]):
         with pytest.raises(ValueError, match="actions must be 2 whole numbers from 0 to 3"):
             envs.step(np.array(actions))
-    with pytest.raises(ValueError, match=r"seed must be a whole number or several, got 1\.5"):
-        envs.reset(seed=1.5)
     with pytest.raises(ValueError, match="seed must be one or 2 of them, got 3"):
         envs.reset(seed=[1, 2, 3])
     for mask in ([False, False], [True], [1, 0]):
         with pytest.raises(ValueError, match="must be 2 bools, not all False"):
             envs.reset(options={"reset_mask": np.array(mask)})
-    with pytest.raises(ValueError, match="autoreset_mode must be one of"):
+    with pytest.raises(ValueError, match="autoreset_mode='Later': input should be 'NextStep'"):
         make_vec(2, autoreset_mode="Later")
-    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_envs=0: input should be greater"):
         make_vec(0)
 
 

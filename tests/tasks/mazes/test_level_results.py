@@ -12,7 +12,7 @@ from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_a
 from proposer_rl.task import LevelResult
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import RolloutEvaluator
-from proposer_rl.tasks.mazes.level_files import levels_from_text, shipped_levels
+from proposer_rl.tasks.mazes.level_files import levels_from_text
 from proposer_rl.tasks.mazes.rendering import draw_level
 from proposer_rl.tasks.mazes.settings import MazeSettings
 from tests.tasks.mazes.oracles import random_levels
@@ -132,16 +132,8 @@ def test_scores_are_what_playing_gives(per_step: bool) -> None:
     level = random_levels(1, 5, 7, 0.1, 4)[0]
     scores = results(solver, {"level": level}, lambda length: 20, 0.05)
     copies = level.expand(2, 1)
-    player = RolloutEvaluator(20, 0.05, episodes=4000, generator=torch.Generator().manual_seed(0))
-    played = player(copies, cell_logits(solver, planes(copies)))
+    player, draws = RolloutEvaluator(20, 0.05, episodes=4000), torch.Generator().manual_seed(0)
+    played = player(copies, cell_logits(solver, planes(copies)), draws)
     for k, score in enumerate(scores):
         for key, tolerance in (("success", 0.03), ("return", 0.05)):
             assert score.results[key] == pytest.approx(float(played[key][k, 0]), abs=tolerance)
-
-
-def test_every_shape_goes_through_the_network() -> None:
-    levels = shipped_levels("shapes")
-    scores = results(solvers(), levels, lambda length: 2 * length)
-    assert len(scores) == 2 * len(levels)
-    assert all(0 <= s.results["success"] <= 1 for s in scores)
-    assert {s.results["greedy_success"] for s in scores} <= {0, 1}

@@ -15,7 +15,7 @@ from proposer_rl.models import Population
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, EditableTask, OptimalTask
-from proposer_rl.tasks.mazes import Level, LevelSpec, shortest_path_length
+from proposer_rl.tasks.mazes import Level
 from proposer_rl.tasks.mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
@@ -238,17 +238,6 @@ def test_named_levels_get_the_steps_that_they_need(tmp_path) -> None:
         match="--levels mazes: must be one of: shapes, small, a file ",
     ):
         named(TASK, "mazes")
-
-
-def test_the_bins_are_the_product_of_the_axes() -> None:
-    space = TASK.space
-    assert list(space.axes) == ["obstacle fraction", "path length"]
-    levels = space.generate(torch.arange(4)[None], [Streams(0).generator()])[0]
-    lengths = shortest_path_length(levels).tolist()
-    fractions = levels.walls.float().mean((-2, -1)).tolist()
-    found = [LevelSpec(round(f, 3), n) for f, n in zip(fractions, lengths, strict=True)]
-    first, second = space.axes.values()
-    assert found == [LevelSpec(f, n) for f in first for n in second]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.tasks.mazes.distance import shortest_path_length
+from proposer_rl.tasks.mazes.levels import validate_levels
 from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
 from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
 from proposer_rl.tasks.view_mazes.generation import (
@@ -19,7 +20,7 @@ from proposer_rl.tasks.view_mazes.generation import (
     scattered_walls,
     solvable,
 )
-from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel, validate_view_levels
+from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
 from proposer_rl.tasks.view_mazes.settings import (
     DistributionSettings,
     PerfectSettings,
@@ -62,7 +63,7 @@ def test_drawings_are_read_back(seed: int) -> None:
     again = ViewLevel.from_text(levels.to_text())
     assert bool((again == levels).all())
     assert bool((ViewLevel.from_text(levels[0].to_text()) == levels[0]).all())
-    validate_view_levels(again)
+    validate_levels(again)
 
 
 def test_a_start_without_direction_looks_right() -> None:
@@ -80,10 +81,10 @@ def test_what_is_no_level_is_refused(drawing: str) -> None:
 def test_directions_are_checked() -> None:
     levels = random_levels(3)
     for wrong in (torch.tensor([0, 4, 1]), torch.tensor([0, -1, 1])):
-        with pytest.raises(ValueError, match="1 of 3 levels have a direction"):
-            validate_view_levels(levels.replace(direction=wrong))
+        with pytest.raises(ValueError, match="1 of 3 levels have the direction outside"):
+            validate_levels(levels.replace(direction=wrong))
     with pytest.raises(ValueError, match="direction must be int64"):
-        validate_view_levels(levels.replace(direction=torch.zeros(3)))
+        validate_levels(levels.replace(direction=torch.zeros(3)))
 
 
 def test_shortest_ways_are_those_of_networkx() -> None:
@@ -110,7 +111,7 @@ def test_the_optimum_is_a_shortest_way_within_the_limit() -> None:
 def test_mazes_and_rooms_are_valid(draw: Callable[..., ViewLevel]) -> None:
     for height, width in ((13, 13), (5, 9)):
         levels = draw(20, height, width, generator())
-        validate_view_levels(levels)
+        validate_levels(levels)
         assert (shortest_path_length(levels) > 0).all()
         assert bool((draw(20, height, width, generator()) == levels).all())
         assert not (levels.walls[0] == levels.walls[1:]).flatten(1).all(1).all()
@@ -132,7 +133,7 @@ def test_a_search_reaches_every_maze() -> None:
 def test_scattered_walls_are_counted_and_uniform() -> None:
     count = torch.tensor([0, 3, 7]).repeat(2000)
     levels = scattered_walls(count, 3, 3, generator())
-    validate_view_levels(levels)
+    validate_levels(levels)
     assert torch.equal(levels.walls.flatten(1).sum(1), count)
     three = levels[count == 3]
     for places in (three.walls.flatten(1).float().mean(0) / 3, *ends(three)):
@@ -164,7 +165,7 @@ def test_a_bin_has_its_walls_and_its_path() -> None:
     assert space.axes == {"walls": (0, 5), "path length": (1, 3, 6)} and space.size == 6
     choices = torch.arange(6).repeat(2, 3)
     levels = space.generate(choices, [generator(), generator(1)])
-    validate_view_levels(levels)
+    validate_levels(levels)
     assert torch.equal(levels.walls.sum((-2, -1)), torch.tensor([0, 5])[choices // 3])
     assert torch.equal(shortest_path_length(levels), torch.tensor([1, 3, 6])[choices % 3])
     assert torch.equal(space.shares(levels[0]), torch.full((6,), 1 / 6))

@@ -13,8 +13,9 @@ from proposer_rl.cli.train import main as train
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.tasks.mazes.levels import validate_levels
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.levels import ViewLevel, validate_view_levels
+from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from tests.commands import call
 from tests.tiny import composed, tiny_view_task
 
@@ -47,7 +48,7 @@ def test_edits_keep_levels_valid_their_class_and_their_directions() -> None:
     task = tiny_view_task()
     levels = task.space.sample(12, Streams(0).generator()).reshape(2, 6)
     children = edit_levels(levels, 4, [Streams(k).generator() for k in range(2)])
-    validate_view_levels(children)
+    validate_levels(children)
     assert type(children) is ViewLevel
     again = task.edit(levels, 4, [Streams(k).generator() for k in range(2)])
     assert bool((again == children).all())
@@ -108,38 +109,7 @@ def test_a_run_is_trained_resumed_and_evaluated(
         assert row["max_steps"] == 12
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["+method=first_order_gain"], "must define differentiable_performance"),
-        (["+method=regret"], "ViewMazeTask tells performance by playing, which is not exact"),
-        (["+method=sfl"], "ViewMazeTask tells performance by playing"),
-        (["+method=target", "task.maze.height=4"], "distributions.ood: perfect mazes have odd"),
-        (["+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23 walls"),
-        (
-            ["+method=target", "task.distributions.id.kind=spiral"],
-            "task.distributions.id.kind='spiral': input should be one of 'four_rooms', 'perfect', "
-            "'scattered'",
-        ),
-    ],
-)
-def test_what_does_not_go_is_refused_before_anything_is_written(
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(tmp_path / "none", *words) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and said in lines[0]
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("file", ["bad.txt", "bad.npy", "missing.py"])
-def test_a_file_that_holds_no_levels_is_refused(
-    file: str,
+def test_files_that_hold_no_levels_are_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -147,10 +117,11 @@ def test_a_file_that_holds_no_levels_is_refused(
     monkeypatch.chdir(tmp_path)
     assert run(tmp_path / "run", "+method=target", "schedule.updates=2") == 0
     capsys.readouterr()
-    if not file.startswith("missing"):
-        Path(file).write_text(">#G\n")
-    with pytest.raises(SystemExit) as end:
-        evaluate(["run", "--levels", file, "-o", "scores.json"])
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert end.value.code == 2 and len(lines) == 1 and file in lines[0]
-    assert not Path("scores.json").exists()
+    for file in ("bad.txt", "bad.npy", "missing.py"):
+        if not file.startswith("missing"):
+            Path(file).write_text(">#G\n")
+        with pytest.raises(SystemExit) as end:
+            evaluate(["run", "--levels", file, "-o", "scores.json"])
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert end.value.code == 2 and len(lines) == 1 and file in lines[0]
+        assert not Path("scores.json").exists()

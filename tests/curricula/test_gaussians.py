@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 
-from proposer_rl.curricula import alp_gmm
+from proposer_rl.curricula import gaussians
 from proposer_rl.curricula.gaussians import (
     MixtureCurriculum,
     TaskMixture,
@@ -54,7 +54,7 @@ def test_the_nearest_is_that_of_a_loop_and_the_last_of_equals(
         max((-math.dist(p, place), index) for index, place in enumerate(places))[1] for p in points
     ]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(alp_gmm, "CHUNK", chunk)
+        patched.setattr(gaussians, "CHUNK", chunk)
         assert nearest(torch.tensor(points), torch.tensor(places)).tolist() == expected
 
 
@@ -218,7 +218,7 @@ def test_mixtures_are_made_of_the_last_window_when_it_is_full(
         made.append(points)
         return fit(points, most, generator)
 
-    monkeypatch.setattr(alp_gmm, "fit", noted)
+    monkeypatch.setattr(gaussians, "fit", noted)
     task = Scripted(torch.rand(1, 8), batch_size=24)
     curriculum = small(task, warmup=70, refit=50)
     fitted = []

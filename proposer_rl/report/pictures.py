@@ -1,0 +1,263 @@
+"""Figures of levels and of proposals, along training and beside what is measured on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure, FigureBase
+from numpy.typing import NDArray
+
+from proposer_rl.report.measures import UPDATES
+from proposer_rl.report.reading import read_run
+from proposer_rl.report.records import Column, LevelRecord, SampleRecord, number, picture, words
+from proposer_rl.report.runs import Run, share_map
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.style import (
+    SETTINGS,
+    SKY,
+    VERMILLION,
+    Drawing,
+    axes_of,
+    finish,
+)
+from proposer_rl.runs.columns import is_rate
+
+STAGES = 5
+BATCH = 2  # levels of a batch
+SIDE = 1.25  # inches of a level
+SAMPLES = 6
+STRIP = (7.6, 2.1)  # inches, of a row of heat maps
+SINGLE = (3.6, 3.0)
+MOST_TICKS = 10
+
+
+def along_training(study: Study) -> Drawing | None:
+    """The paper's Figure 3: levels of the batch at several stages."""
+    shown = [(group.label, group.runs[0].samples) for group in study.groups]
+    panels = [
+        partial(_draw_stages, samples=samples, title=label)
+        for label, samples in shown
+        if any(level.picture for sample in samples for level in sample.levels[:BATCH])
+    ]
+    if not panels:
+        return None
+    task = study.example.task
+    return Drawing(
+        "levels",
+        f"{task.levels.capitalize()} along training (the paper's Figure 3)",
+        f"The first {BATCH} {task.levels} of the batch of the method's first seed. {task.key}",
+        panels,
+        size=(SIDE * STAGES, SIDE * BATCH + 0.5),
+    )
+
+
+def side_by_side(study: Study) -> Drawing | None:
+    """The paper's Figure 5: the distributions measured on, early and late proposals."""
+    task = study.example.task
+    rows = [(words(name), task.samples.get(name, [])) for name in task.distributions]
+    for group in study.groups:
+        samples = group.runs[0].samples if group.proposes else ()
+        for stage, sample in zip(("first", "last"), (*samples[:1], *samples[-1:]), strict=False):
+            rows.append((f"{group.label}, {stage} (update {sample.updates})", sample.levels))
+    return _in_rows(
+        rows,
+        "samples",
+        "Samples: what is measured on, and proposals (the paper's Figure 5)",
+        f"Random {task.levels} of the distributions, and those that the Proposers made at their "
+        f"first and last evaluated update. {task.key}",
+    )
+
+
+def recorded_by_curricula(study: Study) -> Drawing | None:
+    """Levels that curricula recorded: the last time, of each method's first seed."""
+    task = study.example.task
+    rows = [
+        (f"{group.label}: {caption}", levels)
+        for group in study.groups
+        for caption, levels in group.runs[0].sheets.items()
+    ]
+    return _in_rows(
+        rows,
+        "recorded",
+        f"{task.levels.capitalize()} that the curricula recorded",
+        "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
+        f"{task.key}",
+    )
+
+
+def _in_rows(
+    rows: Sequence[tuple[str, Sequence[LevelRecord]]], name: str, title: str, caption: str
+) -> Drawing | None:
+    """A row of pictures for each title that has any; None without one."""
+    panels = [
+        partial(_draw_row, levels=levels, title=head)
+        for head, levels in rows
+        if any(level.picture for level in levels[:SAMPLES])
+    ]
+    size = (SIDE * SAMPLES, SIDE + 0.35)
+    return Drawing(name, title, caption, panels, 1, size=size) if panels else None
+
+
+def draw_run(folder: Path, title: str) -> Path:
+    """One picture of a run: what was measured on every distribution, and levels trained on.
+
+    Args:
+        folder: a run's folder.
+        title: of the picture.
+
+    Returns:
+        The file, ``run.png`` in the folder.
+    """
+    runs = read_run(folder)
+    height = (SIDE + 0.15) * BATCH + 0.4
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=(8.5, 3.2 + height), layout="constrained")
+        parts = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.2, height])
+        top, bottom = parts[:, 0]
+        _draw_measurements(axes_of(top), runs)
+        top.suptitle(title)
+        if runs[0].samples:
+            _draw_stages(bottom, runs[0].samples, runs[0].task.key)
+        file = folder / "run.png"
+        figure.savefig(file, dpi=110)
+    return file
+
+
+def _draw_measurements(axes: Axes, runs: Sequence[Run]) -> None:
+    names = runs[0].measurements
+    for place, name in enumerate(names):
+        colour = (VERMILLION, SKY, "0.3")[place % 3]
+        for run in runs:
+            label = words(name) if run is runs[0] else None
+            axes.plot(run.metrics["updates"], run.metrics[name], color=colour, label=label)
+    rates, every = all(map(is_rate, names)), [run.metrics[name] for run in runs for name in names]
+    finish(axes, UPDATES, "rate" if rates else "measurement", every, rate=rates)
+    axes.legend()
+
+
+def _draw_stages(figure: FigureBase, samples: Sequence[SampleRecord], title: str) -> None:
+    """Stages from left to right, the levels of a batch from top to bottom."""
+    last = len(samples) - 1
+    stages = [samples[i] for i in sorted({round(i * last / (STAGES - 1)) for i in range(STAGES)})]
+    grid = figure.subplots(BATCH, STAGES, squeeze=False)
+    for column, sample in zip(grid.T, stages, strict=False):
+        column[0].set_title(f"update {sample.updates}", fontsize=8)
+        _show(column, sample.levels)
+    _show(list(grid.T[len(stages) :].flat), ())
+    figure.suptitle(title, fontsize=9)
+
+
+def _draw_row(figure: FigureBase, levels: Sequence[LevelRecord], title: str) -> None:
+    _show(figure.subplots(1, SAMPLES, squeeze=False)[0], levels)
+    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
+
+
+def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
+    """Draw pictures of levels; a place stays empty where there is none that can be shown."""
+    for axes in places:
+        axes.set_axis_off()
+    for axes, level in zip(places, levels, strict=False):
+        image = picture(level.picture)
+        if image is not None:
+            axes.imshow(image)
+
+
+def heat_maps(study: Study) -> Drawing | None:
+    """Where in the space of levels the proposals lie, along training."""
+    found = [(group, maps) for group in study.groups if (maps := _histograms(group)) is not None]
+    if not found:
+        return None
+    return Drawing(
+        "proposals",
+        f"Proposals over {' and '.join(list(found[0][0].runs[0].task.space)[:2])}, along training",
+        "Share of a cycle's proposals, averaged over the seeds. White is the share "
+        "under domain randomization, orange is more, purple less: a map that stays "
+        "white is a Proposer that has not learnt, or seeds that went different ways.",
+        [
+            partial(_draw_strip, group=group, updates=updates, shares=shares)
+            for group, (updates, shares) in found
+        ],
+        1,
+        size=STRIP,
+    )
+
+
+def last_map(folder: Path) -> NDArray[np.uint8] | None:
+    """The heat map of a running experiment's last cycle as pixels, uint8 [H, W, 3].
+
+    Returns:
+        None if its proposals were not recorded.
+
+    Raises:
+        UnreadableRun: if the folder is none of a run.
+    """
+    run = read_run(folder)[0]
+    shares = run.shares(run.cycles[-1]) if run.cycles else None
+    if shares is None:
+        return None
+    with rc_context(SETTINGS):
+        drawn = share_map(shares)
+        figure = Figure(figsize=SINGLE, layout="constrained")
+        _draw_maps(figure, [axes_of(figure)], [drawn], run, drawn.max())
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Column) -> None:
+    stages = sorted({round(i) for i in np.linspace(0, len(shares) - 1, STAGES)})
+    row = figure.subplots(1, len(stages), squeeze=False, sharey=True)[0]
+    _draw_maps(figure, list(row), [shares[i] for i in stages], group.runs[0], shares.max())
+    for axes, stage in zip(row, stages, strict=True):
+        axes.set_title(f"update {updates[stage]:.0f}", fontsize=9)
+    figure.suptitle(group.label, fontsize=10, x=0.01, ha="left")
+
+
+def _draw_maps(
+    figure: FigureBase, row: Sequence[Axes], shares: Sequence[Column], run: Run, largest: float
+) -> None:
+    """Maps side by side with one bar of colours: white is even, orange more, purple less."""
+    even = 1 / shares[0].size
+    largest = max(largest, 2 * even)
+    *above, (across, columns) = list(run.task.space.items())[:2]
+    for axes, share in zip(row, shares, strict=True):
+        mesh = axes.pcolormesh(share, cmap="PuOr_r", norm=TwoSlopeNorm(even, 0, largest))
+        axes.set_xticks(*_ticks(columns))
+        axes.set_xlabel(across, fontsize=8)
+        axes.set_yticks([])
+        for name, values in above:
+            axes.set_yticks(*_ticks(values))
+            axes.set_ylabel(name if axes is row[0] else "", fontsize=8)
+        axes.tick_params(labelsize=7, length=0)
+        axes.grid(visible=False)
+    bar = figure.colorbar(mesh, ax=list(row), format=lambda value, _: f"{value:.1%}")
+    bar.set_ticks([0, even, largest])
+    bar.set_label("share of proposals", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:
+    """Places and texts of an axis' values, or of some of them where they are many."""
+    step = -(-len(values) // MOST_TICKS)
+    return np.arange(0.5, len(values), step), [f"{value:g}" for value in values[::step]]
+
+
+def _histograms(group: Group) -> tuple[Column, Column] | None:
+    """Shares of proposals by cycle, [cycles, rows, columns], mean over the runs."""
+    by_updates: dict[float, list[Column]] = {}
+    for run in group.logs:
+        for cycle in run.cycles:
+            shares = group.runs[0].shares(cycle)
+            if shares is not None:
+                by_updates.setdefault(number(cycle["updates"]), []).append(share_map(shares))
+    if not by_updates:
+        return None
+    updates = sorted(by_updates)
+    return np.array(updates), np.array([np.mean(by_updates[u], 0) for u in updates])
