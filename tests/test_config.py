@@ -351,7 +351,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
-        "compute.workers=17 must be at least 1 and at most 16, the copies that they share",
+        "compute.workers=17: must be at least 1 and at most 16, the replicas that they share",
     ),
     (
         ["+method=target", "compute.collector=ray"],
