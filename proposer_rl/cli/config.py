@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -187,23 +187,9 @@ def saved_config(folder: Path) -> RunConfig:
     values = stored_config(file)
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _checked({**_as_today(values), **free})
+        return _checked({**values, **free})
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
-
-
-def _as_today(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run of any version; what only another version has does not count."""
-    absent: dict[str, Any] = {"filter": None, "hand_designed": {"distributions": [], "until": []}}
-    known = {field.name for field in fields(RunConfig)}
-    shared = {key: value for key, value in values.items() if key in known}
-    # Our tasks' modules have moved; their classes have kept their names.
-    target, files = shared["task"]["_target_"], (CONFIG_FOLDER / "task").glob("*.yaml")
-    ours = [OmegaConf.select(OmegaConf.load(file), "task._target_") for file in files]
-    if target.startswith("proposer_rl."):
-        today = {str(name).rpartition(".")[2]: name for name in ours}
-        target = today.get(target.rpartition(".")[2], target)
-    return {**absent, **shared, "task": {**shared["task"], "_target_": target}}
 
 
 def stored_config(file: Path) -> Any:
