@@ -105,7 +105,7 @@ def meta_environment(copies: int = 4, updates: int = 20) -> SolverTrainingEnv:
 
 
 def main() -> None:
-    """What a meta-episode is worth with all classes alike, and with the first one alone."""
+    """The reward of a meta-episode with all classes alike, and with the first one alone."""
     env = meta_environment()
     env.fork(env.solvers.snapshot()[0], Streams(0))
     for name, number in (("all classes alike", 0.0), ("the first class above all", -20.0)):

@@ -25,7 +25,7 @@ from proposer_rl.tasks.mazes import planes
 
 
 class Iterated(nn.Module):
-    """A 3x3 convolution that is applied ``steps`` times, each time with a look at the maze."""
+    """A 3x3 convolution that is applied ``steps`` times, each time beside the maze."""
 
     def __init__(self, width: int = 24, steps: int = 8) -> None:
         super().__init__()

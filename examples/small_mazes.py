@@ -51,7 +51,7 @@ def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
 
 
 def proposer_settings() -> ProposerSettings:
-    """A Proposer that learns from four copies of the Solver, trained for a cycle."""
+    """A Proposer that learns from four replicas of the Solver, trained for a cycle."""
     return ProposerSettings(
         rollouts=4,
         meta_episode_length=CYCLE,

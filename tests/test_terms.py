@@ -34,6 +34,8 @@ RETIRED = {
     r"\bgets? one line\b": "fails fast, listing the valid keys",
 }
 
+READS_OLD_RUNS = "config.py"  # has the names that settings had in them
+
 
 def pages() -> Iterator[tuple[str, str]]:
     """README and docs."""
@@ -43,15 +45,17 @@ def pages() -> Iterator[tuple[str, str]]:
 
 def package() -> Iterator[tuple[str, str]]:
     """Docstrings and string constants of the code, and comments of settings (``--help``)."""
-    for folder in ("proposer_rl", "research"):
+    for folder in ("proposer_rl", "research", "examples"):
         for file in sorted((ROOT / folder).rglob("*.py")):
             tree = ast.parse(file.read_text(encoding="utf-8"))
             docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
             for node in ast.walk(tree):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    if file.name == READS_OLD_RUNS and node.value.isidentifier():
+                        continue
                     text = node.value if node in docstrings else node.value.lstrip(". ")
                     yield f"{file.relative_to(ROOT)}:{node.lineno}", text
-    for file in sorted((ROOT / "conf").rglob("*.yaml")):
+    for file in sorted([*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.yaml")]):
         for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
             yield f"{file.relative_to(ROOT)}:{number}", line.partition("#")[2].lstrip(". ")
 
