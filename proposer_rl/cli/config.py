@@ -189,7 +189,9 @@ def saved_config(folder: Path) -> RunConfig:
     try:
         return _checked({**values, **free})
     except (ValueError, TypeError, AttributeError, KeyError) as error:
-        raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
+        raise ConfigError(
+            f"{file}: does not hold the settings of a run of this version: {error}"
+        ) from error
 
 
 def stored_config(file: Path) -> Any:
