@@ -23,7 +23,13 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import build, parts
-from proposer_rl.cli.config import CONFIG_FOLDER, methods, read_config
+from proposer_rl.cli.config import (
+    CONFIG_FOLDER,
+    ConfigError,
+    methods,
+    read_config,
+    saved_config,
+)
 from proposer_rl.cli.errors import BAD_INPUT, UNFORESEEN, exit_code, lacks_memory, one_line
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
@@ -525,6 +531,9 @@ def test_a_resumed_run_with_other_settings_is_refused(finished: Path, train, cap
 def test_a_run_of_an_earlier_version_does_not_go_on(finished: Path, train, capsys) -> None:
     file = copy_of(finished) / "config.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "lifetimes": 1}))
+    with pytest.raises(ConfigError, match=r"of this version: lifetimes: unknown") as read:
+        saved_config(Path("run"))
+    assert exit_code(read.value) == BAD_INPUT and "\n" not in str(read.value)
     line = refused(train, capsys)
     assert "begun by another version, which had lifetimes" in line
 
