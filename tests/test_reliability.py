@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1, SIGUSR2
+from signal import SIGINT, SIGKILL, SIGTERM, SIGUSR1
 
 import pytest
 
@@ -27,6 +28,25 @@ def whole(processes: Processes, tmp_path_factory: pytest.TempPathFactory) -> tup
     return folder, ended
 
 
+@pytest.fixture(scope="module")
+def killed(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A run that was killed after its first checkpoint."""
+    folder = tmp_path_factory.mktemp("killed")
+    ended = processes(
+        *TRAIN, f"hydra.run.dir={folder}", signal_at={nth(whole[1].writes, ROW, 2): int(SIGKILL)}
+    )
+    assert ended.code == -SIGKILL
+    return folder
+
+
+@pytest.fixture
+def run(killed: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(killed, tmp_path, dirs_exist_ok=True))
+
+
 def nth(writes: list[str], name: str, n: int) -> int:
     return [i for i, write in enumerate(writes) if write == name][n]
 
@@ -35,7 +55,7 @@ def checkpoints(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (folder / "checkpoints").glob("step_*.pt")}
 
 
-@pytest.mark.parametrize("signum", [SIGINT, SIGTERM, SIGHUP, SIGUSR1, SIGUSR2])
+@pytest.mark.parametrize("signum", [SIGINT, SIGTERM, SIGUSR1])
 def test_a_signal_saves_and_ends_and_the_same_command_goes_on(
     signum: int, whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
 ) -> None:
@@ -105,58 +125,51 @@ def test_a_folder_in_use_is_refused_naming_the_holder(processes: Processes, tmp_
 
 
 def test_the_lock_of_a_dead_process_blocks_nobody(
-    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+    whole: tuple[Path, Ended], processes: Processes, run: Path
 ) -> None:
-    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
-    killed = processes(*command, signal_at={nth(whole[1].writes, ROW, 2): int(SIGKILL)})
-    assert killed.code == -SIGKILL
-    holder = json.loads((tmp_path / ".holder.json").read_text())
+    holder = json.loads((run / ".holder.json").read_text())
     with pytest.raises(ProcessLookupError):
         os.kill(holder["process"], 0)
-    assert processes(*command).code == 0
-    assert_same_run(whole[0], tmp_path)
+    assert processes(*TRAIN, f"hydra.run.dir={run}").code == 0
+    assert_same_run(whole[0], run)
 
 
 def test_a_full_disk_ends_the_run_and_leaves_the_checkpoint_before(
-    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+    whole: tuple[Path, Ended], processes: Processes, run: Path
 ) -> None:
-    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
-    row = nth(whole[1].writes, ROW, 2)
-    assert processes(*command, signal_at={row: int(SIGKILL)}).code == -SIGKILL
-    before = checkpoints(tmp_path)
+    command = [*TRAIN, f"hydra.run.dir={run}"]
+    before = checkpoints(run)
     assert len(before) == 1
     full = processes(*command, largest_file=20_000)
     assert full.code == 4
     assert full.output.strip().splitlines() == [
-        f"error: cannot write {tmp_path}/checkpoints/step_000000002.pt: File too large"
+        f"error: cannot write {run}/checkpoints/step_000000002.pt: File too large"
     ]
-    assert checkpoints(tmp_path) == before
+    assert checkpoints(run) == before
     assert processes(*command).code == 0
-    assert_same_run(whole[0], tmp_path)
+    assert_same_run(whole[0], run)
 
 
 @pytest.mark.parametrize("sealed", [".", "checkpoints"])
 def test_a_folder_that_may_not_be_written_to(
-    sealed: str, whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+    sealed: str, whole: tuple[Path, Ended], processes: Processes, run: Path
 ) -> None:
-    command = [*TRAIN, f"hydra.run.dir={tmp_path}"]
-    row = nth(whole[1].writes, ROW, 2)
-    assert processes(*command, signal_at={row: int(SIGKILL)}).code == -SIGKILL
-    before = checkpoints(tmp_path)
+    command = [*TRAIN, f"hydra.run.dir={run}"]
+    before = checkpoints(run)
     # A folder that is left as it is may still hold files that can be written to.
-    (tmp_path / ".hydra" / "config.yaml").chmod(0o444)
-    (tmp_path / sealed).chmod(0o555)
+    (run / ".hydra" / "config.yaml").chmod(0o444)
+    (run / sealed).chmod(0o555)
     try:
         refused = processes(*command, as_anyone=True)
     finally:
-        (tmp_path / sealed).chmod(0o755)
-        (tmp_path / ".hydra" / "config.yaml").chmod(0o644)
+        (run / sealed).chmod(0o755)
+        (run / ".hydra" / "config.yaml").chmod(0o644)
     assert refused.code == 4
     assert refused.output.startswith("error: cannot ") and "Permission denied" in refused.output
     assert len(refused.output.strip().splitlines()) == 1
-    assert checkpoints(tmp_path) == before
+    assert checkpoints(run) == before
     assert processes(*command).code == 0
-    assert_same_run(whole[0], tmp_path)
+    assert_same_run(whole[0], run)
 
 
 def test_no_permission_to_make_the_folder(processes: Processes, tmp_path: Path) -> None:
