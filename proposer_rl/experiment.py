@@ -26,7 +26,7 @@ from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ScheduleSettings
+from proposer_rl.settings import ArgumentError, ScheduleSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -377,13 +377,13 @@ def check_headline(task: Task, schedule: ScheduleSettings) -> None:
     """Refuse to sum runs up by what is not measured, or not reached.
 
     Raises:
-        ValueError: if the headline is none of the task's metrics, or a rate that is to reach
+        ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach
             what no rate can.
     """
     headline, threshold, known = schedule.headline, schedule.threshold, list(task.metrics)
     if headline not in known:
-        raise ValueError(f"schedule.headline={headline!r}: must be one of {known}")
+        raise ArgumentError(f"headline={headline!r}: must be one of {known}")
     if not can_reach(headline, threshold):
-        raise ValueError(
-            f"schedule.threshold={threshold:g}: must be above 0 and at most 1, as {headline} is"
+        raise ArgumentError(
+            f"threshold={threshold:g}: must be above 0 and at most 1, as {headline} is"
         )

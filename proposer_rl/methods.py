@@ -410,7 +410,7 @@ def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
         ValueError: if the checkpoint holds no such Proposer.
         CheckpointError: if it cannot be read.
     """
-    learnt = _curriculum_state(Path(checkpoint))
+    learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
     try:
         observed = [name for name in learnt["observed"] if name != "probes"]
         load_agent(agent, TensorDict(learnt["proposer"]))
@@ -423,6 +423,12 @@ def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
             f"proposer.observes={list(observes)}: the Proposer of checkpoint={checkpoint} has "
             f"learnt with {observed}"
         )
+
+
+def _with_proposer(state: State) -> State:
+    """The state of the part that has a Proposer, where curricula hold others, as filtering does."""
+    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
+    return state if "proposer" in state else next(filter(None, inner), {})
 
 
 def _curriculum_state(path: Path) -> State:

@@ -334,7 +334,7 @@ def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
 
 
 def test_a_headline_that_nobody_measures_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"schedule.headline='fun': must be one of \['id_success'"):
+    with pytest.raises(ValueError, match=r"^headline='fun': must be one of \['id_success'"):
         experiment(tmp_path, 0, headline="fun")
 
 

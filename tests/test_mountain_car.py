@@ -54,7 +54,8 @@ def test_it_trains_is_killed_goes_on_and_is_looked_at(
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     page = re.sub(r'<script.*?</script>|base64,[^"]*', "", page, flags=re.DOTALL)  # what is packed
     assert "mountain cars" in page and "maze" not in page.casefold()
-    for figure, heading in (("levels", "Cars along training"), ("samples", "Sample cars")):
+    headings = {"levels": "Cars of that batch", "samples": "Samples: what is measured"}
+    for figure, heading in headings.items():
         assert heading in page
         file = tmp_path / "report" / "figures" / f"{figure}.png"
         drawn = np.asarray(Image.open(file).convert("RGB")).astype(int)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -52,7 +53,8 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     try:
         task = make_task(config)
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-        check_headline(task, config.schedule)
+        with _key("schedule"):
+            check_headline(task, config.schedule)
         curriculum = _curriculum(config, task, signals, status)
         try:
             require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
@@ -93,6 +95,15 @@ def build(
     )
 
 
+@contextmanager
+def _key(name: str) -> Iterator[None]:
+    """Put a key of the configuration before what is said of one of its arguments."""
+    try:
+        yield
+    except ArgumentError as error:
+        raise ConfigError(f"{name}.{one_line(error)}") from error
+
+
 def make_task(config: RunConfig) -> Task:
     """The task of a run, on its device and with its number of threads.
 
@@ -126,7 +137,7 @@ def _curriculum(
 ) -> Curriculum:
     def tell(done: int) -> None:
         if status is not None:
-            status.tick("training the copies", done)
+            status.tick("training the replicas", done)
 
     def on_update(done: int) -> None:
         tell(done)
@@ -136,9 +147,8 @@ def _curriculum(
         task, config.proposer, config.seeds, on_update, _workers(config, task, tell)
     )
     try:
-        curriculum = curriculum_maker(config.curriculum)(components)
-    except ArgumentError as error:
-        raise ConfigError(f"curriculum.{one_line(error)}") from error
+        with _key("curriculum"):
+            curriculum = curriculum_maker(config.curriculum)(components)
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:
@@ -173,7 +183,7 @@ def _check_cycle(config: RunConfig) -> None:
 
 
 def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
-    """Where the copies are trained; None for this process.
+    """Where the replicas are trained; None for this process.
 
     Raises:
         ConfigError: for workers that there are not, that would have nothing to do, or that cannot
@@ -200,7 +210,8 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
     on_gpus = task.device.type == "cuda"
     available = torch.cuda.device_count() if on_gpus else available_cores()
     count = compute.workers or min(copies, available)
-    shares(copies, count)
+    with _key("compute"):
+        shares(copies, count)
     devices = compute.worker_devices or _devices(compute, task.device)
     if compute.collector == "multiprocess":
         devices = [str(_device(name, "worker_devices")) for name in devices]

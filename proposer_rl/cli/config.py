@@ -44,13 +44,6 @@ OmegaConf.register_new_resolver(
 # No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
 LARGEST = 10**9
 LARGEST_FILE = 10**6
-# Of runs of earlier versions, whose folders stay readable.
-RENAMED, GONE = {"hand_made": "hand_designed"}, ("lifetimes",)
-MOVED = {
-    "proposer_rl.mazes.view.": "proposer_rl.tasks.view_mazes.",
-    "proposer_rl.mazes.": "proposer_rl.tasks.mazes.",
-    "proposer_rl.gymnasium_task.": "proposer_rl.tasks.gymnasium.",
-}
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
 
@@ -72,7 +65,7 @@ class RunConfig:
     scale: str
     ablation: str
     curriculum: dict[str, Any]
-    filter: FilterSettings | None = None
+    filter: FilterSettings | None
     task: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]
@@ -194,19 +187,9 @@ def saved_config(folder: Path) -> RunConfig:
     values = stored_config(file)
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _checked({**_as_today(values), **free})
+        return _checked({**values, **free})
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ConfigError(f"{file}: does not hold the settings of a run: {error}") from error
-
-
-def _as_today(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run of any version, under the names that they have today."""
-    named = {RENAMED.get(key, key): value for key, value in values.items() if key not in GONE}
-    target = named["task"]["_target_"]
-    before = next((moved for moved in MOVED if target.startswith(moved)), None)
-    if before is not None:
-        named["task"] = {**named["task"], "_target_": target.replace(before, MOVED[before], 1)}
-    return named
 
 
 def stored_config(file: Path) -> Any:

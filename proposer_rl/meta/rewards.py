@@ -92,8 +92,8 @@ def log_success(performance: TensorDictBase) -> Tensor:
     """
     if "success" not in performance.keys():
         raise NoSuccessError(
-            "log_success: this task tells no success, only the return. A Proposer's reward: give "
-            "curriculum.reward._target_=proposer_rl.meta.rewards.performance_gain and "
-            "proposer.observes=[return]; first-order gain: curriculum.measure=return"
+            "log_success: this task tells no success, only the return. For a Proposer take the "
+            "reward proposer_rl.meta.rewards.performance_gain and observes=[return], for "
+            "first-order gain measure=return"
         )
     return (performance["success"] + LEAST_SUCCESS).log()

@@ -115,7 +115,7 @@
   const drawStage = (parts, data, found, number) => {
     const stage = found.stages[number], [x, y] = found.curve, [rows, columns] = data.stages.axes.length > 1
       ? data.stages.axes : [null, data.stages.axes[0]];
-    const reached = y[x.indexOf(stage.updates)] ?? null;
+    const reached = y[x.filter((updates) => updates <= stage.updates).length - 1] ?? null;
     parts.levels.parentElement.hidden = !found.stages.some((each) => each.levels.length);
     parts.moment.textContent = `update ${stage.updates}: ${short(reached)}`;
     parts.levels.replaceChildren(...stage.levels.map((level, i) => {

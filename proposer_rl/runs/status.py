@@ -33,7 +33,7 @@ class Activity(NamedTuple):
     at_least: bool
 
     def text(self) -> str:
-        """As in ``training the copies 37/100, about 5 h left``."""
+        """As in ``training the replicas 37/100, about 5 h left``."""
         parts = [f"{self.doing} {self.done}/{self.of}" if self.of else self.doing]
         if self.seconds_left is not None:
             about = "at least" if self.at_least else "about"

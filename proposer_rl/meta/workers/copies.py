@@ -29,6 +29,7 @@ from proposer_rl.meta.workers.engines import (
     stop,
 )
 from proposer_rl.meta.workers.remote import MakeEnv, WorkerPolicy, make_worker_env
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 
 ATTEMPTS = 3
@@ -164,12 +165,12 @@ def shares(copies: int, workers: int) -> list[range]:
     takes no longer for it, and TorchRL's collectors want batches of one shape.
 
     Raises:
-        ValueError: for more workers than replicas, or none.
+        ArgumentError: for more workers than replicas, or none.
     """
     if not 1 <= workers <= copies:
-        raise ValueError(
-            f"compute.workers={workers} must be at least 1 and at most {copies}, the copies that "
-            "they share (proposer.rollouts)"
+        raise ArgumentError(
+            f"workers={workers}: must be at least 1 and at most {copies}, the replicas that they "
+            "share"
         )
     each = -(-copies // workers)
     starts = [min(worker * each, copies - each) for worker in range(workers)]

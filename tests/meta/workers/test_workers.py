@@ -126,11 +126,11 @@ def test_shares_are_all_copies_in_ranges_of_one_length(copies: int) -> None:
         assert {copy for part in parts for copy in part} == set(range(copies))
         assert len(parts) == count and {len(part) for part in parts} == {-(-copies // count)}
     for count in (0, copies + 1):
-        message = f"compute.workers={count} must be at least 1 and at most {copies}"
+        message = f"workers={count}: must be at least 1 and at most {copies}"
         with pytest.raises(ValueError, match=message):
             shares(copies, count)
 
 
 def test_no_more_workers_than_copies() -> None:
-    with pytest.raises(ValueError, match=r"compute.workers=4 must be at least 1 and at most 3"):
+    with pytest.raises(ValueError, match=r"workers=4: must be at least 1 and at most 3"):
         make(workers("multiprocess", COPIES + 1))

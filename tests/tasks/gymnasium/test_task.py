@@ -23,8 +23,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import pictures
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
 from tests.tasks.gymnasium.toys import PARAMETERS, TINY, Walk, walk_task
-from tests.test_docs import TRAIN
-from tests.test_readme import ROOT, write_files
+from tests.test_readme import ROOT, commands, write_files
 from tests.tiny import composed
 
 NO_BOX2D = pytest.mark.skipif(
@@ -276,9 +275,10 @@ def test_curricula_run_from_the_command_line(method: str, train: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_folder")
 def test_the_file_that_the_page_shows_is_all_that_is_needed(train: Any) -> None:
-    (command,) = [call for call in TRAIN if "task=hill" in call]
-    write_files((ROOT / "docs/how_to/gymnasium_environment.md").read_text(), Path())
-    assert train(*command, *TINY, "hydra.run.dir=run") == 0
+    page = (ROOT / "docs/how_to/gymnasium_environment.md").read_text(encoding="utf-8")
+    write_files(page, Path())
+    _, *words = next(words for words in commands(page) if "task=hill" in words)
+    assert train(*words, *TINY, "hydra.run.dir=run") == 0
     told = json.loads(Path("run/run.json").read_text())["task"]
     assert told["title"] == "MountainCar-v0"
     assert told["space"] == {
