@@ -48,7 +48,6 @@ autosummary_ignore_module_all = True  # a name is documented where it is defined
 autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-autodoc_preserve_defaults = True
 maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -147,7 +146,7 @@ def resolve(
     What another package defines, or what has no docstring of its own, stays text. A name that means
     nothing is left to Sphinx, which warns.
     """
-    target = node["reftarget"]
+    target = re.sub(r"^pd\.", "pandas.", node["reftarget"])  # which only type checkers import
     if node["refdomain"] != "py":
         return None
     if not re.fullmatch(r"[\w.]+", target):

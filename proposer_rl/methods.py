@@ -150,7 +150,7 @@ def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curr
     def factory(run: Components, /, **numbers: Any) -> Curriculum:
         return make(*(getattr(run.task, part) for part in parts), **numbers)
 
-    factory.__doc__ = make.__doc__
+    factory.__doc__ = f"Make a :class:`~{make.__module__}.{make.__qualname__}` for the run's task."
     return factory
 
 

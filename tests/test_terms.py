@@ -34,8 +34,6 @@ RETIRED = {
     r"\bgets? one line\b": "fails fast, listing the valid keys",
 }
 
-READS_OLD_RUNS = "config.py"  # has the names that settings had in them
-
 
 def pages() -> Iterator[tuple[str, str]]:
     """README and docs."""
@@ -51,8 +49,6 @@ def package() -> Iterator[tuple[str, str]]:
             docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
             for node in ast.walk(tree):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                    if file.name == READS_OLD_RUNS and node.value.isidentifier():
-                        continue
                     text = node.value if node in docstrings else node.value.lstrip(". ")
                     yield f"{file.relative_to(ROOT)}:{node.lineno}", text
     for file in sorted([*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.yaml")]):

@@ -181,7 +181,7 @@ class Scorer:
 
         Args:
             student: whose critic and discount count.
-            rollouts: with values, as :meth:`Student.play` returns them.
+            rollouts: with values, as ``Student.play`` returns them.
             best: the highest returns seen on these levels before, float [K, n]; minus infinity
                 where there was none.
             solved: whether an episode was a success before, bool [K, n].
