@@ -15,8 +15,6 @@ from typing import Any, Literal
 
 import yaml
 
-from proposer_rl.settings import ArgumentError
-
 PACKAGE = Path(__file__).resolve().parent
 # In a wheel the configuration lies in the package, in a checkout beside it.
 CONFIG_FOLDER = next(
@@ -79,7 +77,7 @@ def own_recipe(
     """
     name = f"{make.__module__}.{make.__qualname__}"
     if make.__module__ == "__main__" or "<" in name:
-        raise ArgumentError(
+        raise _refusal(
             f"make={name}: must be importable, as a class or function of a module is, so that "
             "watch, eval and play can make it again"
         )
@@ -113,10 +111,10 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     def make(**given: Any) -> Recipe:
         unknown = [key for key in given if key not in settings]
         if unknown:
-            raise ArgumentError(f"{unknown[0]}: unknown; there are: {', '.join(settings)}")
+            raise _refusal(f"{unknown[0]}: unknown; there are: {', '.join(settings)}")
         for key, value in settings.items():
             if value == MISSING and key not in given:
-                raise ArgumentError(f"{key}: missing")
+                raise _refusal(f"{key}: missing")
         return Recipe(group, name, given)
 
     make.__name__ = make.__qualname__ = name
@@ -145,12 +143,12 @@ def override_value(value: Any) -> str:
         return "{" + ", ".join(f"{_key(k)}: {override_value(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(override_value, value)) + "]"
-    raise ArgumentError(f"{value!r}: must be a number, a text, a list or a mapping of such")
+    raise _refusal(f"{value!r}: must be a number, a text, a list or a mapping of such")
 
 
 def _key(key: Any) -> str:
     if not isinstance(key, str) or not KEY.fullmatch(key) or key.casefold() in CONSTANTS:
-        raise ArgumentError(
+        raise _refusal(
             f"{key!r}: a name must begin with a letter, and have letters, digits, underscores, "
             "hyphens and single spaces alone"
         )
@@ -173,3 +171,9 @@ def _about(group: str, name: str) -> str:
     text = (CONFIG_FOLDER / group / f"{name}.yaml").read_text(encoding="utf-8")
     lines = (line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
     return next(line for line in lines if not line.startswith("@package"))
+
+
+def _refusal(line: str) -> ValueError:
+    from proposer_rl.settings import ArgumentError  # help needs none, and it takes time to import
+
+    return ArgumentError(line)

@@ -41,7 +41,7 @@ class SkillLadder:
             batch_size=torch.Size([copies, problems]),
             set_levels=self._set_levels,
         )
-        self.settings = SimpleNamespace(horizon=1)
+        self.copies, self.horizon = copies, 1
 
     def _set_levels(self, levels: Tensor) -> None:
         self._levels = levels

@@ -236,12 +236,9 @@ def test_draws_beyond_the_box_are_clipped_and_told() -> None:
     task = Scripted(torch.zeros(1, 5), batch_size=5000)
     curriculum = small(task, exploration=0.3)
     state = curriculum.state_dict()
-    state["mixtures"] = [
-        {
-            "means": torch.tensor([[0.9, 0.5]]).double(),
-            "covariances": torch.diag(torch.tensor([0.01, 0.2])).double().unsqueeze(0),
-        }
-    ]
+    means = torch.tensor([[0.9, 0.5]]).double()
+    covariances = torch.diag(torch.tensor([0.01, 0.2])).double().unsqueeze(0)
+    state["mixtures"] = [(means, covariances)]
     curriculum.load_state_dict(state)
     step(curriculum, task, 0)
     told = json.loads(json.dumps(curriculum.log()))

@@ -106,7 +106,7 @@ def test_folders_of_something_else_are_refused(tmp_path: Path, run: Path, capsys
         assert call(look, str(tmp_path), str(run)) == 2
         assert message in capsys.readouterr().err
     settings = json.loads((run / "config.json").read_text())
-    for change, message in (({"seed": -1}, "seed=-1"), ({"surprise": 1}, "surprise: there is no")):
+    for change, message in (({"seed": -1}, "seed=-1"), ({"surprise": 1}, "surprise: unknown")):
         (tmp_path / "config.json").write_text(json.dumps({**settings, **change}))
         assert call(look, str(tmp_path), str(run)) == 2
         assert message in capsys.readouterr().err
