@@ -221,7 +221,7 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Mapping[str, Any] | None = None) -> bool:
-        """Append what the curriculum tells of the cycle that has ended and of its improvement."""
+        """Append the log of the cycle that has ended, and the metrics of its improvement."""
         metrics = {**self.curriculum.log(), **(improved or {})}
         if not metrics:
             return False

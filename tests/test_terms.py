@@ -30,6 +30,7 @@ RETIRED = {
     r"\bwithout an end\b": "NaN or infinity",
     r"\bthe choice\b|\bunchosen\b|\+choose\b|\bchosen by default\b": "filtering, filtered",
     r"\ba look\b|\b(?:two|each|every|closer|one) looks?\b|\blooks? closely\b": "scoring pass",
+    r"\btells? of\b": "return metrics, metrics",
     r"\binterval tells\b": "CI over student seeds, one teacher",
     r"\bgets? one line\b": "fails fast, listing the valid keys",
 }

@@ -107,7 +107,7 @@ class _Recorded(BaseModel):
 
 
 def recorded_activity(folder: Path) -> Activity | None:
-    """What a run tells of itself; None where it is over, or that cannot be read."""
+    """The status file of a run; None where the run is over or the file cannot be read."""
     try:
         found = checked(_Recorded, small_json(folder / FILE, 2**12), FILE)
     except ValueError:

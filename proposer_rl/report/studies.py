@@ -140,7 +140,7 @@ class Study:
         return np.array(rows) if rows else None
 
     def tellers(self, group: Group, name: str) -> list[Run]:
-        """A group's runs of full length that tell of as many levels as the study's first."""
+        """A group's runs of full length that have as many levels as the study's first."""
         counts = [len(run.levels[name]) for run in self.runs if self._tells(run, name)]
         own = [run for run in group.runs if self._tells(run, name)]
         return [run for run in own if len(run.levels[name]) == counts[0]]

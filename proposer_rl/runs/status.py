@@ -57,7 +57,7 @@ class Status:
     none has begun, not at all: then it takes at least that long.
 
     Args:
-        parts: into how many parts a unit falls that tells of them by :meth:`tick`.
+        parts: number of parts of a unit that reports them by :meth:`tick`.
         clock: seconds.
     """
 
@@ -75,7 +75,7 @@ class Status:
 
     @contextmanager
     def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
-        """While a run goes on: tell of it in its folder, and call ``show`` as often."""
+        """While a run goes on, report it in its folder, and call ``show`` as often."""
         self._folder, self._show = folder, show
         try:
             yield
