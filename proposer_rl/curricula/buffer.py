@@ -12,7 +12,7 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 - ``filled`` bool: whether there is one; nothing else of an empty slot counts;
 - ``score`` float64; ``best`` float32, the highest return that was ever seen on the level, and
   ``solved`` bool, whether an episode there ever was a success;
-- ``reached`` float32, the return when the level was trained on last; NaN where it was not;
+- ``reached`` float32, the return when the level was trained on last; else minus infinity;
 - ``touched`` int64: the clock when it was drawn or scored last. A clock counts the levels that were
   drawn or scored; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
@@ -75,7 +75,7 @@ def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
             "filled": torch.zeros(shape, dtype=torch.bool),
             "score": torch.zeros(shape, dtype=torch.float64),
             "best": torch.full(shape, -torch.inf),
-            "reached": torch.full(shape, torch.nan),
+            "reached": torch.full(shape, -torch.inf),
             "solved": torch.zeros(shape, dtype=torch.bool),
             **{name: torch.zeros(shape, dtype=torch.int64) for name in numbers},
         },
@@ -194,7 +194,7 @@ def insert(
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
     keys = level_keys(new["level"])
-    none, unknown = torch.zeros_like(keys), torch.full(keys.shape, torch.nan)
+    none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
     buffer = buffer.clone()
     for copy in range(len(keys)) if wanted is None else wanted.nonzero().flatten().tolist():
         score, *seen = _of_equals(keys[copy], *(new[name][copy] for name in ("score", *SEEN)))

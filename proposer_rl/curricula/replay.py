@@ -175,8 +175,8 @@ class ReplayCurriculum(Curriculum):
             levels[~replayed] = self._fresh(count, streams, "new")[~replayed]
         each = replayed.unsqueeze(-1)
         known = {name: self.buffer[name].gather(1, slots) for name in (*SEEN, "key", "reached")}
-        filled = self.buffer["filled"]
-        mean = self.buffer["reached"].where(filled, torch.nan).nanmean(-1, keepdim=True)
+        reached = self.buffer["reached"]
+        mean = reached.where(reached.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return self._inbox.batch(
             levels.to(self._device),
             slot=slots,
@@ -184,7 +184,7 @@ class ReplayCurriculum(Curriculum):
             key=known["key"],
             best=known["best"].where(each, -torch.inf),
             solved=known["solved"] & each,
-            before=known["reached"].where(each, mean),
+            before=known["reached"].where(each, mean.nan_to_num(-torch.inf)),
         )
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
@@ -348,7 +348,7 @@ class ReplayCurriculum(Curriculum):
                 scored.score.where(there, -torch.inf),
                 scored.best.where(there, -torch.inf),
                 scored.solved & there,
-                None if reached is None else reached.where(there, torch.nan),
+                None if reached is None else reached.where(there, -torch.inf),
             )
             if self._co_learnability:
                 after = self._credit(old, after, slots, replayed)

@@ -175,14 +175,14 @@ class Scorer:
             outcome: with a ``score``, a ``rollout``, or neither.
             best: see :meth:`of_rollouts`.
             solved: the same.
-            before: the return of each level when it was trained on before, float [K, n]; NaN where
-                nothing is known.
+            before: the return of each level when it was trained on before, float [K, n]; minus
+                infinity where nothing is known.
 
         Raises:
             ValueError: if the outcome lacks what :attr:`reads` names.
         """
         for entry in self.reads:
-            if not {entry, "rollout", "score"} & {*outcome.keys()}:
+            if not {entry, "rollout"} & {*outcome.keys()}:
                 raise ValueError(f"score={self._name}: the outcome has no {entry}")
         if "rollout" in outcome.keys():
             scored = self.of_rollouts(student, [outcome["rollout"]], best, solved)
@@ -259,8 +259,7 @@ class Scorer:
                     scored.append(self.of_rollouts(student, played, *new))
                 else:
                     mean = torch.stack(played).mean(0)
-                    unknown = torch.full_like(new[0], torch.nan)
-                    scored.append(self.of_outcome(student, mean, *new, unknown))
+                    scored.append(self.of_outcome(student, mean, *new, new[0]))
             else:
                 with torch.no_grad():
                     score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
