@@ -54,7 +54,8 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     try:
         task = make_task(config)
         checked(TaskFacts, task.facts, "task")  # as the run's readers will
-        learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
+        with _key("solver.ppo"):
+            learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
         with _key("schedule"):
             check_headline(task, config.schedule)
         curriculum = _curriculum(config, task, signals, status)
