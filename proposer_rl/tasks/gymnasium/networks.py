@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from proposer_rl.models import orthogonal_
+from proposer_rl.models.stacked import StackedLinear
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
 
 Acts = spaces.Discrete | spaces.Box
@@ -34,6 +35,7 @@ class SolverNetwork(nn.Module):
         super().__init__()
         self._scale = settings.scale or (1 / 255 if seen.dtype == np.uint8 else 1.0)
         self._sides = len(seen.shape)
+        self.stackable = self._sides == 1
         self.convolutions = nn.Sequential()
         features = seen.shape
         if self._sides == 3:
@@ -58,7 +60,9 @@ class SolverNetwork(nn.Module):
             seen = self.convolutions(seen.flatten(0, -4).permute(0, 3, 1, 2)).unflatten(0, batch)
         logits, value = self.policy(seen), self.critic(seen)
         if self.log_scale is not None:
-            logits = torch.stack([logits, self.log_scale.expand_as(logits)], -1)
+            between = [1] * (logits.ndim - self.log_scale.ndim)
+            scale = self.log_scale.unflatten(-1, (*between, -1))  # with replicas [K, D]
+            logits = torch.stack([logits, scale.expand_as(logits)], -1)
         return logits, value
 
 
@@ -103,7 +107,9 @@ def _convolutions(channels: int, side: int, widths: list[int]) -> nn.Sequential:
 
 
 def _mlp(features: int, outputs: int, hidden: list[int], gain: float) -> MLP:
-    mlp = MLP(features, outputs, num_cells=hidden, activation_class=nn.Tanh)
+    mlp = MLP(
+        features, outputs, num_cells=hidden, activation_class=nn.Tanh, layer_class=StackedLinear
+    )
     orthogonal_(mlp)
     nn.init.orthogonal_(mlp[-1].weight, gain)
     return mlp
