@@ -438,12 +438,13 @@ class LoggerSettings:
 
     Attributes:
         type: ``csv`` for nowhere.
-        project, mode: of Weights & Biases.
+        project, mode: of Weights & Biases; None for what its own variables say, WANDB_PROJECT and
+            WANDB_MODE, or else ``proposer_rl`` and ``online``.
     """
 
     type: Literal["csv", "tensorboard", "wandb"]
-    project: str = "proposer_rl"
-    mode: Literal["online", "offline", "disabled"] = "online"
+    project: str | None = None
+    mode: Literal["online", "offline", "disabled"] | None = None
 
 
 @settings

@@ -153,7 +153,7 @@ def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, 
     assert train(*arguments) == 0
     shutil.rmtree("run/checkpoints")
     assert "ended after 6 updates and has no checkpoint to go on from" in refused(8)
-    monkeypatch.setattr("proposer_rl.cli.build.make_log", None)  # nothing is left to be logged
+    monkeypatch.setattr("proposer_rl.cli.run.logger", None)  # nothing is left to be logged
     assert train(*arguments) == 0
 
 

@@ -19,7 +19,7 @@ import torch
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.evaluate import evaluate, load
-from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
+from proposer_rl.cli.stored import stored_run
 from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.play.server import STATIC
 from proposer_rl.runs.folder import read_jsonl
@@ -204,10 +204,8 @@ def test_cars_are_looked_at_though_they_cannot_be_drawn(car_page: Page) -> None:
     assert told["board"] is None and told["task_levels"] == "cars"
     question = {"source": "distribution", "name": "all", "seed": 0, "checkpoint": 2, "solver": 0}
     drawn = asked(car_page, "levels", question)
-    run, state = read_checkpoint(car_page.run)
-    config = saved_config(run)
-    task = make_task(config)
-    agent = restored(task, config, state).agent
+    stored = stored_run(car_page.run)
+    task, agent = stored.task, stored.stage().learner.agent
     streams = Streams(0, "play", "all")
     levels = task.distributions["all"].sample(task.batch_size, streams.generator("levels"))
     with torch.no_grad():
