@@ -26,7 +26,7 @@ from typing import (
 )
 
 from annotated_types import Ge, Gt, Interval, Le, Len
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Discriminator, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 
 T = TypeVar("T")
@@ -200,11 +200,7 @@ def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
 
 
 def _first_line(error: ValidationError, name: str, value: Any) -> str:
-    errors = error.errors()
-    # Of a union pydantic tells what is wrong with every member; one of another kind is not meant.
-    others = [e["loc"][:-1] for e in errors if e["loc"][-1:] == ("kind",)]
-    meant = [e for e in errors if not any(e["loc"][: len(other)] == other for other in others)]
-    details = (meant or errors)[0]
+    details = error.errors()[0]
     # Where it stands in the value: a union's member is named in the place, too, and is no key.
     loc: list[int | str] = []
     folder = inner = value
@@ -217,9 +213,6 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
         loc.append(part)
     key = ".".join(map(str, [name, *loc]))
     message = details["msg"].removeprefix("Value error, ")
-    if not meant:  # of a kind that there is not: the members' kinds are what there is
-        kinds = {str(e["ctx"]["expected"]) for e in errors if e["loc"][-1:] == ("kind",)}
-        message = f"input should be one of {', '.join(sorted(kinds))}"
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = ", ".join(sorted(map(str, folder.keys() - {loc[-1]})))
         return f"{key}: unknown" + (f"; there are: {known}" if known else "")
@@ -348,7 +341,7 @@ class ProposerSettings:
     observes: list[Literal["return", "log_success", "progress"]] = field(
         default_factory=lambda: ["log_success", "progress"]
     )
-    action: MixtureSettings | ProblemSettings = MixtureSettings()
+    action: Annotated[MixtureSettings | ProblemSettings, Discriminator("kind")] = MixtureSettings()
     own_action: Literal["sample", "mode"] = "mode"
     advance: Literal["train", "best", "random"] = "train"
     advantage: Literal["leave_one_out", "gae"] = "leave_one_out"

@@ -73,7 +73,7 @@ def test_a_run_ends_with_its_picture(train) -> None:
 @pytest.mark.parametrize(
     ("checkpoint", "said"),
     [
-        ("null", "checkpoint=: name a run's folder or a checkpoint that has a Proposer"),
+        ("null", "checkpoint=None: must name a run's folder or a checkpoint that has a Proposer"),
         ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
         (".", "checkpoint=.: the folder holds no checkpoints and no proposer.pt"),
     ],
@@ -89,7 +89,7 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt") == 0
     arguments = ["+method=frozen_proposer", *SMOKE, "checkpoint=learnt", "hydra.run.dir=run"]
     assert train(*arguments, "proposer.observes=[return,progress]") == 2
-    said = "the Proposer of checkpoint=learnt has learnt with ['log_success', 'progress']"
+    said = "checkpoint=learnt: its Proposer has learnt with observes=['log_success', 'progress']"
     assert said in capsys.readouterr().err and not Path("run").exists()
     assert train(*arguments, "schedule.updates=4") == 0
     # The checkpoint moves on, and the Proposer that this run began with does not.

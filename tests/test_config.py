@@ -173,7 +173,7 @@ WRONG = [
     ),
     ("seed=${nowhere}", "seed: Interpolation key 'nowhere' not found"),
     ("seed=???", "seed: missing"),
-    ("task.target=???", "task.target: missing"),
+    ("task.target=???", "Missing mandatory value: task.target"),
     ("task.maze=${task.nowhere}", "task.maze: Interpolation key 'task.nowhere' not found"),
     ("+proposer.ppo.horizon=3", "proposer.ppo.horizon: unknown; there are: adam_eps"),
     (

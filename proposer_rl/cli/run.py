@@ -19,6 +19,7 @@ from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.learning import DivergedError
+from proposer_rl.meta.workers import WorkersError
 from proposer_rl.report.pictures import draw_run
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
@@ -68,6 +69,8 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
         try:
             result = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin
+        except WorkersError as error:
+            raise WorkersError(f"compute.{error}") from error
         finally:
             made.curriculum.close()
     finals = [float(row[config.schedule.headline]) for row in result["final"]]

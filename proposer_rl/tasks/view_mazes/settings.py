@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Len
+from pydantic import Discriminator
 
 from proposer_rl.settings import settings
 
@@ -53,7 +54,9 @@ class RoomsSettings:
     kind: Literal["four_rooms"] = "four_rooms"
 
 
-DistributionSettings = ScatteredSettings | PerfectSettings | RoomsSettings
+DistributionSettings = Annotated[
+    ScatteredSettings | PerfectSettings | RoomsSettings, Discriminator("kind")
+]
 
 
 @settings
