@@ -13,7 +13,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.cli.config import LARGEST_FILE, ConfigError, RunConfig
 from proposer_rl.cli.errors import SIGNALLED, one_line
 from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
@@ -22,7 +22,7 @@ from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.report.pictures import draw_run
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
-from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
@@ -128,11 +128,12 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     wrong = f"schedule.updates={updates}: the run in {folder}"
     if not file.exists():
         latest = load_latest(checkpoints)
-        if latest is not None and (made := latest[1].get("updates", 0)) > updates:
+        made = 0 if latest is None else latest[1].get("updates")
+        if isinstance(made, int) and made > updates:
             raise ConfigError(f"{wrong} has made {made} updates already")
         return None
     try:
-        summary: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        summary: dict[str, Any] = json.loads(read_bounded(file, LARGEST_FILE))
         ended = int(summary["updates"])
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
