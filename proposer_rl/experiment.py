@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, arguments
+from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -36,6 +35,18 @@ Log = Callable[[str, Mapping[str, Any], int], None]
 
 RECORDED_LEVELS = 8
 MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
+
+
+@settings
+class _Counted:
+    """What a checkpoint, which may come from anybody, has counted."""
+
+    updates: Annotated[int, Ge(0)]
+    cycles: Annotated[int, Ge(0)]
+    curriculum_frames: Annotated[int, Ge(0)]
+    evaluations: Annotated[int, Ge(0)]
+    seconds: NotNegative
+    rows: dict[str, Annotated[int, Ge(0)]]
 
 
 class Experiment:
@@ -364,35 +375,17 @@ class Experiment:
 
     def _restore(self, state: State) -> None:
         length = self.schedule.cycle_length
-        read = arguments(_counters, {name: state[name] for name in _COUNTERS})
-        updates, cycles = read["updates"], read["cycles"]
+        read = _Counted(**{name: state[name] for name in _Counted.__annotations__})
+        updates, cycles = read.updates, read.cycles
         if not (cycles - 1) * length <= updates <= cycles * length:
             raise ValueError(f"cycles={cycles}, of {length} updates each, but updates={updates}")
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
         self.curriculum.load_state_dict(state["curriculum"])
         self.updates, self.cycles = updates, cycles
-        self.student.frames = read["curriculum_frames"]
-        self.student.evaluations = read["evaluations"]
-        self._seconds_before = read["seconds"]
+        self.student.frames, self.student.evaluations = read.curriculum_frames, read.evaluations
+        self._seconds_before = read.seconds
         self._started = time.monotonic()
         self._headline = [float(value) for value in state["headline"]]
-
-
-Natural = Annotated[int, Ge(0)]
-
-
-def _counters(
-    updates: Natural,
-    cycles: Natural,
-    curriculum_frames: Natural,
-    evaluations: Natural,
-    seconds: NotNegative,
-    rows: dict[str, Natural],
-) -> None:
-    """What a checkpoint counts, which may come from anybody."""
-
-
-_COUNTERS = tuple(inspect.signature(_counters).parameters)
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:

@@ -194,13 +194,12 @@ def read_bounded(path: Path, largest: int) -> bytes:
         StorageError: if it cannot be read.
     """
     with storage(path, "read"):
-        if not stat.S_ISREG(path.stat().st_mode):
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
             raise ValueError(f"{path}: is no plain file")
-        with open(path, "rb") as file:
-            content = file.read(largest + 1)
-    if len(content) > largest:
-        raise ValueError(f"{path}: is larger than {largest:,} bytes")
-    return content
+        if found.st_size > largest:
+            raise ValueError(f"{path}: is larger than {largest:,} bytes")
+        return path.read_bytes()
 
 
 @contextmanager
