@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -205,6 +206,29 @@ def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> No
     monkeypatch.setattr("proposer_rl.cli.run.train", broken)
     with pytest.raises(ValueError, match="a bug"):
         train("+method=target", *SMOKE, "hydra.run.dir=run")
+
+
+@pytest.mark.parametrize(
+    ("function", "place"),
+    [
+        ("hydra.core.utils._save_config", "run"),
+        ("proposer_rl.cli.run.draw_run", "run"),
+        ("logging.FileHandler._open", "run/train.log"),
+    ],
+)
+def test_a_disk_that_takes_no_more_is_named_with_its_folder(
+    function: str, place: str, train, monkeypatch, capsys
+) -> None:
+    """Whoever writes: Hydra, logging or matplotlib, which do not say where."""
+
+    def full(*_: object, **__: object) -> None:
+        named = [str(Path("run/train.log").absolute())] if place != "run" else []
+        raise OSError(errno.EFBIG, "File too large", *named)
+
+    monkeypatch.setattr(function, full)
+    assert train("+method=target", *FEW, "hydra.run.dir=run") == 4
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == f"error: cannot use {Path(place).absolute()}: File too large"
 
 
 def test_a_damaged_summary_is_named(train, capsys) -> None:

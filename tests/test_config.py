@@ -138,6 +138,7 @@ WRONG = [
         "task.maze.height=10000: input should be less than or equal to 1000",
     ),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
+    ("solver.ppo.horizon=1000000000", "horizon=1000000000: a rollout takes at least 1"),
     # one of a few
     ("compute.threads=5000", "compute.threads=5000: input should be less than or equal to 1024"),
     ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),

@@ -21,6 +21,7 @@ from proposer_rl.meta.workers import WorkerSettings, shares
 from proposer_rl.methods import Components, Workers, filtered
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
 from proposer_rl.settings import SolverSettings
@@ -53,6 +54,7 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
+    _check_memory(learner)
     with key("schedule"):
         check_headline(task, config.schedule)
     curriculum = _curriculum(config, task, signals, status)
@@ -98,6 +100,21 @@ def make_task(config: RunConfig) -> Task:
             task_maker(config.task), config.solver, context, compute.graphs, str(device)
         )
     return task
+
+
+def _check_memory(learner: PPO) -> None:
+    """Refuse a rollout that no memory holds: it is collected step by step, until that is full."""
+    levels = learner.agent.level_keys  # of which there is one for all steps
+    step = learner.env.fake_tensordict().exclude(*levels, *(("next", name) for name in levels))
+    taken, device = step.bytes() * learner.horizon, learner.env.device
+    there = memory()
+    if device is not None and device.type == "cuda":
+        there = torch.cuda.get_device_properties(device).total_memory
+    if taken > there:
+        raise ConfigError(
+            f"solver.ppo.horizon={learner.horizon}: a rollout takes at least {taken / 1e9:,.0f} GB "
+            f"of memory, there are {there / 1e9:,.0f}"
+        )
 
 
 def _made(
