@@ -50,15 +50,13 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     """
     require_logger(config.logger)
     task = make_task(config)
-    try:
+    with key("solver.ppo", other=""):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-    except ValueError as error:
-        raise ConfigError(one_line(error)) from error
     _check_memory(learner)
     with key("schedule"):
         check_headline(task, config.schedule)
     curriculum = _curriculum(config, task, signals, status)
-    with key("curriculum", ": "):
+    with key("curriculum", other="curriculum: "):
         require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
     return Made(task, learner, curriculum)
 
@@ -95,7 +93,7 @@ def make_task(config: RunConfig) -> Task:
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
     context = ComputeContext(device, config.precision, compute.cores)
-    with key("task"):
+    with key("task", other="task."):
         task: Task = _made(
             task_maker(config.task), config.solver, context, compute.graphs, str(device)
         )
@@ -139,7 +137,7 @@ def _curriculum(
 
     workers = _workers(config, task, tell)
     components = Components(task, config.proposer, config.seeds, on_update, workers)
-    with key("curriculum", ": "):
+    with key("curriculum", other="curriculum: "):
         curriculum = curriculum_maker(config.curriculum)(components)
         if not isinstance(curriculum, Curriculum):
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")

@@ -56,19 +56,23 @@ class ConfigError(ValueError):
 
 
 @contextmanager
-def key(name: str, separator: str = ".") -> Iterator[None]:
+def key(name: str, other: str = "") -> Iterator[None]:
     """Put a key of the configuration before what is said of the arguments that stand below it.
 
+    Args:
+        name: the key.
+        other: what comes before any other TypeError or ValueError.
+
     Raises:
-        ConfigError: in place of an ArgumentError; of another TypeError or ValueError, too.
+        ConfigError: in place of all of these.
     """
     try:
         yield
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:
-        between = "." if isinstance(error, ArgumentError) else separator
-        raise ConfigError(f"{name}{between}{one_line(error)}") from error
+        lead = f"{name}." if isinstance(error, ArgumentError) else other
+        raise ConfigError(f"{lead}{one_line(error)}") from error
 
 
 @settings

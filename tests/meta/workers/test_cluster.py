@@ -78,9 +78,7 @@ def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
     try:
         with (
             pytest.warns(RuntimeWarning, match=r"waiting: \d of 2 workers have begun after"),
-            pytest.raises(
-                WorkersError, match=r"begun after .* room for 1$"
-            ),
+            pytest.raises(WorkersError, match=r"begun after .* room for 1$"),
         ):
             cycles(*make(settings(cluster)))
         assert getsignal(SIGTERM) is ours
