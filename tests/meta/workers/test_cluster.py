@@ -34,7 +34,7 @@ def two_machines(cluster: Cluster) -> Iterator[None]:
     cluster.wait_for_nodes()
     yield
     for node in added:
-        if node in cluster.list_all_nodes:
+        if node in cluster.list_all_nodes():
             cluster.remove_node(node)
 
 
@@ -43,7 +43,7 @@ def settings(cluster: Cluster, cores: int = 1) -> WorkerSettings:
 
 
 def worker_machines(cluster: Cluster) -> list[Any]:
-    return [node for node in cluster.list_all_nodes if node is not cluster.head_node]
+    return [node for node in cluster.list_all_nodes() if node is not cluster.head_node]
 
 
 def test_machines_that_are_too_small_are_told_at_once(cluster: Cluster) -> None:
