@@ -44,6 +44,10 @@ NotNegative = Annotated[float, Ge(0)]
 """Zero, or a number above it."""
 
 
+BY_KIND = Discriminator("kind")
+"""Of a union of settings, each of which has an entry ``kind`` of its own."""
+
+
 class ArgumentError(ValueError):
     """An argument is not allowed: one line ``name=value: what is allowed``.
 
@@ -354,7 +358,7 @@ class ProposerSettings:
     observes: list[Literal["return", "log_success", "progress"]] = field(
         default_factory=lambda: ["log_success", "progress"]
     )
-    action: Annotated[MixtureSettings | ProblemSettings, Discriminator("kind")] = MixtureSettings()
+    action: Annotated[MixtureSettings | ProblemSettings, BY_KIND] = MixtureSettings()
     own_action: Literal["sample", "mode"] = "mode"
     advance: Literal["train", "best", "random"] = "train"
     advantage: Literal["leave_one_out", "gae"] = "leave_one_out"

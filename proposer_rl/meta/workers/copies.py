@@ -69,6 +69,7 @@ class CopiesInWorkers:
         every = [copy for share in self._shares for copy in share]
         self._first = [every.index(copy) for copy in range(self._env.batch_size[0])]
         self._collector: BaseCollector | None = None
+        self._losses = 0
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
         """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`.
@@ -85,6 +86,7 @@ class CopiesInWorkers:
             except WorkersError:
                 raise
             except lost(self._settings) as error:
+                self._losses += 1
                 self.close()
                 # A worker's error comes with its traceback before.
                 reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
@@ -124,7 +126,9 @@ class CopiesInWorkers:
         self, solver: TensorDictBase, streams: Streams
     ) -> tuple[Any, Sequence[str | None]]:
         """The batch of all workers, [W, k, T], and what diverged in each."""
-        self._collector = collector = self._collector or self._start()
+        collector = self._collector
+        if collector is None:
+            collector = self._collector = self._start()
         # One block of memory each: across processes, every tensor costs a file descriptor.
         origin = solver.cpu().consolidate()
         named = self._proposer.agent.named_parameters()
@@ -148,6 +152,7 @@ class CopiesInWorkers:
             [partial(WorkerPolicy, agent, horizon, shape, device) for _, device in placed],
             frames=len(self._shares[0]) * horizon,
             check=partial(self._env.on_update, 0),
+            patient=self._losses > 0,
         )
 
 

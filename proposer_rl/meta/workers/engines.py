@@ -57,6 +57,7 @@ def start(
     policies: list[Callable[[], Any]],
     frames: int,
     check: Callable[[], None] = lambda: None,
+    patient: bool = False,
 ) -> BaseCollector:
     """Start the workers.
 
@@ -66,6 +67,7 @@ def start(
         policies: the same.
         frames: that each worker collects in a batch.
         check: called while they are waited for; what it raises ends the wait.
+        patient: whether machines may come that are missing, as after one was lost.
 
     Raises:
         WorkersError: if there is no such cluster, it is too small, or its workers do not come up.
@@ -92,7 +94,7 @@ def start(
             )
         from torchrl.collectors.distributed import RayCollector
 
-        share = _cluster_share(settings, check)
+        share = _cluster_share(settings, check, patient)
         collector = RayCollector(
             environments,
             total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
@@ -106,7 +108,7 @@ def start(
             **common,
         )
         try:
-            _wait_for(collector, settings, check)
+            _wait_for_all(collector, settings, check)
         except BaseException:
             stop(collector)
             raise
@@ -151,7 +153,9 @@ def quiet() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _cluster_share(settings: WorkerSettings, check: Callable[[], None]) -> dict[str, Any]:
+def _cluster_share(
+    settings: WorkerSettings, check: Callable[[], None], patient: bool
+) -> dict[str, Any]:
     """Connect to the cluster, or start one, and say what of it a worker reserves.
 
     Raises:
@@ -180,9 +184,11 @@ def _cluster_share(settings: WorkerSettings, check: Callable[[], None]) -> dict[
     on_gpus = any(torch.device(device).type == "cuda" for device in settings.devices)
     visible = torch.cuda.device_count() if address is None else workers
     share = {"num_cpus": cores, "num_gpus": min(1.0, visible / workers) if on_gpus else 0}
-    if (short := _short_of(share, workers)) is not None:
+    try:
+        _wait(lambda: _short_of(share, workers), workers, SECONDS_TO_START * patient, check)
+    except BaseException:
         ray.shutdown()
-        raise WorkersError(f"workers={workers}: {short}")
+        raise
     return {**share, "scheduling_strategy": "SPREAD"}  # on several machines where it can be
 
 
@@ -207,33 +213,42 @@ def _short_of(share: dict[str, Any], workers: int) -> str | None:
     )
 
 
-def _wait_for(collector: Any, settings: WorkerSettings, check: Callable[[], None]) -> None:
-    """Wait until every worker has begun, and say so where it takes long.
-
-    Raises:
-        WorkersError: where a machine is lost meanwhile, so that there is no place for all, or they
-            do not begin in time.
-    """
+def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], None]) -> None:
+    """Wait until every worker has begun."""
     import ray
 
     workers = settings.workers
-    waiting = [one.get_distant_attr.remote("worker_idx") for one in collector.remote_collectors]
-    began = said = time.monotonic()
-    share = {"num_cpus": settings.cores, "num_gpus": 0}
-    while waiting:
-        ready, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=EVERY)
+    begun = [one.get_distant_attr.remote("worker_idx") for one in collector.remote_collectors]
+
+    def missing() -> str | None:
+        ready, waiting = ray.wait(begun, num_returns=workers, timeout=EVERY)
         ray.get(ready)  # raises what has kept a worker from beginning
-        check()
+        free = ray.available_resources().get("CPU", 0)
+        if not waiting:
+            return None
+        return f"{len(ready)} have begun, {free:g} CPU of the Ray cluster are free"
+
+    _wait(missing, workers, SECONDS_TO_START, check)
+
+
+def _wait(
+    reason: Callable[[], str | None], workers: int, limit: float, check: Callable[[], None]
+) -> None:
+    """Wait until there is no reason to any more, and say so where it takes long.
+
+    Raises:
+        WorkersError: with the reason, where there still is one after so many seconds.
+    """
+    began = said = time.monotonic()
+    while (why := reason()) is not None:
         now = time.monotonic()
-        if waiting and now - said >= SECONDS_TO_SAY:
+        if now - began >= limit:
+            raise WorkersError(f"workers={workers}: {why}" + f", after {limit:g} s" * bool(limit))
+        if now - said >= SECONDS_TO_SAY:
             said = now
-            free = ray.available_resources().get("CPU", 0)
-            why = _short_of(share, workers) or f"{free:g} CPU of the Ray cluster are free"
-            line = f"{workers - len(waiting)} of {workers} workers have begun after "
-            line += f"{now - began:.0f} s: {why}"
-            if now - began >= SECONDS_TO_START:
-                raise WorkersError(f"workers={workers}: {line}")
-            warnings.warn(f"waiting: {line}", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"workers={workers} are waited for: {why}", RuntimeWarning, stacklevel=2)
+        check()
+        time.sleep(EVERY)
 
 
 def _elsewhere(function: Callable[[], Any], check: Callable[[], None]) -> None:

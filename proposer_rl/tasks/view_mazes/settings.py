@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Len
-from pydantic import Discriminator
 
-from proposer_rl.settings import settings
+from proposer_rl.settings import BY_KIND, settings
 
 Walls = Annotated[int, Ge(0)]
 
@@ -54,9 +53,7 @@ class RoomsSettings:
     kind: Literal["four_rooms"] = "four_rooms"
 
 
-DistributionSettings = Annotated[
-    ScatteredSettings | PerfectSettings | RoomsSettings, Discriminator("kind")
-]
+DistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
 
 
 @settings

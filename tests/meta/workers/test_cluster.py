@@ -65,7 +65,7 @@ def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
 ) -> None:
     monkeypatch.setattr(engines_module, "SECONDS_TO_SAY", 2.0)
     monkeypatch.setattr(engines_module, "SECONDS_TO_START", 6.0)
-    begin = engines_module._wait_for
+    begin = engines_module._wait_for_all
     handler = signal(SIGTERM, lambda *_: None)
     ours = getsignal(SIGTERM)
 
@@ -74,11 +74,11 @@ def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
         cluster.remove_node(worker_machines(cluster)[-1])
         begin(collector, *arguments)
 
-    monkeypatch.setattr(engines_module, "_wait_for", lose_one_and_wait)
+    monkeypatch.setattr(engines_module, "_wait_for_all", lose_one_and_wait)
     try:
         with (
-            pytest.warns(RuntimeWarning, match=r"waiting: \d of 2 workers have begun after"),
-            pytest.raises(WorkersError, match=r"begun after .* room for 1$"),
+            pytest.warns(RuntimeWarning, match="workers=2 are waited for: the Ray cluster has 1"),
+            pytest.raises(WorkersError, match=r"room for 1, after 6 s$"),
         ):
             cycles(*make(settings(cluster)))
         assert getsignal(SIGTERM) is ours
