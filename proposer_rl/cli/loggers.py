@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -21,7 +22,7 @@ from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import LoggerSettings
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
-ID = "wandb_id.txt"  # of the run at Weights & Biases; one that goes on is the same there
+ID = "wandb_id.txt"
 
 Picture = NDArray[np.uint8]
 Write = Callable[[Mapping[str, float], Mapping[str, Picture], int], None]
@@ -107,16 +108,13 @@ def _wandb(
     """What its own variables say, such as WANDB_MODE, holds where the settings say nothing."""
     import wandb
 
-    file = path / ID
-    if not file.exists():
-        write_atomically(file, wandb.util.generate_id().encode())
     try:
         run = wandb.init(
             project=settings.project or os.environ.get("WANDB_PROJECT", "proposer_rl"),
             mode=settings.mode,
             dir=path,
             name=name,
-            id=file.read_text().strip(),
+            id=wandb_id(path),
             resume="allow",
             config=dict(config),
             reinit="finish_previous",  # of a sweep in one process each run is its own
@@ -135,6 +133,14 @@ def _wandb(
         run.finish(exit_code=1)
         raise
     run.finish()
+
+
+def wandb_id(path: Path) -> str:
+    """The id of a run at Weights & Biases, kept in its folder: one that goes on is no second."""
+    file = path / ID
+    if not file.is_file():
+        write_atomically(file, secrets.token_hex(4).encode())
+    return file.read_text(encoding="utf-8").strip()
 
 
 def _refusal(error: Exception) -> ConfigError:
