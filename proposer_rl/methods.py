@@ -22,6 +22,7 @@ from proposer_rl.curricula import (
     FirstOrderProposer,
     LearningProgressCurriculum,
     MixtureCurriculum,
+    Modelled,
     PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
@@ -55,6 +56,7 @@ from proposer_rl.settings import (
     ArgumentError,
     Count,
     FilterSettings,
+    ModelSettings,
     NotNegative,
     Positive,
     PPOSettings,
@@ -120,6 +122,19 @@ def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculu
         return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
     except ValueError as error:
         raise ValueError(f"filter.{error}") from error
+
+
+def modelled(curriculum: Curriculum, task: Task, config: ModelSettings | None) -> Curriculum:
+    """A curriculum that asks a model of outcomes wherever it would ask about performance.
+
+    Args:
+        curriculum: any.
+        task: whose levels have the features.
+        config: of the model; None to leave the curriculum as it is.
+    """
+    if config is None:
+        return curriculum
+    return Modelled(curriculum, task.features, **asdict(config))
 
 
 def _takes_numbers_of(make: Callable[..., Curriculum], *given: str) -> Callable[[F], F]:

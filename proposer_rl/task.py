@@ -275,6 +275,14 @@ class Task(ABC):
         """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
         return nn.Linear(self._actions, features)
 
+    def features(self, levels: Levels) -> Tensor:
+        """What a model of outcomes knows of levels [K, n]: float [K, n, F], each about -1 to 1.
+
+        Here by where they lie in the space, which then needs ``locate(levels)``; a task may add
+        others.
+        """
+        return space_features(self.space, levels)
+
     @property
     def metrics(self) -> list[str]:
         """The names of what :meth:`measure` gives."""
@@ -508,6 +516,33 @@ class EditableTask(Protocol):
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
         """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+
+
+def space_features(space: Any, levels: Levels) -> Tensor:
+    """Features of levels by where they lie in a space, among the bins or beside them.
+
+    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest.
+
+    Args:
+        space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
+            coordinates of levels [*B]: float [*B, D].
+        levels: [*B].
+
+    Returns:
+        float64 [*B, 1 + 2 D + N] on the CPU.
+
+    Raises:
+        TypeError: if the space cannot locate levels.
+    """
+    if not hasattr(space, "locate"):
+        raise TypeError(
+            f"features of levels: {type(space).__name__} must define locate(levels), the "
+            "coordinates of levels, or the task features(levels)"
+        )
+    places, c = space.coordinates.double(), space.locate(levels).double().cpu()
+    nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
+    bins = torch.nn.functional.one_hot(nearest, len(places))
+    return torch.cat([torch.ones_like(c[..., :1]), c, c.square(), bins], -1)
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:

@@ -20,7 +20,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Components, Workers, filtered
+from proposer_rl.methods import Components, Workers, filtered, modelled
 from proposer_rl.models import available_cores
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
@@ -164,7 +164,7 @@ def _curriculum(
         )
     if config.proposer.advance != "train":
         _check_cycle(config)
-    return filtered(curriculum, config.filter)
+    return modelled(filtered(curriculum, config.filter), task, config.model)
 
 
 def _check_cycle(config: RunConfig) -> None:
