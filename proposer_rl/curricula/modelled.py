@@ -55,9 +55,7 @@ class Modelled(Combinator):
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)
         self._features, self._labels = features, labels
-        self._model = OutcomeModel(
-            labels=labels, ridge=ridge, half_life=half_life, scaled=1
-        )
+        self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life, scaled=1)
         self._inbox = Inbox()
         self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
 
@@ -140,9 +138,7 @@ class Modelled(Combinator):
         phi = torch.cat([phi, value.to(phi).unsqueeze(-1)], -1)
         wrong = (~phi.isfinite()).sum()
         if wrong:
-            raise ValueError(
-                f"features: {int(wrong)} of {phi.numel()} of these levels are not finite"
-            )
+            raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
         return phi
 
 
