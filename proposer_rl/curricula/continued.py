@@ -157,6 +157,7 @@ class ContinuedLevels:
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs, the actions of episodes that are not over included."""
         memory = self._learner.collector.memory
+        discounted = self._learner.statistics.discounted
         return {
             "proposed": self._proposed,
             "waiting": [list(waiting) for waiting in self._waiting],
@@ -166,6 +167,7 @@ class ContinuedLevels:
             "steps": self._steps.clone(),
             "history": None if self._history is None else packed(self._history),
             "memory": None if memory is None else packed(memory),
+            "discounted": None if discounted is None else discounted.clone(),
             "shown": None if self._shown is None else [*map(packed, self._shown)],
             "batches": {number: each.state_dict() for number, each in self._batches.items()},
         }
@@ -193,6 +195,8 @@ class ContinuedLevels:
             length = state["history"]["action"].shape[2]
             self._history = TensorDict.from_dict(state["history"], batch_size=[*shape, length])
             self._episodes.stand(self._levels, self._history["action"], self._steps)
+        if state["discounted"] is not None:
+            self._learner.statistics.discounted = state["discounted"].clone()
         if state["memory"] is not None:
             self._learner.collector.memory = TensorDict.from_dict(state["memory"], batch_size=shape)
 

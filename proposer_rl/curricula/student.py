@@ -78,8 +78,9 @@ class Student:
     play: Callable[[Levels, Sequence[torch.Generator]], TensorDictBase]
     """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
 
-    TorchRL's, with ``state_value`` where a score reads a critic. Actions of student k are drawn
-    from the k-th generator.
+    TorchRL's, with ``state_value`` where a score reads a critic; or only an outcome [K, n], as
+    :func:`~proposer_rl.curricula.outcome_of` describes it. Actions of student k are drawn from the
+    k-th generator.
     """
     performance: Callable[[Levels, torch.Generator], TensorDictBase]
     """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].

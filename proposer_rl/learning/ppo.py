@@ -37,6 +37,7 @@ from proposer_rl.learning.losses import (
 from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
+from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError, PPOSettings
 
@@ -104,6 +105,7 @@ class PPO:
             env, agent, settings.horizon, continued=settings.continue_episodes
         )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
+        self.statistics = Statistics(env, agent, settings)
         self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
         clipped = partial(
             CopiesClipLoss,
@@ -175,6 +177,8 @@ class PPO:
             them; ``explained_variance``, ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
+        first = not self._gradient_steps
+        self.statistics.before(rollout, level, first=first)
         steps = rollout.exclude(*self.agent.level_keys)
         for group in self._adam.param_groups:
             if isinstance(group["lr"], Tensor):
@@ -185,6 +189,7 @@ class PPO:
         trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
         self._gradient_steps += len(trained["gradient_steps"])
         rollout.update(trained["steps"])
+        self.statistics.after(rollout, first=first)
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
         return self._last_training[1].mean(0)
 
@@ -212,6 +217,8 @@ class PPO:
         agent, copies = self.agent, self.agent.copies
         with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
             steps = agent.decode(steps.copy(), agent.encode(level))
+        trained_on = agent.value_key, ACTED_VALUE, "value_target", "advantage"
+        steps = self.statistics.in_units(steps, *trained_on)
         losses = self._loss(steps)
         metrics = {
             key: of_copies(losses[key], copies)
@@ -277,4 +284,5 @@ class PPO:
         Episodes that would have gone on begin anew.
         """
         self.collector.begin_anew()
+        self.statistics.discounted = None
         self._gradient_steps = restore_snapshot(self.agent, self._adam, snapshot)

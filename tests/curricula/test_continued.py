@@ -191,7 +191,7 @@ def test_others_watch_whole_episodes_elsewhere() -> None:
 
 
 def experiment(folder: Path, updates: int) -> Experiment:
-    task = continued_task()
+    task = continued_task(normalize_observations=True, normalize_rewards=True)
     learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
     rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
     curriculum = ReplayCurriculum(
