@@ -124,16 +124,20 @@ def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculu
         raise ValueError(f"filter.{error}") from error
 
 
-def modelled(curriculum: Curriculum, task: Task, config: ModelSettings | None) -> Curriculum:
+def modelled(curriculum: Curriculum, task: Any, config: ModelSettings | None) -> Curriculum:
     """A curriculum that asks a model of outcomes wherever it would ask about performance.
 
     Args:
         curriculum: any.
-        task: whose levels have the features.
+        task: whose levels have the features, or a space of levels alone.
         config: of the model; None to leave the curriculum as it is.
+
+    Raises:
+        ArgumentError: if the task's levels have no features.
     """
     if config is None:
         return curriculum
+    task.features(task.space.sample(1, Streams(0).generator())[None])
     return Modelled(curriculum, task.features, **asdict(config))
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -244,6 +245,31 @@ def check_groups(given: Sequence[str]) -> None:
             changed_by = changed_by or group
         elif group in ("+method", "+scale") and changed_by is not None:
             raise ConfigError(f"{group}: must come before {changed_by}, or it would undo it")
+
+
+def check_packages(config: DictConfig) -> None:
+    """Refuse a file of one's own that Hydra has put below its group, for want of its first line.
+
+    Args:
+        config: as composed by Hydra.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    top = {field.name for field in fields(RunConfig)}
+    for group, name in HydraConfig.get().runtime.choices.items():
+        below = config.get(group)
+        if not isinstance(below, DictConfig) or not top & {*below}:
+            continue
+        folders = (Path(source.path) for source in HydraConfig.get().runtime.config_sources)
+        files = [folder / group / f"{name}.yaml" for folder in folders]
+        file = next((file for file in files if file.is_file()), files[0])
+        marked = file.is_file() and file.read_bytes().startswith(codecs.BOM_UTF8)
+        hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
+        raise ConfigError(
+            f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
+            f"become {group}.{next(map(str, below))} and so on{hidden if marked else ''}"
+        )
 
 
 def methods() -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,8 +16,10 @@ from proposer_rl.cli.config import ConfigError
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.report.records import numbers, picture
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import LoggerSettings
 
+WANDB_ID = "wandb_id.txt"
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 
 
@@ -48,7 +51,8 @@ def make_log(settings: LoggerSettings, path: Path, name: str) -> Log | None:
         # Of a sweep in one process each run is its own.
         reinit = "finish_previous"
         options["wandb_kwargs"] = {
-            "project": settings.project, "mode": settings.mode, "reinit": reinit
+            "project": settings.project, "mode": settings.mode, "reinit": reinit,
+            "id": wandb_id(path), "resume": "allow",
         }  # fmt: skip
     logger = get_logger(settings.type, str(path), name, **options)
 
@@ -62,6 +66,14 @@ def make_log(settings: LoggerSettings, path: Path, name: str) -> Log | None:
             logger.experiment.flush()  # so that it is seen during the run
 
     return log
+
+
+def wandb_id(path: Path) -> str:
+    """The run's name at Weights & Biases, kept in its folder: a run that goes on is no second."""
+    file = path / WANDB_ID
+    if not file.is_file():
+        write_atomically(file, secrets.token_hex(4).encode())
+    return file.read_text(encoding="utf-8").strip()
 
 
 def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:

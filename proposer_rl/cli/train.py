@@ -20,7 +20,13 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli.config import ConfigError, check_groups, overrides, read_config
+from proposer_rl.cli.config import (
+    ConfigError,
+    check_groups,
+    check_packages,
+    overrides,
+    read_config,
+)
 from proposer_rl.cli.errors import UNFORESEEN, command, exit_code, one_line, refuse
 from proposer_rl.cli.hydra_errors import explained
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -44,7 +50,7 @@ def _compose_and_run() -> None:
     try:
         with _unchecked_help():
             _main()
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
     except ValueError as error:
@@ -75,6 +81,7 @@ def _main(hydra_config: DictConfig) -> float:
     try:
         forget_failure(path)
         check_groups(overrides())
+        check_packages(hydra_config)
         config = read_config(hydra_config)
         from proposer_rl.cli.run import train  # only now: it takes seconds
 

@@ -14,6 +14,7 @@ Number = int | float
 
 SEED = "seed"
 LARGEST_SEED = 2**31 - 1
+MOST_BINS = 256  # along an axis; readers of runs take no more
 
 
 class Bins(NamedTuple):
