@@ -147,7 +147,7 @@ class Run:
         from proposer_rl.cli.stored import stored_run
 
         run = stored_run(self.folder)
-        return run.task, run.learner(run.files[-1])[2].agent
+        return run.task, run.stage().learner.agent
 
     def _table(self, name: str) -> pd.DataFrame:
         import pandas as pd
