@@ -154,8 +154,7 @@ def _curriculum(
         _check_cycle(config)
     with key("filter"):
         curriculum = filtered(curriculum, config.filter)
-    with key("model"):
-        return modelled(curriculum, task, config.model)
+    return modelled(curriculum, task, config.model)
 
 
 def _check_cycle(config: RunConfig) -> None:
