@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from proposer_rl.cli import traces
 from proposer_rl.cli.config import (
     ConfigError,
     check_groups,
@@ -53,10 +54,15 @@ def _compose_and_run() -> None:
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
+    except OSError as error:  # of Hydra's own files
+        remove_traces()
+        refuse(error, traces.folder())
     except ValueError as error:
         if BEGUN:
             raise
         remove_traces()
+        if isinstance(error.__cause__, OSError):  # of the file that logging cannot open
+            refuse(error.__cause__)
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
 
 
@@ -88,10 +94,10 @@ def _main(hydra_config: DictConfig) -> float:
         return train(config, path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return record_failure(path, error, one_line(error), exit_code(error))
+            return record_failure(path, error, one_line(error, path), exit_code(error))
         if exit_code(error) != UNFORESEEN:
             remove_traces()
-            refuse(error)
+            refuse(error, path)
         raise
 
 
