@@ -91,8 +91,8 @@ def simulate(replications: int, seed: int = 0) -> pd.DataFrame:
         seed: of all draws.
 
     Returns:
-        A row for each law, number of ``seeds`` and method, with ``coverage`` and median ``width``, in
-        standard deviations of the law. Nothing for an interval that needs bounds where a law has
+        A row for each law, number of ``seeds`` and method: ``coverage``, and median ``width`` in
+        standard deviations of the law. None for an interval that needs bounds where a law has
         none.
     """
     rng = np.random.default_rng(seed)
