@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
@@ -20,13 +21,14 @@ from proposer_rl.curricula import (
     outcome_of,
     require,
 )
-from proposer_rl.learning import PPO, Update, located
+from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, ScheduleSettings
+from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -34,6 +36,18 @@ Log = Callable[[str, Mapping[str, Any], int], None]
 
 RECORDED_LEVELS = 8
 MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
+
+
+@settings
+class _Counted:
+    """What a checkpoint, which may come from anybody, has counted."""
+
+    updates: Annotated[int, Ge(0)]
+    cycles: Annotated[int, Ge(0)]
+    curriculum_frames: Annotated[int, Ge(0)]
+    evaluations: Annotated[int, Ge(0)]
+    seconds: NotNegative
+    rows: dict[str, Annotated[int, Ge(0)]]
 
 
 class Experiment:
@@ -78,6 +92,10 @@ class Experiment:
         self.student = TaskStudent(task, learner)
         require(self.student, curriculum.needs, type(curriculum).__name__)
         self.curriculum = curriculum
+        self._continued: ContinuedLevels | None = None
+        if learner.settings.continue_episodes:
+            like = next(iter(task.evaluated_on.values()))
+            self._continued = ContinuedLevels(curriculum, self.student, learner, like)
         self.schedule = schedule
         self.seeds = list(seeds)
         self.folder = folder
@@ -203,7 +221,7 @@ class Experiment:
         if outcome.advance is not None:
             self.updates += outcome.advance.updates
             self._measure()
-            self._record(outcome.advance.levels, outcome.advance.update)
+            self._record(outcome.advance.levels, *outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
         self._pause(due=logged or self.student.frames > spent)
 
@@ -237,16 +255,23 @@ class Experiment:
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
         with self._status.phase(TRAINING):
-            batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
-            self.learner.env.set_levels(batch.levels)
-            update = self.learner.update([stream.generator("actions") for stream in streams])
-            self.learner.check()
-        self.curriculum.observe(self.student, batch, outcome_of(update.rollout))
+            if self._continued is not None:
+                update, credits = self._continued.update(streams)
+                played = self._continued.shown
+            else:
+                batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
+                self.learner.env.set_levels(batch.levels)
+                update = self.learner.update([stream.generator("actions") for stream in streams])
+                self.learner.check()
+                credits = [(batch, outcome_of(update.rollout))]
+                played = batch.levels, update.rollout
+        for credit in credits:
+            self.curriculum.observe(self.student, *credit)
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
-            self._record(batch.levels, update)
+            self._record(*played, update.metrics)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _plan(self) -> None:
@@ -277,14 +302,14 @@ class Experiment:
                 row = {"seed": seed, "updates": self.updates, "distribution": name, **reached}
                 self.folder.append("levels.jsonl", row)
 
-    def _record(self, levels: Any, update: Update) -> None:
+    def _record(self, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase) -> None:
         """Append how the training went and samples of its levels, for every copy."""
-        told = self.task.training_metrics(levels, update.rollout), update.metrics
+        told = self.task.training_metrics(levels, rollout), metrics
         for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
             self._append("training.csv", seed, {**values, **training})
         some = slice(RECORDED_LEVELS)
         for copy, seed in enumerate(self.seeds):
-            sample = self.task.record(levels[copy, some], update.rollout[copy, some])
+            sample = self.task.record(levels[copy, some], rollout[copy, some])
             row = {"updates": self.updates, "seed": seed, "levels": sample}
             self.folder.append("curriculum.jsonl", row)
             if copy == 0:
@@ -341,6 +366,7 @@ class Experiment:
             "rows": self.folder.lengths(),
             "solver": self.learner.snapshot().to_dict(),
             "curriculum": self.curriculum.state_dict(),
+            **({} if self._continued is None else {"episodes": self._continued.state_dict()}),
         }
 
     def _resume(self) -> bool:
@@ -361,16 +387,20 @@ class Experiment:
         return True
 
     def _restore(self, state: State) -> None:
+        length = self.schedule.cycle_length
+        read = _Counted(**{name: state[name] for name in _Counted.__annotations__})
+        updates, cycles = read.updates, read.cycles
+        if not (cycles - 1) * length <= updates <= cycles * length:
+            raise ValueError(f"cycles={cycles}, of {length} updates each, but updates={updates}")
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
-        self.curriculum.load_state_dict(state["curriculum"])
-        self.updates, self.cycles = state["updates"], state["cycles"]
-        self.student.frames, self.student.evaluations = (
-            state["curriculum_frames"],
-            state["evaluations"],
-        )
-        self._seconds_before = state["seconds"]
+        self.curriculum.load_state_dict(dict(state["curriculum"]))
+        if self._continued is not None:
+            self._continued.load_state_dict(state["episodes"])
+        self.updates, self.cycles = updates, cycles
+        self.student.frames, self.student.evaluations = read.curriculum_frames, read.evaluations
+        self._seconds_before = read.seconds
         self._started = time.monotonic()
-        self._headline = state["headline"]
+        self._headline = [float(value) for value in state["headline"]]
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:

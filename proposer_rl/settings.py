@@ -26,7 +26,7 @@ from typing import (
 )
 
 from annotated_types import Ge, Gt, Interval, Le, Len
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Discriminator, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 
 T = TypeVar("T")
@@ -42,6 +42,10 @@ Positive = Annotated[float, Gt(0)]
 """A number above zero."""
 NotNegative = Annotated[float, Ge(0)]
 """Zero, or a number above it."""
+
+
+BY_KIND = Discriminator("kind")
+"""Of a union of settings, each of which has an entry ``kind`` of its own."""
 
 
 class ArgumentError(ValueError):
@@ -200,11 +204,7 @@ def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
 
 
 def _first_line(error: ValidationError, name: str, value: Any) -> str:
-    errors = error.errors()
-    # Of a union pydantic tells what is wrong with every member; one of another kind is not meant.
-    others = [e["loc"][:-1] for e in errors if e["loc"][-1:] == ("kind",)]
-    meant = [e for e in errors if not any(e["loc"][: len(other)] == other for other in others)]
-    details = (meant or errors)[0]
+    details = error.errors()[0]
     # Where it stands in the value: a union's member is named in the place, too, and is no key.
     loc: list[int | str] = []
     folder = inner = value
@@ -217,9 +217,6 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
         loc.append(part)
     key = ".".join(map(str, [name, *loc]))
     message = details["msg"].removeprefix("Value error, ")
-    if not meant:  # of a kind that there is not: the members' kinds are what there is
-        kinds = {str(e["ctx"]["expected"]) for e in errors if e["loc"][-1:] == ("kind",)}
-        message = f"input should be one of {', '.join(sorted(kinds))}"
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = ", ".join(sorted(map(str, folder.keys() - {loc[-1]})))
         return f"{key}: unknown" + (f"; there are: {known}" if known else "")
@@ -248,13 +245,14 @@ class LearningSettings:
 
     Attributes:
         updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
-        epochs: gradient steps of an update, each on the full batch.
+        epochs: passes of an update through its batch, each a gradient step where the batch is not
+            cut in parts.
         learning_rate, adam_eps: Adam's step size and denominator offset.
         gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
         clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
         entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
         max_grad_norm: largest gradient norm of one copy.
-        normalize_advantage: standardise advantages over each copy's batch.
+        normalize_advantage: standardise advantages over what a gradient step of a copy is made on.
     """
 
     updates: Annotated[int, Ge(1)] = 1
@@ -272,13 +270,31 @@ class LearningSettings:
 
 @settings
 class PPOSettings(LearningSettings):
-    """PPO's numbers.
+    """PPO's numbers, and how it goes through a batch.
 
     Attributes:
         horizon: steps T collected from every environment before an update.
+        continue_episodes: whether episodes go on from rollout to rollout, and a new level begins
+            where one ends; otherwise every rollout begins with its levels.
+        normalize_observations: the numbers that are observed are shown without the mean of all that
+            a replica has trained on, in their standard deviations, cut off at 10 of them.
+        normalize_rewards: values have the standard deviation of the discounted return for a unit,
+            which is the same as rewards divided by it.
+        minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
+            standardised advantages) each; 1 for the batch as it is.
+        anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
+            after so many; None for a constant one.
+        clip_value: how far a value may move from that of the rollout before its error counts as if
+            it had not come back (the larger of both errors); None for the plain squared error.
     """
 
     horizon: Annotated[int, Ge(1)] = 25
+    continue_episodes: bool = False
+    normalize_observations: bool = False
+    normalize_rewards: bool = False
+    minibatches: Annotated[int, Ge(1)] = 1
+    anneal_updates: Annotated[int, Ge(1)] | None = None
+    clip_value: Annotated[float, Gt(0)] | None = None
 
 
 @settings
@@ -348,7 +364,7 @@ class ProposerSettings:
     observes: list[Literal["return", "log_success", "progress"]] = field(
         default_factory=lambda: ["log_success", "progress"]
     )
-    action: MixtureSettings | ProblemSettings = MixtureSettings()
+    action: Annotated[MixtureSettings | ProblemSettings, BY_KIND] = MixtureSettings()
     own_action: Literal["sample", "mode"] = "mode"
     advance: Literal["train", "best", "random"] = "train"
     advantage: Literal["leave_one_out", "gae"] = "leave_one_out"
@@ -438,12 +454,13 @@ class LoggerSettings:
 
     Attributes:
         type: ``csv`` for nowhere.
-        project, mode: of Weights & Biases.
+        project, mode: of Weights & Biases; None for what its own variables say, WANDB_PROJECT and
+            WANDB_MODE, or else ``proposer_rl`` and ``online``.
     """
 
     type: Literal["csv", "tensorboard", "wandb"]
-    project: str = "proposer_rl"
-    mode: Literal["online", "offline", "disabled"] = "online"
+    project: str | None = None
+    mode: Literal["online", "offline", "disabled"] | None = None
 
 
 @settings

@@ -24,12 +24,19 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Categorical
+from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import PPO, first_episode_return, first_episode_success
 from proposer_rl.learning.episodes import mean_performance
-from proposer_rl.models import ActorCritic, Population, categorical, normal
+from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.models import (
+    ActorCritic,
+    Population,
+    categorical,
+    joint_categorical,
+    normal,
+)
 from proposer_rl.runs.pictures import pixels, png, written
 from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams, each_from
@@ -221,8 +228,7 @@ class Task(ABC):
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
         """K networks as the agent of an environment [K, P]."""
         module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
-        discrete = isinstance(env.full_action_spec["action"], Categorical)
-        distribution = categorical if discrete else normal
+        distribution = distribution_of(env.full_action_spec["action"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
@@ -233,6 +239,20 @@ class Task(ABC):
         level = next(iter(self.evaluated_on.values()))[:1]
         env = self.environment(level.expand(copies, self.batch_size))
         return PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
+
+    def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:
+        """Where the Solvers of a learner play levels [K, P] that they do not train on.
+
+        Returns:
+            The environment, and what rolls out whole episodes there: the learner's own where its
+            rollouts begin with their levels.
+        """
+        if not learner.settings.continue_episodes:
+            return learner.env, learner.collector
+        level = next(iter(self.evaluated_on.values()))[:1]
+        env = self.environment(level.expand(*learner.env.batch_size))
+        horizon = max(self.max_steps, learner.horizon)
+        return env, RolloutCollector(env, learner.agent, horizon)
 
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator
@@ -260,8 +280,8 @@ class Task(ABC):
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
         """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
 
-        Here at the beginning of each level: probabilities of n actions, or the means of continuous
-        ones, [K, C, D].
+        Here at the beginning of each level: probabilities of n actions, of each choice where there
+        are several, or the means of continuous ones, [K, C, D].
         """
         copies = for_copies(agent, levels)
         if not copies.batch_size.numel():
@@ -269,7 +289,8 @@ class Task(ABC):
         state = self.evaluation_environment(copies).reset()
         state.update(agent.no_memory(state))
         logits = agent(state)[agent.logits_key]
-        return logits.softmax(-1) if logits.ndim == 3 else logits[..., 0]
+        continuous = agent.distribution_class is normal
+        return logits[..., 0] if continuous else logits.softmax(-1).flatten(2)
 
     def probe_encoder(self, features: int) -> nn.Module:
         """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
@@ -424,9 +445,11 @@ class Task(ABC):
 
     @property
     def _actions(self) -> int:
-        """Number of actions to choose from, or of the parts of a continuous one."""
+        """Numbers of a probe of one level."""
         level = next(iter(self.evaluated_on.values()))[:1]
         spec = self.evaluation_environment(level.expand(1, 1)).full_action_spec["action"]
+        if isinstance(spec, MultiCategorical):
+            return len(spec.nvec[0, 0]) * int(spec.nvec.max())
         return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
 
     def _numbers(self, levels: Levels) -> list[str]:
@@ -508,6 +531,13 @@ class EditableTask(Protocol):
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
         """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+
+
+def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
+    """What makes a policy's distribution of actions of logits, by the actions' spec."""
+    if isinstance(acts, MultiCategorical):
+        return joint_categorical
+    return categorical if isinstance(acts, Categorical) else normal
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:

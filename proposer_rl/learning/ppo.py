@@ -1,6 +1,7 @@
 """Proximal policy optimisation of one agent, or of K independent replicas of it at once.
 
-An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps on
+An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps,
+on all of it or on shuffled parts of it, on
 
     - min(r A, clip(r, 1 - eps, 1 + eps) A)  +  critic_coeff (V - R)^2  -  entropy_coeff H
 
@@ -18,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
@@ -25,16 +27,19 @@ from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
 from proposer_rl.learning.losses import (
+    ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
     explained_variance,
     make_loss,
     of_copies,
 )
+from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
+from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import PPOSettings
+from proposer_rl.settings import ArgumentError, PPOSettings
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -96,8 +101,11 @@ class PPO:
                 f"be {agent.copies}; its batch size is {list(env.batch_size)}"
             )
         self.env, self.agent, self.settings = env, agent, settings
-        self.collector = RolloutCollector(env, agent, settings.horizon)
-        steps = env.batch_size[0 if agent.copies is None else 1 :].numel() * settings.horizon
+        self.collector = RolloutCollector(
+            env, agent, settings.horizon, continued=settings.continue_episodes
+        )
+        self._minibatches = Minibatches(agent, env.batch_size, settings)
+        self.statistics = Statistics(env, agent, settings)
         self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
         clipped = partial(
             CopiesClipLoss,
@@ -105,11 +113,13 @@ class PPO:
             clip_epsilon=settings.clip_epsilon,
             entropy_coeff=settings.entropy_coeff,
             critic_coeff=settings.critic_coeff,
-            normalize_advantage=settings.normalize_advantage and steps > 1,
+            normalize_advantage=settings.normalize_advantage and self._minibatches.steps > 1,
+            clip_value=settings.clip_value,
         )
         self._loss = make_loss(loss or clipped, agent)
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
+        self._gradient_steps = 0
 
     @property
     def copies(self) -> int | None:
@@ -124,10 +134,10 @@ class PPO:
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
         rollout = self.collect(generators)
-        return Update(rollout, self.optimise(rollout))
+        return Update(rollout, self.optimise(rollout, generators))
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """Reset the environment and act for a horizon.
+        """Reset the environment, unless its episodes go on, and act for a horizon.
 
         Args:
             generators: one for each index of the environment's first dimension, from which its
@@ -139,10 +149,26 @@ class PPO:
         """
         return self.collector.collect(generators)
 
-    def optimise(self, rollout: TensorDictBase) -> TensorDict:
+    @property
+    def learning_rate(self) -> float:
+        """Of the next update."""
+        settings = self.settings
+        if settings.anneal_updates is None:
+            return settings.learning_rate
+        each = settings.updates * settings.epochs * settings.minibatches
+        done = self._gradient_steps / each / settings.anneal_updates
+        return settings.learning_rate * max(0.0, 1 - done)
+
+    def optimise(
+        self, rollout: TensorDictBase, generators: list[torch.Generator] | None = None
+    ) -> TensorDict:
         """Train on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
 
         Writes ``advantage`` and ``value_target`` into the rollout.
+
+        Args:
+            rollout: complete.
+            generators: as of :meth:`collect`; minibatches are shuffled by them.
 
         Returns:
             Of each replica [K], without replicas [], means over its batch and the gradient steps:
@@ -151,9 +177,19 @@ class PPO:
             them; ``explained_variance``, ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
+        first = not self._gradient_steps
+        self.statistics.before(rollout, level, first=first)
         steps = rollout.exclude(*self.agent.level_keys)
-        trained = self.train(TensorDict({"steps": steps, "level": level}))
+        for group in self._adam.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(self.learning_rate)
+            else:
+                group["lr"] = self.learning_rate
+        orders = self._minibatches.draw(generators)
+        trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
+        self._gradient_steps += len(trained["gradient_steps"])
         rollout.update(trained["steps"])
+        self.statistics.after(rollout, first=first)
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
         return self._last_training[1].mean(0)
 
@@ -168,7 +204,12 @@ class PPO:
             if update:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
-            taken += [self._gradient_step(steps, level) for _ in range(self.settings.epochs)]
+            if self.settings.clip_value is not None:
+                steps.set(ACTED_VALUE, steps[value])
+            for epoch in range(self.settings.epochs):
+                order = batch.get(f"order_{update}_{epoch}", None)
+                parts = self._minibatches(steps, level, order)
+                taken += [self._gradient_step(*part) for part in parts]
         computed = steps.select(value, ("next", value), "advantage", "value_target")
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
@@ -176,6 +217,8 @@ class PPO:
         agent, copies = self.agent, self.agent.copies
         with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
             steps = agent.decode(steps.copy(), agent.encode(level))
+        trained_on = agent.value_key, ACTED_VALUE, "value_target", "advantage"
+        steps = self.statistics.in_units(steps, *trained_on)
         losses = self._loss(steps)
         metrics = {
             key: of_copies(losses[key], copies)
@@ -204,9 +247,17 @@ class PPO:
         return rollout
 
     def prepare_for_graphs(self) -> None:
-        """Let training be recorded as a CUDA graph; without, it need not be."""
-        for group in self._adam.param_groups:
-            group["capturable"] = self._parameters[0].is_cuda
+        """Let training be recorded as a CUDA graph; without, it need not be.
+
+        Raises:
+            ArgumentError: if episodes go on, of which each step has to be asked whether it ends.
+        """
+        if self.settings.continue_episodes:
+            raise ArgumentError("continue_episodes=True: cannot be recorded as a CUDA graph")
+        if self._parameters[0].is_cuda:
+            for group in self._adam.param_groups:
+                group["capturable"] = True
+                group["lr"] = torch.tensor(group["lr"], device=self._parameters[0].device)
 
     def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.
@@ -228,5 +279,10 @@ class PPO:
         return take_snapshot(self.agent, self._adam)
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Put a snapshot of as many replicas back; a ValueError says why one does not fit."""
-        restore_snapshot(self.agent, self._adam, snapshot)
+        """Put a snapshot of as many replicas back; a ValueError says why one does not fit.
+
+        Episodes that would have gone on begin anew.
+        """
+        self.collector.begin_anew()
+        self.statistics.discounted = None
+        self._gradient_steps = restore_snapshot(self.agent, self._adam, snapshot)
