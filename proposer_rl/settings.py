@@ -248,13 +248,14 @@ class LearningSettings:
 
     Attributes:
         updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
-        epochs: gradient steps of an update, each on the full batch.
+        epochs: passes of an update through its batch, each a gradient step where the batch is not
+            cut in parts.
         learning_rate, adam_eps: Adam's step size and denominator offset.
         gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
         clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
         entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
         max_grad_norm: largest gradient norm of one copy.
-        normalize_advantage: standardise advantages over each copy's batch.
+        normalize_advantage: standardise advantages over what a gradient step of a copy is made on.
     """
 
     updates: Annotated[int, Ge(1)] = 1
@@ -272,13 +273,22 @@ class LearningSettings:
 
 @settings
 class PPOSettings(LearningSettings):
-    """PPO's numbers.
+    """PPO's numbers, and how it goes through a batch.
 
     Attributes:
         horizon: steps T collected from every environment before an update.
+        minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
+            standardised advantages) each; 1 for the batch as it is.
+        anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
+            after so many; None for a constant one.
+        clip_value: how far a value may move from that of the rollout before its error counts as if
+            it had not come back (the larger of both errors); None for the plain squared error.
     """
 
     horizon: Annotated[int, Ge(1)] = 25
+    minibatches: Annotated[int, Ge(1)] = 1
+    anneal_updates: Annotated[int, Ge(1)] | None = None
+    clip_value: Annotated[float, Gt(0)] | None = None
 
 
 @settings

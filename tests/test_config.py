@@ -85,6 +85,9 @@ WRONG = [
     ("solver.ppo.entropy_coeff=-1", "entropy_coeff=-1: input should be greater than or equal to 0"),
     ("solver.ppo.max_grad_norm=0", "max_grad_norm=0: input should be greater than 0"),
     ("solver.ppo.epochs=0", "solver.ppo.epochs=0: input should be greater than or equal to 1"),
+    ("solver.ppo.minibatches=0", "solver.ppo.minibatches=0: input should be greater than or equal"),
+    ("solver.ppo.anneal_updates=0", "anneal_updates=0: input should be greater than or equal to 1"),
+    ("solver.ppo.clip_value=0", "solver.ppo.clip_value=0: input should be greater than 0"),
     ("solver.ppo.horizon=0", "solver.ppo.horizon=0: input should be greater than or equal to 1"),
     ("task.network.channels=[]", "task.network.channels=[]: list should have at least 1 item"),
     (
@@ -186,6 +189,10 @@ WRONG = [
     ("compute.workers=0", "compute.workers=0: input should be greater than or equal to 1"),
     ("compute.worker_devices=[]", "compute.worker_devices=[]: list should have at least 1 item"),
     # contradictions
+    (
+        "solver.ppo.minibatches=129",
+        "solver.ppo.minibatches=129: must be at most the 128 sequences of a batch",
+    ),
     (
         "compute.workers=2",
         "compute.workers=2: there are workers only with compute.collector=multiprocess",

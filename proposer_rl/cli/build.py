@@ -52,7 +52,8 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     require_logger(config.logger)
     try:
         task = make_task(config)
-        learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
+        with _key("solver.ppo"):
+            learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
         with _key("schedule"):
             check_headline(task, config.schedule)
         curriculum = _curriculum(config, task, signals, status)

@@ -14,6 +14,9 @@ from torchrl.objectives import ClipPPOLoss, LossModule
 
 from proposer_rl.models import ActorCritic
 
+ACTED_VALUE = "acted_value"
+"""Entry of the values that the critic had when it acted, which a clipped value loss compares to."""
+
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
@@ -76,6 +79,16 @@ class CopiesClipLoss(ClipPPOLoss):
         clipped = ratio.clamp(*self._clip_bounds) != ratio
         self._each |= {"kl_approx": kl_approx.detach(), "clip_fraction": clipped.to(ratio)}
         return log_weight, distribution, kl_approx, correction
+
+    def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
+        """The critic's term; the old values are not those that the caller has just written."""
+        self._acted_value = tensordict.get(ACTED_VALUE, None)
+        return super().loss_critic(tensordict)
+
+    def _critic_loss_inputs(
+        self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        return target_return, state_value, self._acted_value
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
         # TorchRL's checks that an entropy is finite, and waits: for discrete actions it is.

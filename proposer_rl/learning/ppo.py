@@ -1,6 +1,7 @@
 """Proximal policy optimisation of one agent, or of K independent replicas of it at once.
 
-An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps on
+An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps,
+on all of it or on shuffled parts of it, on
 
     - min(r A, clip(r, 1 - eps, 1 + eps) A)  +  critic_coeff (V - R)^2  -  entropy_coeff H
 
@@ -18,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
@@ -25,12 +27,14 @@ from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
 from proposer_rl.learning.losses import (
+    ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
     explained_variance,
     make_loss,
     of_copies,
 )
+from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.models import ActorCritic
@@ -97,7 +101,7 @@ class PPO:
             )
         self.env, self.agent, self.settings = env, agent, settings
         self.collector = RolloutCollector(env, agent, settings.horizon)
-        steps = env.batch_size[0 if agent.copies is None else 1 :].numel() * settings.horizon
+        self._minibatches = Minibatches(agent, env.batch_size, settings)
         self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
         clipped = partial(
             CopiesClipLoss,
@@ -105,11 +109,13 @@ class PPO:
             clip_epsilon=settings.clip_epsilon,
             entropy_coeff=settings.entropy_coeff,
             critic_coeff=settings.critic_coeff,
-            normalize_advantage=settings.normalize_advantage and steps > 1,
+            normalize_advantage=settings.normalize_advantage and self._minibatches.steps > 1,
+            clip_value=settings.clip_value,
         )
         self._loss = make_loss(loss or clipped, agent)
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
+        self._gradient_steps = 0
 
     @property
     def copies(self) -> int | None:
@@ -124,7 +130,7 @@ class PPO:
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
         """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
         rollout = self.collect(generators)
-        return Update(rollout, self.optimise(rollout))
+        return Update(rollout, self.optimise(rollout, generators))
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
         """Reset the environment and act for a horizon.
@@ -139,10 +145,26 @@ class PPO:
         """
         return self.collector.collect(generators)
 
-    def optimise(self, rollout: TensorDictBase) -> TensorDict:
+    @property
+    def learning_rate(self) -> float:
+        """Of the next update."""
+        settings = self.settings
+        if settings.anneal_updates is None:
+            return settings.learning_rate
+        each = settings.updates * settings.epochs * settings.minibatches
+        done = self._gradient_steps / each / settings.anneal_updates
+        return settings.learning_rate * max(0.0, 1 - done)
+
+    def optimise(
+        self, rollout: TensorDictBase, generators: list[torch.Generator] | None = None
+    ) -> TensorDict:
         """Train on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
 
         Writes ``advantage`` and ``value_target`` into the rollout.
+
+        Args:
+            rollout: complete.
+            generators: as of :meth:`collect`; minibatches are shuffled by them.
 
         Returns:
             Of each replica [K], without replicas [], means over its batch and the gradient steps:
@@ -152,7 +174,14 @@ class PPO:
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
         steps = rollout.exclude(*self.agent.level_keys)
-        trained = self.train(TensorDict({"steps": steps, "level": level}))
+        for group in self._adam.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(self.learning_rate)
+            else:
+                group["lr"] = self.learning_rate
+        orders = self._minibatches.draw(generators)
+        trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
+        self._gradient_steps += len(trained["gradient_steps"])
         rollout.update(trained["steps"])
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
         return self._last_training[1].mean(0)
@@ -168,7 +197,12 @@ class PPO:
             if update:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
-            taken += [self._gradient_step(steps, level) for _ in range(self.settings.epochs)]
+            if self.settings.clip_value is not None:
+                steps.set(ACTED_VALUE, steps[value])
+            for epoch in range(self.settings.epochs):
+                order = batch.get(f"order_{update}_{epoch}", None)
+                parts = self._minibatches(steps, level, order)
+                taken += [self._gradient_step(*part) for part in parts]
         computed = steps.select(value, ("next", value), "advantage", "value_target")
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
@@ -205,8 +239,10 @@ class PPO:
 
     def prepare_for_graphs(self) -> None:
         """Let training be recorded as a CUDA graph; without, it need not be."""
-        for group in self._adam.param_groups:
-            group["capturable"] = self._parameters[0].is_cuda
+        if self._parameters[0].is_cuda:
+            for group in self._adam.param_groups:
+                group["capturable"] = True
+                group["lr"] = torch.tensor(group["lr"], device=self._parameters[0].device)
 
     def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.
@@ -229,4 +265,4 @@ class PPO:
 
     def restore(self, snapshot: TensorDictBase) -> None:
         """Put a snapshot of as many replicas back; a ValueError says why one does not fit."""
-        restore_snapshot(self.agent, self._adam, snapshot)
+        self._gradient_steps = restore_snapshot(self.agent, self._adam, snapshot)

@@ -42,8 +42,11 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
     return TensorDict(entries, batch)
 
 
-def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> None:
+def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> int:
     """Put a snapshot of as many replicas back (in place).
+
+    Returns:
+        The number of Adam's steps so far.
 
     Raises:
         ValueError: if its batch, a parameter's name or shape, or Adam's steps do not fit.
@@ -69,6 +72,7 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
         state["exp_avg"].copy_(entry["exp_avg"])
         state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
         state["step"].copy_(entry["step"].flatten()[0])
+    return int(steps[0, 0])
 
 
 def _batch(agent: ActorCritic) -> torch.Size:

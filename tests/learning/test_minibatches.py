@@ -1,0 +1,145 @@
+"""Minibatches, annealing and the clipped value loss, against the batch as a whole and formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import GymEnv
+
+from proposer_rl.learning import PPO
+from proposer_rl.models import ActorCritic
+from proposer_rl.settings import ArgumentError, PPOSettings
+from tests.learning import test_memory, test_ppo
+
+K = 2
+SETTINGS = PPOSettings(horizon=12, epochs=2, minibatches=3, learning_rate=1e-2, clip_value=0.2)
+
+
+def of_maze(settings: PPOSettings, per_step: bool) -> PPO:
+    return test_ppo.learner(K, settings, observe_agent=per_step)
+
+
+KINDS: dict[str, Callable[[PPOSettings], PPO]] = {
+    "steps": lambda settings: of_maze(settings, True),
+    "levels": lambda settings: of_maze(settings, False),
+    "memory": lambda settings: test_memory.learner(settings=settings),
+}
+
+
+@pytest.fixture(params=KINDS)
+def make(request: pytest.FixtureRequest) -> Callable[[PPOSettings], PPO]:
+    return KINDS[request.param]
+
+
+def generators(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds or range(K)]
+
+
+def parts(ppo: PPO, rollout: TensorDict) -> list[TensorDict]:
+    """Of the first epoch, each with its level's entries where an encoder reads them."""
+    level = rollout.select(*ppo.agent.level_keys)[..., 0]
+    order = ppo._minibatches.draw(generators())["order_0_0"]
+    return [some for some, _ in ppo._minibatches(rollout, level, order)]
+
+
+def test_each_step_is_in_one_part_of_its_own_replica(make: Callable[[PPOSettings], PPO]) -> None:
+    ppo = make(replace(SETTINGS, minibatches=2))
+    rollout = ppo.collect(generators())
+    number = torch.arange(rollout.numel()).reshape(*rollout.shape, 1)
+    rollout.set("advantage", number)
+    drawn = [part["advantage"].flatten(1) for part in parts(ppo, rollout)]
+    assert not torch.equal(torch.cat(drawn, 1), number.flatten(1))
+    assert torch.equal(torch.cat(drawn, 1).sort().values, number.flatten(1))
+
+
+def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(
+    make: Callable[[PPOSettings], PPO],
+) -> None:
+    ppo = make(replace(SETTINGS, minibatches=1))
+    rollout = ppo.update(generators()).rollout  # the policy has moved on from the one that acted
+    rollout.set("acted_value", rollout["state_value"])
+    level = rollout.select(*ppo.agent.level_keys)[..., 0]
+    start, metrics, gradients = ppo.snapshot(), [], []
+    orders = torch.stack([torch.randperm(ppo._minibatches._count) for _ in range(K)])
+    for order in (None, orders):
+        ppo.restore(start)
+        (part,) = ppo._minibatches(rollout, level, order)
+        metrics.append(ppo._gradient_step(*part))
+        gradients.append([p.grad.clone() for p in ppo.agent.parameters() if p.grad is not None])
+    torch.testing.assert_close(metrics[0].to_dict(), metrics[1].to_dict(), rtol=1e-4, atol=1e-5)
+    for whole, shuffled in zip(*gradients, strict=True):
+        torch.testing.assert_close(whole, shuffled, rtol=1e-3, atol=1e-5)
+
+
+def test_copies_together_are_shuffled_and_train_as_each_alone() -> None:
+    settings = replace(SETTINGS, horizon=test_memory.T)
+    together = test_memory.learner(settings=settings)
+    together.update(test_memory.generators())
+    for k in range(K):
+        alone = test_memory.learner(range(k, k + 1), settings)
+        alone.update(test_memory.generators(range(k, k + 1)))
+        for name, entry in alone.snapshot().items():
+            own = together.snapshot()[name, "value"][k]
+            torch.testing.assert_close(own, entry["value"][0], rtol=1e-4, atol=1e-5)
+
+
+def test_a_single_agent_in_a_single_environment_trains_on_minibatches() -> None:
+    layer = TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["outputs"])
+    split = TensorDictModule(lambda x: x.split([2, 1], -1), ["outputs"], ["logits", "state_value"])
+    env = GymEnv("CartPole-v1", categorical_action_encoding=True)
+    ppo = PPO(env, ActorCritic(TensorDictSequential(layer, split)), SETTINGS)
+    before = layer.module.weight.detach().clone()
+    rollout, metrics = ppo.update()
+    assert rollout["advantage"].shape == (SETTINGS.horizon, 1) and metrics["grad_norm"].isfinite()
+    assert not torch.equal(before, layer.module.weight)
+    assert {float(each["step"]) for each in ppo.snapshot().values()} == {6.0}
+
+
+def test_more_parts_than_there_are_are_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"^minibatches=7: must be at most the 6 sequences of"):
+        of_maze(replace(SETTINGS, minibatches=7), False)
+    with pytest.raises(ArgumentError, match=r"^minibatches=73: must be at most the 72 steps of"):
+        of_maze(replace(SETTINGS, minibatches=73), True)
+
+
+def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
+    """Also of a learner that a snapshot was put into; then nothing is learnt any more."""
+    settings = replace(SETTINGS, anneal_updates=4, updates=2, normalize_advantage=False)
+    ppo = of_maze(settings, True)
+    rates = []
+    for update in range(6):
+        ppo.update(generators())
+        rates.append(ppo._adam.param_groups[0]["lr"])
+        if update == 1:
+            ppo.restore(ppo.snapshot())
+            fresh = of_maze(settings, True)
+            fresh.restore(ppo.snapshot())
+            assert fresh.learning_rate == ppo.learning_rate
+    assert rates == pytest.approx([1e-2 * share for share in (1, 0.75, 0.5, 0.25, 0, 0)])
+    before = ppo.snapshot()
+    ppo.update(generators())
+    for name, entry in ppo.snapshot().items():
+        assert torch.equal(entry["value"], before[name, "value"])
+
+
+def test_a_clipped_value_loss_is_the_larger_error() -> None:
+    """Of the value, and of the value moved from the old one by at most a little."""
+    bound = 1e-3
+    ppo = of_maze(replace(SETTINGS, minibatches=1, clip_value=bound), True)
+    rollout = ppo.update(generators()).rollout
+    rollout.set("acted_value", rollout["state_value"])
+    level = rollout.select(*ppo.agent.level_keys)[..., 0]
+    with torch.no_grad():
+        value = ppo.agent(rollout.copy())["state_value"]
+    old, target = rollout["state_value"], rollout["value_target"]
+    near = torch.maximum(torch.minimum(value, old + bound), old - bound)
+    errors = torch.stack([(value - target).square(), (near - target).square()])
+    assert (errors[1] > errors[0]).any() and (errors[0] > errors[1]).any()
+    expected = ppo.settings.critic_coeff * errors.amax(0).mean((1, 2, 3))
+    found = ppo._gradient_step(rollout, level)["loss_critic"]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
