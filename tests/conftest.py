@@ -17,16 +17,19 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
-from omegaconf import OmegaConf
+from hydra.core.default_element import ResultDefault
+from omegaconf import DictConfig, OmegaConf
 
 from proposer_rl.cli import run
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.train import main
 from tests.commands import call
 from tests.processes import Processes
 
 # A busy machine makes an example slow, not wrong.
-hypothesis.settings.register_profile("proposer_rl", deadline=None)
+hypothesis.settings.register_profile("proposer_rl", deadline=None, max_examples=40)
 hypothesis.settings.load_profile("proposer_rl")
 
 
@@ -55,6 +58,23 @@ def load_once(file: Any) -> Any:
 
 
 OmegaConf.load = staticmethod(load_once)  # type: ignore[method-assign,assignment]
+
+compose = ConfigLoaderImpl._compose_config_from_defaults_list
+composed: dict[str, bytes] = {}
+
+
+def compose_once(self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: Any) -> DictConfig:
+    """The same files, one merged into the other, are the same; but those that tests write."""
+    sources = [source.path for source in repo.get_sources() if source.path]
+    if not all(path in (str(CONFIG_FOLDER), "hydra.conf") for path in sources):
+        return compose(self, defaults, repo)
+    key = repr([(default, default.override_key) for default in defaults])
+    if key not in composed:
+        composed[key] = pickle.dumps(compose(self, defaults, repo))
+    return pickle.loads(composed[key])
+
+
+ConfigLoaderImpl._compose_config_from_defaults_list = compose_once  # type: ignore[method-assign]
 
 get_mode = Hydra.get_mode
 
