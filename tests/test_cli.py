@@ -34,7 +34,7 @@ FEW = [*SMOKE, "schedule.updates=2"]
 
 @pytest.mark.parametrize("method", ["perf_gain", "task_difficulty"])
 def test_a_run_leaves_its_measurements(method: str, train, capsys) -> None:
-    """Of every method ``tests/test_needs.py`` makes a run."""
+    """Of every other method ``tests/test_needs.py`` makes a run."""
     assert train(f"+method={method}", *SMOKE, "hydra.run.dir=run") == 0
     folder = Path("run")
     metrics = read_csv(folder / "metrics.csv")

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import copy
-import json
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.meta.rewards import performance_gain
 from proposer_rl.methods import Components, proposer
-from proposer_rl.runs.folder import read_csv
+from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.tasks.mazes.task import MazeTask
 from research.ranking import EXACT, GRADIENTS, TARGET
-from tests.tiny import TASK
+from tests.tiny import TASK, composed
 
 NEEDS = needs([CONFIG_FOLDER])
 REUSED = "frozen_proposer"  # of another run's checkpoint
@@ -54,7 +55,7 @@ def test_every_method_says_what_it_needs() -> None:
 
 @pytest.mark.parametrize("method", sorted(NEEDS.keys() - {REUSED}))
 def test_every_method_runs_and_asks_for_what_it_says(
-    method: str, train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
     made = MazeTask.__init__
@@ -65,9 +66,9 @@ def test_every_method_runs_and_asks_for_what_it_says(
         self.target = self.distributions[given["target"]] = Watched(self.target, asked)
 
     monkeypatch.setattr(MazeTask, "__init__", watched)
-    assert train(f"+method={method}", *SMALL, f"hydra.run.dir={tmp_path}") == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["method"] == method and summary["frames"] == 2 * 4 * 10
+    config, signals = composed(f"+method={method}", *SMALL), StopSignals()
+    summary = build(config, parts(config, signals), RunFolder(tmp_path), signals).run()
+    assert summary["frames"] == 2 * 4 * 10
     for name in ("metrics", "training"):
         assert read_csv(tmp_path / f"{name}.csv")[-1]["updates"] == 2
     assert 0 <= read_csv(tmp_path / "metrics.csv")[-1]["ood_success"] <= 1
