@@ -22,10 +22,12 @@ from tests.tasks.gymnasium.toys import TINY
 
 # Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
-SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5"]
-QUIET = ["+scale=smoke", *FEW, *SHORT]
+SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5", "task.evaluation.levels=2"]
+QUIET = ["+scale=smoke", *FEW, *SHORT, "task.network.channels=[8,8]"]
+FITTED = ["curriculum.warmup=4", "curriculum.refit=4", "curriculum.components=2"]
 CALLED = {
-    **{method: [f"+method={method}", *QUIET] for method in ("plr", "alp_gmm", "perf_gain")},
+    **{method: [f"+method={method}", *QUIET] for method in ("plr", "perf_gain")},
+    "alp_gmm": ["+method=alp_gmm", *QUIET, *FITTED],
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
