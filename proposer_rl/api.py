@@ -21,6 +21,7 @@ from proposer_rl.curricula import (
     Schedule,
     Student,
     TaskStudent,
+    outcome_of,
 )
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
@@ -43,6 +44,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
+from proposer_rl.teaching import Items, LevelGenerator, Parameters, Teacher
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,9 +59,11 @@ __all__ = [
     "ExactEvaluator",
     "Experiment",
     "Filtered",
+    "Items",
     "LearnedCurriculum",
     "LeaveOneOutBaseline",
     "Level",
+    "LevelGenerator",
     "LevelSpec",
     "MapEncoder",
     "MazeEnv",
@@ -67,6 +71,7 @@ __all__ = [
     "Mixture",
     "MixtureHead",
     "PPOSettings",
+    "Parameters",
     "Population",
     "ProblemChoices",
     "ProblemHead",
@@ -85,10 +90,12 @@ __all__ = [
     "Student",
     "Task",
     "TaskStudent",
+    "Teacher",
     "UNet",
     "curricula",
     "generate_levels",
     "log_success_gain",
+    "outcome_of",
     "performance_gain",
     "shortest_path_length",
     "task_difficulty",

@@ -20,7 +20,8 @@ from proposer_rl.curricula import (
     outcome_of,
     require,
 )
-from proposer_rl.learning import PPO, Update, located
+from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
@@ -78,6 +79,10 @@ class Experiment:
         self.student = TaskStudent(task, learner)
         require(self.student, curriculum.needs, type(curriculum).__name__)
         self.curriculum = curriculum
+        self._continued: ContinuedLevels | None = None
+        if learner.settings.continue_episodes:
+            like = next(iter(task.evaluated_on.values()))
+            self._continued = ContinuedLevels(curriculum, self.student, learner, like)
         self.schedule = schedule
         self.seeds = list(seeds)
         self.folder = folder
@@ -203,7 +208,7 @@ class Experiment:
         if outcome.advance is not None:
             self.updates += outcome.advance.updates
             self._measure()
-            self._record(outcome.advance.levels, outcome.advance.update)
+            self._record(outcome.advance.levels, *outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
         self._pause(due=logged or self.student.frames > spent)
 
@@ -237,16 +242,23 @@ class Experiment:
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
         with self._status.phase(TRAINING):
-            batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
-            self.learner.env.set_levels(batch.levels)
-            update = self.learner.update([stream.generator("actions") for stream in streams])
-            self.learner.check()
-        self.curriculum.observe(self.student, batch, outcome_of(update.rollout))
+            if self._continued is not None:
+                update, credits = self._continued.update(streams)
+                played = self._continued.shown
+            else:
+                batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
+                self.learner.env.set_levels(batch.levels)
+                update = self.learner.update([stream.generator("actions") for stream in streams])
+                self.learner.check()
+                credits = [(batch, outcome_of(update.rollout))]
+                played = batch.levels, update.rollout
+        for credit in credits:
+            self.curriculum.observe(self.student, *credit)
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
-            self._record(batch.levels, update)
+            self._record(*played, update.metrics)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _plan(self) -> None:
@@ -277,14 +289,14 @@ class Experiment:
                 row = {"seed": seed, "updates": self.updates, "distribution": name, **reached}
                 self.folder.append("levels.jsonl", row)
 
-    def _record(self, levels: Any, update: Update) -> None:
+    def _record(self, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase) -> None:
         """Append how the training went and samples of its levels, for every copy."""
-        told = self.task.training_metrics(levels, update.rollout), update.metrics
+        told = self.task.training_metrics(levels, rollout), metrics
         for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
             self._append("training.csv", seed, {**values, **training})
         some = slice(RECORDED_LEVELS)
         for copy, seed in enumerate(self.seeds):
-            sample = self.task.record(levels[copy, some], update.rollout[copy, some])
+            sample = self.task.record(levels[copy, some], rollout[copy, some])
             row = {"updates": self.updates, "seed": seed, "levels": sample}
             self.folder.append("curriculum.jsonl", row)
             if copy == 0:
@@ -341,6 +353,7 @@ class Experiment:
             "rows": self.folder.lengths(),
             "solver": self.learner.snapshot().to_dict(),
             "curriculum": self.curriculum.state_dict(),
+            **({} if self._continued is None else {"episodes": self._continued.state_dict()}),
         }
 
     def _resume(self) -> bool:
@@ -363,6 +376,8 @@ class Experiment:
     def _restore(self, state: State) -> None:
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
         self.curriculum.load_state_dict(state["curriculum"])
+        if self._continued is not None:
+            self._continued.load_state_dict(state["episodes"])
         self.updates, self.cycles = state["updates"], state["cycles"]
         self.student.frames, self.student.evaluations = (
             state["curriculum_frames"],

@@ -24,7 +24,7 @@ CONFIG_FOLDER = next(
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
 CONSTANTS = {"null", "true", "false", "nan", "inf"}
 MISSING = "???"  # in a file: to be given
-KEYS = {"task": "task", "method": "curriculum"}
+KEYS = {"task": "task", "method": "curriculum", "filter": "filter"}
 """Where the settings of a group's files stand in the configuration."""
 
 
@@ -98,7 +98,8 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     if name.startswith("__") or name not in available(group):
         known = ", ".join(available(group))
         raise AttributeError(f"there is no {name!r}; there are: {known}")
-    settings = _settings(group, name)
+    settings = file_settings(group, name)
+    del settings["_target_"]
     parameters = [
         inspect.Parameter(
             key,
@@ -155,16 +156,20 @@ def _key(key: Any) -> str:
     return key
 
 
-def _settings(group: str, name: str) -> dict[str, Any]:
+def file_settings(group: str, name: str) -> dict[str, Any]:
     """The settings in a file and in those that it builds on, the file's own last."""
-    text = (CONFIG_FOLDER / group / f"{name}.yaml").read_text(encoding="utf-8")
-    content = yaml.safe_load(text) or {}
+    content = yaml_file(f"{group}/{name}")
     settings: dict[str, Any] = {}
     for default in content.get("defaults", ()):
         if isinstance(default, str) and default in available(group):
-            settings |= _settings(group, default)
-    settings |= content.get(KEYS[group]) or {}
-    return {key: value for key, value in settings.items() if key != "_target_"}
+            settings |= file_settings(group, default)
+    return settings | (content.get(KEYS[group]) or {})
+
+
+def yaml_file(name: str) -> dict[str, Any]:
+    """What stands in a file of the configuration, named from its folder on, without ``.yaml``."""
+    content = yaml.safe_load((CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    return content or {}
 
 
 def _about(group: str, name: str) -> str:

@@ -277,6 +277,12 @@ class PPOSettings(LearningSettings):
 
     Attributes:
         horizon: steps T collected from every environment before an update.
+        continue_episodes: whether episodes go on from rollout to rollout, and a new level begins
+            where one ends; otherwise every rollout begins with its levels.
+        normalize_observations: the numbers that are observed are shown without the mean of all that
+            a replica has trained on, in their standard deviations, cut off at 10 of them.
+        normalize_rewards: values have the standard deviation of the discounted return for a unit,
+            which is the same as rewards divided by it.
         minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
             standardised advantages) each; 1 for the batch as it is.
         anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
@@ -286,6 +292,9 @@ class PPOSettings(LearningSettings):
     """
 
     horizon: Annotated[int, Ge(1)] = 25
+    continue_episodes: bool = False
+    normalize_observations: bool = False
+    normalize_rewards: bool = False
     minibatches: Annotated[int, Ge(1)] = 1
     anneal_updates: Annotated[int, Ge(1)] | None = None
     clip_value: Annotated[float, Gt(0)] | None = None

@@ -29,6 +29,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning import PPO, first_episode_return, first_episode_success
 from proposer_rl.learning.episodes import mean_performance
+from proposer_rl.learning.rollout import RolloutCollector
 from proposer_rl.models import ActorCritic, Population, categorical, normal
 from proposer_rl.runs.pictures import pixels, png, written
 from proposer_rl.settings import SolverSettings
@@ -233,6 +234,20 @@ class Task(ABC):
         level = next(iter(self.evaluated_on.values()))[:1]
         env = self.environment(level.expand(copies, self.batch_size))
         return PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
+
+    def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:
+        """Where the Solvers of a learner play levels [K, P] that they do not train on.
+
+        Returns:
+            The environment, and what rolls out whole episodes there: the learner's own where its
+            rollouts begin with their levels.
+        """
+        if not learner.settings.continue_episodes:
+            return learner.env, learner.collector
+        level = next(iter(self.evaluated_on.values()))[:1]
+        env = self.environment(level.expand(*learner.env.batch_size))
+        horizon = max(self.max_steps, learner.horizon)
+        return env, RolloutCollector(env, learner.agent, horizon)
 
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator

@@ -190,6 +190,10 @@ WRONG = [
     ("compute.worker_devices=[]", "compute.worker_devices=[]: list should have at least 1 item"),
     # contradictions
     (
+        "solver.ppo.continue_episodes=true",
+        "solver.ppo.continue_episodes=True: this Solver reads its level once for a whole rollout",
+    ),
+    (
         "solver.ppo.minibatches=129",
         "solver.ppo.minibatches=129: must be at most the 128 sequences of a batch",
     ),

@@ -18,7 +18,6 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
-    level_keys,
     replay_weights,
     rescore,
 )
@@ -34,6 +33,7 @@ from proposer_rl.curricula.contract import (
 )
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
 from proposer_rl.curricula.gaussians import MixtureCurriculum
+from proposer_rl.curricula.keys import level_keys
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer
 from proposer_rl.curricula.progress import LearningProgressCurriculum

@@ -12,6 +12,7 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 - ``filled`` bool: whether there is one; nothing else of an empty slot counts;
 - ``score`` float64; ``best`` float32, the highest return that was ever seen on the level, and
   ``solved`` bool, whether an episode there ever was a success;
+- ``reached`` float32, the return when the level was trained on last; else minus infinity;
 - ``touched`` int64: the clock when it was drawn or scored last. A clock counts the levels that were
   drawn or scored; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
@@ -23,13 +24,15 @@ Functions return a changed copy and leave the buffer that they are given as it w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from hashlib import blake2b
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula.keys import level_keys
+from proposer_rl.curricula.slots import draw
+from proposer_rl.curricula.slots import insert as insert_levels
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
@@ -72,6 +75,7 @@ def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
             "filled": torch.zeros(shape, dtype=torch.bool),
             "score": torch.zeros(shape, dtype=torch.float64),
             "best": torch.full(shape, -torch.inf),
+            "reached": torch.full(shape, -torch.inf),
             "solved": torch.zeros(shape, dtype=torch.bool),
             **{name: torch.zeros(shape, dtype=torch.int64) for name in numbers},
         },
@@ -95,26 +99,36 @@ def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
         >>> score_weights(score, score < 1, ReplayRule(temperature=1.0))
         tensor([0.4380, 0.1095, 0.2190, 0.1460, 0.0876], dtype=torch.float64)
     """
-    score = score.double()
-    known = score.where(filled, -torch.inf)
-    order = known.argsort(dim=-1, descending=True, stable=True)
-    rank = torch.empty_like(order).scatter_(
-        -1, order, torch.arange(1, score.shape[-1] + 1).expand_as(order)
-    )
-    counted = filled if rule.best is None else filled & (rank <= rule.best)
+    known = score.double().where(filled, -torch.inf)
+    falling, order = known.sort(dim=-1, descending=True, stable=True)
+    shares = shares_by_rank(falling, filled.sum(-1, keepdim=True), rule)
+    return torch.zeros_like(shares).scatter_(-1, order, shares)
+
+
+def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
+    """Shares of the best score, the second best and so on: float64 [*B, N].
+
+    Args:
+        falling: the scores, float64 [*B, N].
+        count: how many of them there are, int64 [*B, 1]; the others come last, and get none.
+        rule: of the draws.
+    """
+    rank = torch.arange(1, falling.shape[-1] + 1)
+    exists = rank <= count
+    counted = exists if rule.best is None else exists & (rank <= rule.best)
     if rule.prioritization == "rank":
         weight = rank.double() ** (-1 / rule.temperature)
     elif rule.prioritization == "proportional":
         # Divided by the largest, so that no power of it is infinite.
-        largest = known.amax(-1, keepdim=True).clamp_min(torch.finfo(score.dtype).tiny)
-        weight = (known / largest).clamp_min(0) ** (1 / rule.temperature)
+        largest = falling[..., :1].clamp_min(torch.finfo(falling.dtype).tiny)
+        weight = (falling / largest).clamp_min(0) ** (1 / rule.temperature)
     else:
-        logits = known.where(counted, -torch.inf) / rule.temperature
-        weight = (logits - logits.amax(-1, keepdim=True)).exp()
+        logits = falling.where(counted, -torch.inf) / rule.temperature
+        weight = (logits - logits[..., :1]).exp()
     weight = weight.where(counted, 0.0)
-    lowest = score.where(filled, torch.inf).amin(-1, keepdim=True)
-    alike = (known.amax(-1, keepdim=True) == lowest) | (weight.sum(-1, keepdim=True) == 0)
-    return _shares(weight.where(~alike, filled.double()))
+    lowest = falling.gather(-1, (count - 1).clamp_min(0))
+    alike = (falling[..., :1] == lowest) | (weight.sum(-1, keepdim=True) == 0)
+    return _shares(weight.where(~alike, exists.double()))
 
 
 def staleness_weights(age: Tensor, filled: Tensor) -> Tensor:
@@ -150,21 +164,16 @@ def draw_slots(
     Returns:
         Slots int64 [K, P], and the buffer afterwards.
     """
-    filled, by_score = buffer["filled"], score_weights(buffer["score"], buffer["filled"], rule)
-    touched, clock = buffer["touched"].clone(), buffer["clock"].clone()
-    noise = torch.stack([torch.rand(count, generator=g, dtype=torch.float64) for g in generators])
-    slots = torch.empty(noise.shape, dtype=torch.int64)
-    for i in range(count):
-        by_age = staleness_weights(clock - touched, filled)
-        cumulative = ((1 - rule.staleness) * by_score + rule.staleness * by_age).cumsum(-1)
-        mark = noise[:, i : i + 1] * cumulative[:, -1:]
-        # An empty slot adds nothing to the sum, so that no mark lies in it.
-        slot = torch.searchsorted(cumulative, mark, right=True).clamp_(max=filled.shape[-1] - 1)
-        clock += 1
-        touched.scatter_(1, slot, clock.gather(1, slot))
-        slots[:, i : i + 1] = slot
+    by_score = score_weights(buffer["score"], buffer["filled"], rule).numpy()
+    changed = {name: buffer[name].clone() for name in ("touched", "clock")}
+    drawn = []
+    for copy, generator in enumerate(generators):
+        numbers = _row({"filled": buffer["filled"], **changed}, copy)
+        noise = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
+        drawn.append(torch.from_numpy(draw(numbers, by_score[copy], rule.staleness, noise)))
+    slots = torch.stack(drawn)
     draws = buffer["draws"].scatter_add(1, slots, torch.ones_like(slots))
-    return slots, _changed(buffer, touched=touched, clock=clock, draws=draws)
+    return slots, _changed(buffer, **changed, draws=draws)
 
 
 def insert(
@@ -179,35 +188,54 @@ def insert(
     Args:
         buffer: [K, N].
         new: [K, M] with ``level``, ``score``, ``best`` and ``solved``, and where it is not zero
-            ``parent`` and ``generation``. Scores that are not finite are those of levels not to be
-            kept.
+            ``parent`` and ``generation``; ``reached`` where they were trained on. Scores that are
+            not finite are those of levels not to be kept.
         rule: of the draws.
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
-    key = level_keys(new["level"])
-    same, none = _alike(key), torch.zeros_like(key)
-    told = {
-        "score": _means(same, new["score"]),
-        "best": new["best"].unsqueeze(-2).where(same, -torch.inf).amax(-1),
-        "solved": (new["solved"].unsqueeze(-2) & same).any(-1),
-        "key": key,
-        "parent": new.get("parent", none),
-        "generation": new.get("generation", none),
-        "draws": none,
-    }
+    keys = level_keys(new["level"])
+    none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
     buffer = buffer.clone()
-    for copy in range(len(key)) if wanted is None else wanted.nonzero().flatten().tolist():
-        numbers = {name: entry[copy] for name, entry in buffer.items() if name != "level"}
-        source = torch.full_like(numbers["key"], -1)  # which new level lies in each slot
-        for i, values in enumerate(zip(*(entry[copy] for entry in told.values()), strict=True)):
-            _insert_one(numbers, source, i, dict(zip(told, values, strict=True)), rule)
-        slots = (source >= 0).nonzero().flatten()
-        buffer["level"][copy, slots] = new["level"][copy, source[slots]].cpu()
+    for copy in range(len(keys)) if wanted is None else wanted.nonzero().flatten().tolist():
+        score, *seen = _of_equals(keys[copy], *(new[name][copy] for name in ("score", *SEEN)))
+        row = _row(buffer.exclude("level"), copy)
+        source, again = insert_levels(
+            row,
+            keys[copy].tolist(),
+            score.tolist(),
+            rule.staleness,
+            lambda falling: shares_by_rank(
+                torch.from_numpy(falling), torch.tensor([len(falling)]), rule
+            ).numpy(),
+            by_rank=rule.prioritization == "rank",
+        )
+        if again:
+            slots, which = torch.tensor(again).unbind(1)
+            for name, entry in zip(SEEN, seen, strict=True):
+                there = buffer[name][copy]
+                there.scatter_reduce_(0, slots, entry[which].to(there), "amax")
+        slots = torch.from_numpy((source >= 0).nonzero()[0])
+        which = torch.from_numpy(source)[slots]
+        told = {
+            **dict(zip(SEEN, seen, strict=True)),
+            "parent": new.get("parent", none)[copy],
+            "generation": new.get("generation", none)[copy],
+            "draws": none[copy],
+            "reached": new.get("reached", unknown)[copy],
+        }
+        for name, entry in told.items():
+            buffer[name][copy, slots] = entry[which].to(buffer[name])
+        buffer["level"][copy, slots] = new["level"][copy, which].cpu()
     return buffer
 
 
 def rescore(
-    buffer: TensorDictBase, slots: Tensor, score: Tensor, best: Tensor, solved: Tensor
+    buffer: TensorDictBase,
+    slots: Tensor,
+    score: Tensor,
+    best: Tensor,
+    solved: Tensor,
+    reached: Tensor | None = None,
 ) -> TensorDict:
     """New scores of levels that were drawn.
 
@@ -217,75 +245,41 @@ def rescore(
         score: float [K, P]; one that is not finite leaves the level's old score.
         best: float [K, P], the highest returns, of which the highest ever is kept.
         solved: bool [K, P], whether there was a success, of which one is enough for ever.
+        reached: float [K, P], the returns, taken as scores are; None where nobody was trained.
     """
-    finite = score.double().where(score.isfinite(), 0.0)
-    none = torch.zeros_like(buffer["score"])
-    counts = none.scatter_add(1, slots, score.isfinite().to(none))
-    means = none.scatter_add(1, slots, finite.to(none)) / counts
-    scores = means.where(counts > 0, buffer["score"])
+    new = {"score": score, **({} if reached is None else {"reached": reached})}
+    means = {name: _mean_of_slots(buffer[name], slots, entry) for name, entry in new.items()}
     seen = {
         name: buffer[name].scatter_reduce(1, slots, new.to(buffer[name]), "amax")
         for name, new in zip(SEEN, (best, solved), strict=True)
     }
-    return _changed(buffer, score=scores, **seen)
+    return _changed(buffer, **means, **seen)
 
 
-def level_keys(levels: Any) -> Tensor:
-    """A number for each level, equal for equal levels and else different: int64 [*B].
+def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
+    """What slots [K, N] held, or the mean of what is new and finite in them, both [K, P]."""
+    finite, none = new.isfinite(), torch.zeros_like(old, dtype=torch.float64)
+    counts = none.scatter_add(1, slots, finite.double())
+    means = none.scatter_add(1, slots, new.double().where(finite, 0.0)) / counts
+    return means.to(old).where(counts > 0, old)
 
-    Hashes of the bytes of all entries: two levels collide with a probability of 2^-64.
-    """
-    entries = (levels.get(name).cpu() for name in sorted(levels.keys(True, True), key=str))
-    rows = [entry.reshape(levels.batch_size.numel(), -1).numpy() for entry in entries]
-    keys = [
-        int.from_bytes(
-            blake2b(b"".join(row[i].tobytes() for row in rows), digest_size=8).digest(),
-            "little",
-            signed=True,
-        )
-        for i in range(levels.batch_size.numel())
+
+def _row(buffer: Any, copy: int) -> dict[str, Any]:
+    """The numbers of one student, as arrays that share the buffer's memory."""
+    return {name: entry[copy].numpy() for name, entry in buffer.items()}
+
+
+def _of_equals(key: Tensor, score: Tensor, best: Tensor, solved: Tensor) -> list[Tensor]:
+    """Numbers [M] as those of all equal levels: finite scores' mean, the highest, whether any."""
+    groups, group = key.unique(return_inverse=True)
+    finite, none = score.isfinite(), torch.zeros(len(groups), dtype=torch.float64)
+    total = none.scatter_add(0, group, score.double().where(finite, 0.0))
+    mean = total / none.scatter_add(0, group, finite.double())
+    highest = [
+        torch.full((len(groups),), low, dtype=entry.dtype).scatter_reduce(0, group, entry, "amax")
+        for low, entry in ((-torch.inf, best), (0, solved.int()))
     ]
-    return torch.tensor(keys, dtype=torch.int64).reshape(levels.batch_size)
-
-
-def _insert_one(
-    numbers: dict[str, Tensor], source: Tensor, i: int, new: dict[str, Tensor], rule: ReplayRule
-) -> None:
-    """Insert the i-th new level among those of one copy, [N] each, in place."""
-    clock, filled, score = numbers["clock"], numbers["filled"], numbers["score"]
-    clock += 1
-    if not bool(new["score"].isfinite()):
-        return
-    same = filled & (numbers["key"] == new["key"])
-    if bool(same.any()):
-        slot = int(same.nonzero()[0])
-        score[slot] = new["score"]
-        for name in SEEN:
-            numbers[name][slot] = torch.maximum(numbers[name][slot], new[name])
-    else:
-        free = (~filled).nonzero()
-        if len(free):
-            slot = int(free[0])
-        else:
-            slot = int(replay_weights(score, clock - numbers["touched"], filled, rule).argmin())
-            if not bool(new["score"] > score[slot]):
-                return
-        filled[slot] = True
-        source[slot] = i
-        for name, value in new.items():
-            numbers[name][slot] = value
-    numbers["touched"][slot] = clock[slot]
-
-
-def _alike(group: Tensor) -> Tensor:
-    """Which entries have the same number [K, M]: bool [K, M, M]."""
-    return group.unsqueeze(-1) == group.unsqueeze(-2)
-
-
-def _means(same: Tensor, score: Tensor) -> Tensor:
-    """Means of the finite scores [K, M] over what is the same, bool [K, M, M]; else nan."""
-    counts = same & score.isfinite().unsqueeze(-2)
-    return score.double().unsqueeze(-2).where(counts, torch.nan).nanmean(-1)
+    return [entry[group] for entry in (mean, *highest)]
 
 
 def _shares(weight: Tensor) -> Tensor:

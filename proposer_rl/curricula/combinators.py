@@ -28,6 +28,7 @@ class _Combinator(LearnedCurriculum):
     def __init__(self, parts: Sequence[Curriculum]) -> None:
         self.parts = list(parts)
         self.needs = tuple(dict.fromkeys(need for part in parts for need in part.needs))
+        self.reads = tuple(dict.fromkeys(entry for part in parts for entry in part.reads))
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:

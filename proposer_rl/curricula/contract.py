@@ -75,7 +75,7 @@ class Batch:
 
 
 def outcome_of(rollout: TensorDictBase) -> TensorDict:
-    """What came of training on levels, from TorchRL's rollout [K, n, T] on them.
+    """What came of training on levels, from TorchRL's rollout [K, n, T] or [n, T] on them.
 
     Every outcome is a tensordict [K, n] with
 
@@ -83,7 +83,8 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
       loop has played there;
     - ``success`` float in [0, 1], where there is such a thing: likewise;
     - ``episodes`` and ``steps`` int64: how many episodes ended, and how long all of it was;
-    - ``rollout`` [K, n, T], where there is one, with ``state_value`` where there is a critic.
+    - ``rollout`` [K, n, T], where there is one, with ``state_value`` where there is a critic;
+    - ``score`` float, where the loop itself says how much there is to learn on a level.
 
     Curricula without a use for an entry do not ask for it; ``return`` must be there.
     """
@@ -97,7 +98,7 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
             "steps": torch.full_like(episodes, done.shape[-1]),
             "rollout": rollout,
         },
-        rollout.batch_size[:2],
+        rollout.batch_size[:-1],
     )
 
 
@@ -108,12 +109,15 @@ class Curriculum:
 
     Attributes:
         needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
+        reads: entries of an outcome, beside the return, that it cannot do without: ``success``,
+            ``rollout``.
         remembers: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
             and dicts of these, and objects with a state of their own. Others are for
             :meth:`state_dict`.
     """
 
     needs: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
     remembers: ClassVar[tuple[str, ...]] = ()
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -251,7 +255,7 @@ class Inbox:
             )
         if "return" not in outcome.keys():
             raise ValueError(f"the outcome has no return, only {sorted(map(str, outcome.keys()))}")
-        for name in ("return", "success"):
+        for name in ("return", "success", "score"):
             if name in outcome.keys() and not bool(outcome[name].isfinite().all()):
                 raise ValueError(f"the outcome's {name} is not finite on every level")
         if not {"number", "place", "size"} <= {*notes.keys()}:

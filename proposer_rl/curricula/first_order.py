@@ -129,6 +129,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
     """
 
     needs = ("play", "sampled_direction", "sampled_alignment")
+    reads = ("rollout",)
     remembers = (*BinCurriculum.remembers, "_direction")
 
     @checked

@@ -65,6 +65,7 @@ class LearningProgressCurriculum(BinCurriculum):
     ) -> None:
         super().__init__(space, every=every)
         self.needs = ("performance",) if source == "exact" else ()
+        self.reads = ("success",) if (source, measure) == ("episodes", "success") else ()
         self._source, self._probes = source, Probes(space, probes, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration
         # Sum and number of what came of each bin since the last scoring pass, [K, N].

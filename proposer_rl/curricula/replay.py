@@ -31,11 +31,11 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
-    level_keys,
     replay_weights,
     rescore,
 )
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.keys import level_keys
 from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
@@ -114,7 +114,10 @@ class ReplayCurriculum(Curriculum):
                 f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
                 "before each draw, what is added to them is lost"
             )
-        self.needs = scorer.needs
+        # Levels are scored aside where they are new and not trained on, edited, or renewed.
+        aside = not train_on_new or edits or renew
+        self.needs = scorer.needs if aside else scorer.asks
+        self.reads = (*scorer.reads, *(("rollout",) if edits and parents == "easy" else ()))
         self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
         self._capacity, self._warm, self._probability = (
             capacity,
@@ -171,7 +174,9 @@ class ReplayCurriculum(Curriculum):
         if not bool(replayed.all()):
             levels[~replayed] = self._fresh(count, streams, "new")[~replayed]
         each = replayed.unsqueeze(-1)
-        known = {name: self.buffer[name].gather(1, slots) for name in (*SEEN, "key")}
+        known = {name: self.buffer[name].gather(1, slots) for name in (*SEEN, "key", "reached")}
+        reached = self.buffer["reached"]
+        mean = reached.where(reached.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return self._inbox.batch(
             levels.to(self._device),
             slot=slots,
@@ -179,6 +184,7 @@ class ReplayCurriculum(Curriculum):
             key=known["key"],
             best=known["best"].where(each, -torch.inf),
             solved=known["solved"] & each,
+            before=known["reached"].where(each, mean.nan_to_num(-torch.inf)),
         )
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
@@ -187,8 +193,9 @@ class ReplayCurriculum(Curriculum):
         notes = batch.notes
         evidence = {"level": batch.levels.cpu(), **notes.select("slot", "replayed", "key")}
         if self.scorer.from_episodes:
-            scored = self.scorer.of_outcome(student, outcome, notes["best"], notes["solved"])
-            evidence |= scored._asdict()
+            known = (notes[name] for name in (*SEEN, "before"))
+            evidence |= self.scorer.of_outcome(student, outcome, *known)._asdict()
+            evidence["reached"] = outcome["return"].float()
         if self._edits and self._parents == "easy":
             evidence["easy"] = _easiness(student, outcome)
         self._came_back["levels"] += notes.batch_size.numel()
@@ -242,7 +249,8 @@ class ReplayCurriculum(Curriculum):
         for evidence in self._inbox.take(whole=self._edits > 0 and self._parents == "easy"):
             self._last = evidence.select("level", "place")
             if self.scorer.from_episodes:
-                self._take(evidence, Scored(*(evidence[name] for name in Scored._fields)))
+                scored = Scored(*(evidence[name] for name in Scored._fields))
+                self._take(evidence, scored, evidence["reached"])
             if self._edits or not self.scorer.from_episodes:
                 self._due.append(evidence)
 
@@ -301,11 +309,13 @@ class ReplayCurriculum(Curriculum):
         self,
         levels: Levels,
         scored: Scored,
-        origin: Mapping[str, Tensor] | None = None,
+        more: Mapping[str, Tensor | None] | None = None,
         wanted: Tensor | None = None,
     ) -> None:
         """Keep the better ones of new levels [K, n]."""
-        new = TensorDict({"level": levels, **scored._asdict(), **(origin or {})}, levels.shape[:2])
+        entries = {"level": levels, **scored._asdict(), **(more or {})}
+        known = {name: entry for name, entry in entries.items() if entry is not None}
+        new = TensorDict(known, levels.shape[:2])
         self.buffer = insert(self.buffer, new, self._rule, wanted)
         self._scored += new.shape[1]
 
@@ -323,7 +333,9 @@ class ReplayCurriculum(Curriculum):
         scored = self._score(student, levels_at(self.buffer["level"], slots), streams, "all")
         self.buffer = rescore(self.buffer, slots, *scored)
 
-    def _take(self, evidence: TensorDictBase, scored: Scored) -> None:
+    def _take(
+        self, evidence: TensorDictBase, scored: Scored, reached: Tensor | None = None
+    ) -> None:
         """Take the scores of levels that were trained on: new ones go into the buffer."""
         replayed = evidence["replayed"][:, 0]
         slots, old = evidence["slot"], self.buffer
@@ -336,13 +348,14 @@ class ReplayCurriculum(Curriculum):
                 scored.score.where(there, -torch.inf),
                 scored.best.where(there, -torch.inf),
                 scored.solved & there,
+                None if reached is None else reached.where(there, -torch.inf),
             )
             if self._co_learnability:
                 after = self._credit(old, after, slots, replayed)
             self.buffer = old.clone()
             self.buffer[replayed] = after[replayed]
         if not bool(replayed.all()):
-            self._add(evidence["level"], scored, wanted=~replayed)
+            self._add(evidence["level"], scored, {"reached": reached}, ~replayed)
 
     def _credit(
         self, old: TensorDictBase, after: TensorDict, slots: Tensor, replayed: Tensor

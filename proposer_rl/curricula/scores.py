@@ -24,6 +24,12 @@ regret                   R - mean return                J* - J
 gradient_norm            the same of a policy gradient  squared norm of the gradient of J
 =======================  =============================  ====================================
 
+Where a loop gives what came of an episode but no rollout, the episode counts as one step, and in
+the critic's place stands the return of the level when it was trained on before (of a new level the
+mean of these over the buffer): value losses are then absolute learning progress (Portelas et al.
+2019, arXiv 1910.07224), and only ``return_variance`` and ``gradient_norm`` cannot be had. A score
+that the loop gives itself takes the place of all this.
+
 Sources: learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4), variance of a return
 that is 0 or 1; regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm: PACE (arXiv
 2605.01358); the first five: :mod:`~proposer_rl.curricula.stepwise`. The critic is discounted and R
@@ -49,6 +55,12 @@ from proposer_rl.task import Levels
 
 Source = Literal["episodes", "exact"]
 
+READS = {
+    "learnability": ("success",),
+    "mean_negative_advantage": ("success",),
+    "return_variance": ("rollout",),
+    "gradient_norm": ("rollout",),
+}
 AT_ONCE = 1024  # levels of each Solver that are evaluated at once
 
 
@@ -125,6 +137,8 @@ class Scorer:
     Attributes:
         from_episodes: whether levels are scored by playing on them.
         needs: what scoring levels asks of a student, that nobody trains on.
+        asks: what scoring those that were trained on asks of it.
+        reads: entries of an outcome that this needs beside the return.
 
     Raises:
         ArgumentError: if there is no such score, or not from this source.
@@ -139,40 +153,44 @@ class Scorer:
         }[source]
         if score not in available:
             raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
-        self.needs = EXACT[score].needs if source == "exact" else ("play",)
-        if self.from_episodes and score == "gradient_norm":
-            self.needs += ("policy_gradient_norms",)
+        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score].needs
+        self.reads: tuple[str, ...] = ()
+        if self.from_episodes:
+            self.asks = {"gradient_norm": ("policy_gradient_norms",)}.get(score, ())
+            self.reads = READS.get(score, ())
+        self.needs = (*(("play",) if self.from_episodes else ()), *self.asks)
 
     def of_outcome(
-        self, student: Student, outcome: TensorDictBase, best: Tensor, solved: Tensor
+        self,
+        student: Student,
+        outcome: TensorDictBase,
+        best: Tensor,
+        solved: Tensor,
+        before: Tensor,
     ) -> Scored:
         """Score levels [K, n] by what came of training on them.
 
         Args:
             student: whose critic and discount count.
-            outcome: with a rollout; without one, learnability and regret take what it says of
-                success and return.
+            outcome: with a ``score``, a ``rollout``, or neither.
             best: see :meth:`of_rollouts`.
             solved: the same.
+            before: the return of each level when it was trained on before, float [K, n]; minus
+                infinity where nothing is known.
 
         Raises:
-            ValueError: if there is no rollout where the score needs one.
+            ValueError: if the outcome lacks what :attr:`reads` names.
         """
+        for entry in self.reads:
+            if not {entry, "rollout"} & {*outcome.keys()}:
+                raise ValueError(f"score={self._name}: the outcome has no {entry}")
         if "rollout" in outcome.keys():
-            return self.of_rollouts(student, [outcome["rollout"]], best, solved)
-        reached, success = outcome["return"].cpu().double(), outcome.get("success", None)
-        best = torch.maximum(best.double(), reached)
-        if success is not None:
-            success = success.cpu().double()
-            solved = solved | (success > 0)
-        if self._name == "regret":
-            score = best - reached
-        elif self._name == "learnability" and success is not None:
-            score = success * (1 - success)
+            scored = self.of_rollouts(student, [outcome["rollout"]], best, solved)
         else:
-            needed = "success" if self._name == "learnability" else "rollout"
-            raise ValueError(f"score={self._name}: the outcome has no {needed}")
-        return Scored(score, best.float(), solved)
+            scored = _of_returns(self._name, outcome.cpu(), best, solved, before)
+        if "score" in outcome.keys():
+            scored = scored._replace(score=outcome["score"].double().cpu())
+        return scored
 
     def of_rollouts(
         self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor, solved: Tensor
@@ -236,9 +254,35 @@ class Scorer:
                     )
                     for again in range(self.rollouts)
                 ]
-                scored.append(self.of_rollouts(student, played, *unseen(some.shape[:2])))
+                new = unseen(some.shape[:2])
+                if "next" in played[0].keys():
+                    scored.append(self.of_rollouts(student, played, *new))
+                else:
+                    mean = torch.stack(played).mean(0)
+                    scored.append(self.of_outcome(student, mean, *new, new[0]))
             else:
                 with torch.no_grad():
                     score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
                 scored.append(Scored(score, *unseen(score.shape)))
         return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
+
+
+def _of_returns(
+    name: str, outcome: TensorDictBase, best: Tensor, solved: Tensor, before: Tensor
+) -> Scored:
+    """A score of levels [K, n] from returns and success alone; see the module's text."""
+    reached = outcome["return"].double()
+    success = outcome.get("success", torch.zeros_like(reached)).double()
+    value = before.double().where(before.isfinite(), reached)
+    best, solved = torch.maximum(best.double(), reached), solved | (success > 0)
+    gained = reached - value
+    score = {
+        "positive_value_loss": gained.clamp_min(0),
+        "l1_value_loss": gained.abs(),
+        "one_step_td_error": gained.abs(),
+        "max_mc": best - value,
+        "mean_negative_advantage": (-gained).clamp_min(0).where(solved, 0.0),
+        "regret": best - reached,
+        "learnability": success * (1 - success),
+    }[name]
+    return Scored(score, best.float(), solved)

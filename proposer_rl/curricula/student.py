@@ -14,9 +14,11 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from proposer_rl.learning import PPO
 from proposer_rl.learning.advantages import gae
+from proposer_rl.learning.rollout import RolloutCollector
 from proposer_rl.meta.first_order import (
     Direction,
     alignment,
@@ -76,8 +78,9 @@ class Student:
     play: Callable[[Levels, Sequence[torch.Generator]], TensorDictBase]
     """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
 
-    TorchRL's, with ``state_value`` where a score reads a critic. Actions of student k are drawn
-    from the k-th generator.
+    TorchRL's, with ``state_value`` where a score reads a critic; or only an outcome [K, n], as
+    :func:`~proposer_rl.curricula.outcome_of` describes it. Actions of student k are drawn from the
+    k-th generator.
     """
     performance: Callable[[Levels, torch.Generator], TensorDictBase]
     """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].
@@ -192,6 +195,7 @@ class TaskStudent(Student):
             **{name: getattr(self, f"_{name}") for name in ABILITIES},
         )
         self._task, self._learner = task, learner
+        self._beside: tuple[EnvBase, RolloutCollector] | None = None
         self._norms: Callable[..., Tensor] | None = None
         self._policy_norms: Callable[..., Tensor] | None = None
 
@@ -215,15 +219,17 @@ class TaskStudent(Student):
     @torch.no_grad()
     def _values(self, levels: Levels) -> Tensor:
         agent, count = self._learner.agent, levels.shape[1]
-        self._learner.env.set_levels(self._filled_up(levels))
-        state = self._learner.env.reset()
+        env, _ = self._spectators()
+        env.set_levels(self._filled_up(levels))
+        state = env.reset()
         state.update(agent.no_memory(state))
         return agent.decode(state, agent.encode(state))[VALUE].squeeze(-1)[:, :count]
 
     def _play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
         count = levels.shape[1]
-        self._learner.env.set_levels(self._filled_up(levels))
-        rollout = self._learner.collect(list(generators))
+        env, collector = self._spectators()
+        env.set_levels(self._filled_up(levels))
+        rollout = collector.collect(list(generators))
         self.spend(frames=rollout[0].numel())
         return rollout if count == rollout.shape[1] else rollout[:, :count]
 
@@ -300,6 +306,10 @@ class TaskStudent(Student):
 
     def _restore(self, snapshot: TensorDictBase) -> None:
         self._learner.restore(snapshot)
+
+    def _spectators(self) -> tuple[EnvBase, RolloutCollector]:
+        self._beside = self._beside or self._task.spectators(self._learner)
+        return self._beside
 
     def _filled_up(self, levels: Levels) -> Levels:
         """As many levels as the environment takes: the last one over again."""

@@ -37,8 +37,9 @@ from proposer_rl.learning.losses import (
 from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
+from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import PPOSettings
+from proposer_rl.settings import ArgumentError, PPOSettings
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -100,8 +101,11 @@ class PPO:
                 f"be {agent.copies}; its batch size is {list(env.batch_size)}"
             )
         self.env, self.agent, self.settings = env, agent, settings
-        self.collector = RolloutCollector(env, agent, settings.horizon)
+        self.collector = RolloutCollector(
+            env, agent, settings.horizon, continued=settings.continue_episodes
+        )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
+        self.statistics = Statistics(env, agent, settings)
         self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
         clipped = partial(
             CopiesClipLoss,
@@ -133,7 +137,7 @@ class PPO:
         return Update(rollout, self.optimise(rollout, generators))
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """Reset the environment and act for a horizon.
+        """Reset the environment, unless its episodes go on, and act for a horizon.
 
         Args:
             generators: one for each index of the environment's first dimension, from which its
@@ -173,6 +177,8 @@ class PPO:
             them; ``explained_variance``, ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
+        first = not self._gradient_steps
+        self.statistics.before(rollout, level, first=first)
         steps = rollout.exclude(*self.agent.level_keys)
         for group in self._adam.param_groups:
             if isinstance(group["lr"], Tensor):
@@ -183,6 +189,7 @@ class PPO:
         trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
         self._gradient_steps += len(trained["gradient_steps"])
         rollout.update(trained["steps"])
+        self.statistics.after(rollout, first=first)
         self._last_training = rollout["next", "reward"], trained["gradient_steps"]
         return self._last_training[1].mean(0)
 
@@ -210,6 +217,8 @@ class PPO:
         agent, copies = self.agent, self.agent.copies
         with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
             steps = agent.decode(steps.copy(), agent.encode(level))
+        trained_on = agent.value_key, ACTED_VALUE, "value_target", "advantage"
+        steps = self.statistics.in_units(steps, *trained_on)
         losses = self._loss(steps)
         metrics = {
             key: of_copies(losses[key], copies)
@@ -238,7 +247,13 @@ class PPO:
         return rollout
 
     def prepare_for_graphs(self) -> None:
-        """Let training be recorded as a CUDA graph; without, it need not be."""
+        """Let training be recorded as a CUDA graph; without, it need not be.
+
+        Raises:
+            ArgumentError: if episodes go on, of which each step has to be asked whether it ends.
+        """
+        if self.settings.continue_episodes:
+            raise ArgumentError("continue_episodes=True: cannot be recorded as a CUDA graph")
         if self._parameters[0].is_cuda:
             for group in self._adam.param_groups:
                 group["capturable"] = True
@@ -264,5 +279,10 @@ class PPO:
         return take_snapshot(self.agent, self._adam)
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Put a snapshot of as many replicas back; a ValueError says why one does not fit."""
+        """Put a snapshot of as many replicas back; a ValueError says why one does not fit.
+
+        Episodes that would have gone on begin anew.
+        """
+        self.collector.begin_anew()
+        self.statistics.discounted = None
         self._gradient_steps = restore_snapshot(self.agent, self._adam, snapshot)

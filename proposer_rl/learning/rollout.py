@@ -10,26 +10,45 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
+from proposer_rl.learning.continued import ContinuedEpisodes
 from proposer_rl.models import ActorCritic, draw, uniform_noise
+from proposer_rl.settings import ArgumentError
 
 
 class RolloutCollector:
-    """A TorchRL collector that begins every rollout with a reset.
+    """A TorchRL collector that begins every rollout with a reset, or goes on with its episodes.
 
     Args:
         env: batch [*B]. What the agent's encoder reads must stay the same until its next reset.
         agent: that acts.
         horizon: steps T of a rollout.
+        continued: whether episodes go on from rollout to rollout, with an agent's memory of them.
+
+    Attributes:
+        episodes: the environment as one whose episodes go on; None where they do not.
+        memory: of an agent whose episodes go on, batch [*B]; None before the first rollout.
+
+    Raises:
+        ArgumentError: if the agent reads its level once per rollout, and episodes are to go on.
     """
 
-    def __init__(self, env: EnvBase, agent: ActorCritic, horizon: int) -> None:
+    def __init__(
+        self, env: EnvBase, agent: ActorCritic, horizon: int, *, continued: bool = False
+    ) -> None:
+        if continued and agent.level_keys:
+            raise ArgumentError(
+                "continue_episodes=True: this Solver reads its level once for a whole rollout; "
+                "leave False"
+            )
+        self.episodes = ContinuedEpisodes(env) if continued else None
+        self.memory: TensorDictBase | None = None
         self._agent = agent
         self._action = env.full_action_spec[agent.action_key]
         self._horizon = horizon
         self._level = _LevelAside(*agent.level_keys)
         self._policy = RolloutPolicy(agent)
         self._collector = Collector(
-            _WithoutLevel(env, self._level),
+            _WithoutLevel(self.episodes or env, self._level, auto_unwrap=False),
             self._policy,
             frames_per_batch=env.batch_size.numel() * horizon,
             total_frames=-1,
@@ -39,6 +58,13 @@ class RolloutCollector:
             auto_register_policy_transforms=False,
             no_cuda_sync=True,
         )
+        self.begin_anew()  # a collector resets what it gets
+
+    def begin_anew(self) -> None:
+        """Begin the next rollout with a reset in any case."""
+        self.memory = None
+        if self.episodes is not None:
+            self.episodes.begin_anew()
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
         """A complete rollout [*B, T]; see :meth:`~proposer_rl.learning.ppo.PPO.collect`."""
@@ -54,8 +80,10 @@ class RolloutCollector:
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
         """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
-        self._policy.begin(inputs["noise"], self._level)
+        self._policy.begin(inputs["noise"], self._level, self.memory)
         rollout = self._collector.rollout()
+        if self.episodes is not None:
+            self.memory = self._policy.memory
         set_next_values(self._agent, rollout, self._policy.context)
         return TensorDict({"rollout": rollout, "level": self._level.entries})
 
@@ -92,6 +120,7 @@ class RolloutPolicy(TensorDictModuleBase):
     """
 
     context: TensorDictBase
+    memory: TensorDictBase
 
     def __init__(self, agent: ActorCritic) -> None:
         super().__init__()
@@ -106,15 +135,22 @@ class RolloutPolicy(TensorDictModuleBase):
             *agent.memory_keys,
         ]
 
-    def begin(self, noise: Tensor, level: _LevelAside | None = None) -> None:
+    def begin(
+        self,
+        noise: Tensor,
+        level: _LevelAside | None = None,
+        memory: TensorDictBase | None = None,
+    ) -> None:
         """Expect a rollout with this noise [T, ...].
 
         Args:
             noise: uniform numbers in [0, 1), one for each element of T actions.
             level: where the next reset puts the level aside; None where it stays in every step.
+            memory: of the episodes that go on, [*B]; None where all of them begin.
         """
         self._steps = enumerate(noise)
         self._level = (level,)
+        self._before = memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write action, log-probability and value of the next step."""
@@ -122,15 +158,16 @@ class RolloutPolicy(TensorDictModuleBase):
         index, noise = next(self._steps)
         if index == 0:
             self.context = agent.encode(tensordict if level is None else level.entries)
-            self._memory = agent.no_memory(tensordict)
-        tensordict.update(self._memory)
+            going_on = self._before
+            self.memory = agent.no_memory(tensordict) if going_on is None else going_on.copy()
+        tensordict.update(self.memory)
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
         action = draw(distribution, noise)
         tensordict.set(agent.action_key, action)
         tensordict.set(agent.log_prob_key, distribution.log_prob(action))
         for before, after in zip(agent.memory, agent.memory_keys, strict=True):
-            self._memory.set(before, step.get(after))
+            self.memory.set(before, step.get(after))
             tensordict.set(after, step.get(after))
         return tensordict.set(agent.value_key, step.get(agent.value_key))
 

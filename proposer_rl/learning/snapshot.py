@@ -1,4 +1,4 @@
-"""All that training changes of an agent, taken out and put back: its weights and Adam's state."""
+"""All that training changes of an agent, taken out and put back: weights, moments, Adam's state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Adam
 
 from proposer_rl.models import ActorCritic
@@ -39,6 +39,8 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
             },
             batch,
         )
+    for name, statistic in _statistics(agent).items():
+        entries[name] = TensorDict({"value": statistic.clone()}, batch)
     return TensorDict(entries, batch)
 
 
@@ -57,18 +59,20 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
             f"got {list(snapshot.batch_size)}"
         )
     parameters = dict(agent.named_parameters())
-    if parameters.keys() != set(snapshot.keys()):
+    values = agent_values(agent)
+    if values.keys() != set(snapshot.keys()):
         raise ValueError("the snapshot belongs to another network: its parameters differ")
-    for name, parameter in parameters.items():
-        if snapshot[name, "value"].shape != parameter.shape:
+    for name, value in values.items():
+        if snapshot[name, "value"].shape != value.shape:
             raise ValueError(f"the snapshot's {name} does not fit: another shape")
     steps = torch.stack([snapshot[name, "step"].flatten() for name in parameters])
     # The one question here that waits for the device.
     if not bool((steps == steps[:, :1]).all()):
         raise ValueError("the snapshot's copies have made different numbers of Adam steps")
+    for name, value in values.items():
+        value.data.copy_(snapshot[name, "value"])
     for name, parameter in parameters.items():
         entry, state = snapshot[name], adam.state[parameter]
-        parameter.data.copy_(entry["value"])
         state["exp_avg"].copy_(entry["exp_avg"])
         state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
         state["step"].copy_(entry["step"].flatten()[0])
@@ -79,21 +83,32 @@ def _batch(agent: ActorCritic) -> torch.Size:
     return torch.Size([] if agent.copies is None else [agent.copies])
 
 
+def _statistics(agent: ActorCritic) -> dict[str, Tensor]:
+    """What an agent has learnt without gradients: moments of its observations and rewards."""
+    named = () if agent.normalization is None else agent.normalization.named_buffers()
+    return {f"normalization.{name}": statistic for name, statistic in named}
+
+
+def agent_values(agent: ActorCritic) -> dict[str, Tensor]:
+    """All numbers that make an agent what it is, by name: weights and statistics, as they stand."""
+    return {**dict(agent.named_parameters()), **_statistics(agent)}
+
+
 def agent_weights(agent: ActorCritic) -> TensorDict:
-    """A copy of an agent's weights alone, as :func:`load_agent` takes them, batch []."""
-    parameters = agent.named_parameters()
-    return TensorDict({name: {"value": value.detach().clone()} for name, value in parameters})
+    """A copy of what an agent is, as :func:`load_agent` takes it, batch []."""
+    values = agent_values(agent)
+    return TensorDict({name: {"value": value.detach().clone()} for name, value in values.items()})
 
 
 def load_agent(agent: ActorCritic, snapshot: TensorDictBase) -> None:
-    """Put the weights of a snapshot into an agent (in place).
+    """Put the weights and statistics of a snapshot into an agent (in place).
 
     Raises:
         ValueError: if they belong to another network.
     """
-    parameters = dict(agent.named_parameters())
-    shapes = {name: parameter.shape for name, parameter in parameters.items()}
+    values = agent_values(agent)
+    shapes = {name: value.shape for name, value in values.items()}
     if shapes != {name: snapshot[name, "value"].shape for name in snapshot.keys()}:
         raise ValueError("the snapshot belongs to another network: its parameters differ")
-    for name, parameter in parameters.items():
-        parameter.data.copy_(snapshot[name, "value"])
+    for name, value in values.items():
+        value.data.copy_(snapshot[name, "value"])

@@ -21,6 +21,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import PPO
+from proposer_rl.learning.snapshot import agent_values
 from proposer_rl.meta.first_order import squared_length, surrogate
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
@@ -98,12 +99,12 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
         of each: the squared lengths of its gradients, float [K, n].
     """
     agent = task.learner([Streams(0)] * AT_ONCE).agent
-    parameters = dict(agent.named_parameters())
+    parameters, values = dict(agent.named_parameters()), agent_values(agent)
 
     def become(learner: PPO, solver: int) -> None:
         with torch.no_grad():
-            for name, parameter in learner.agent.named_parameters():
-                parameters[name].copy_(parameter[solver])
+            for name, value in agent_values(learner.agent).items():
+                values[name].copy_(value[solver])
 
     def lengths(learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
         parts = []

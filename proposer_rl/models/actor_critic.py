@@ -18,6 +18,8 @@ from torch.distributions import Categorical, Distribution, Independent, Normal
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from proposer_rl.models.normalization import Normalization
+
 
 class ActorCritic(TensorDictModuleBase):
     """Writes action logits and a state value; its ``encoder`` part depends on the level alone.
@@ -39,6 +41,9 @@ class ActorCritic(TensorDictModuleBase):
         memory: of a head that remembers, the widths of its memory by the entries' names: it reads
             them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
             ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
+
+    Attributes:
+        normalization: between what is observed and the head, and of its values; None for none.
     """
 
     def __init__(
@@ -70,13 +75,14 @@ class ActorCritic(TensorDictModuleBase):
         self.memory = dict(memory or {})
         self.memory_keys = [("next", key) for key in self.memory]
         self.out_keys = [logits_key, value_key, *self.memory_keys]
+        self.normalization: Normalization | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
         inputs = tensordict.select(*self.in_keys)
         if self.encoder is not None:
             inputs = self.encoder(inputs)
-        return tensordict.update(self.head(inputs), keys_to_update=self.out_keys)
+        return tensordict.update(self._headed(inputs), keys_to_update=self.out_keys)
 
     def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The context of levels [*B] (or [K, *B]): what :meth:`decode` needs of them."""
@@ -94,10 +100,17 @@ class ActorCritic(TensorDictModuleBase):
             # The time dimensions become features, so that context and steps share their batch.
             inputs.batch_size = context.batch_size
             inputs.update(context)
-        outputs = self.head(inputs)
+        outputs = self._headed(inputs)
         for key in self.out_keys:
             tensordict.set(key, outputs.get(key))
         return tensordict
+
+    def _headed(self, inputs: TensorDictBase) -> TensorDictBase:
+        if self.normalization is None:
+            return self.head(inputs)
+        outputs = self.head(self.normalization.seen(inputs))
+        value = outputs.get(self.value_key)
+        return outputs.set(self.value_key, value * self.normalization.unit(value))
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """The memory before the first step of a batch like this tensordict's, [*B]: zeros."""

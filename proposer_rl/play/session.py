@@ -154,11 +154,12 @@ class Session:
         streams = Streams(question.seed, "play", question.name)
         distribution = self._task.distributions[question.name]
         levels = distribution.sample(batch, streams.generator("levels"))
-        learner.env.set_levels(levels.expand(copies, batch))
+        env, collector = self._task.spectators(learner)
+        env.set_levels(levels.expand(copies, batch))
         actions = [streams.generator("actions", k) for k in range(copies)]
         some, solver = slice(SHOWN), question.solver
         with torch.no_grad():
-            rollout = learner.collect(actions)[solver, some]
+            rollout = collector.collect(actions)[solver, some]
             generator = streams.generator("performance")
             reached = self._task.performance(learner.agent, levels[some], generator)[solver].cpu()
         records = self._task.record(levels[some], rollout)

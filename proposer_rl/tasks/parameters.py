@@ -21,6 +21,7 @@ class Bins(NamedTuple):
 
     Attributes:
         low, high: ends of each part, float64 or int64 [n]; equal where the part is a single value.
+            Whole numbers are drawn with both ends.
     """
 
     low: Tensor
@@ -29,7 +30,7 @@ class Bins(NamedTuple):
     @property
     def middles(self) -> list[Number]:
         """The value that stands for each part."""
-        return self.low.lerp(self.high, 0.5).tolist() if self.wide else self.low.tolist()
+        return ((self.low + self.high) / 2).tolist() if self.wide else self.low.tolist()
 
     @property
     def wide(self) -> bool:
@@ -41,7 +42,10 @@ class Bins(NamedTuple):
         low, high = self.low[index], self.high[index]
         if not self.wide:
             return low
-        return low.lerp(high, torch.rand(len(index), generator=generator, dtype=low.dtype))
+        share = torch.rand(len(index), generator=generator, dtype=torch.float64)
+        if low.is_floating_point():
+            return low.lerp(high, share)
+        return low + (share * (high - low + 1)).long()
 
     def shares(self, of: Bins) -> Tensor:
         """Which of these parts values of other parts lie in, float64 [n].
@@ -50,6 +54,8 @@ class Bins(NamedTuple):
         nearest part.
         """
         total = torch.zeros(len(self.low), dtype=torch.float64)
+        if self.wide and not self.low.is_floating_point():  # a whole number is an interval of one
+            return Bins(self.low - 0.5, self.high + 0.5).shares(Bins(of.low - 0.5, of.high + 0.5))
         for low, high in zip(of.low, of.high, strict=True):
             if high == low:
                 apart = torch.maximum(self.low - low, low - self.high).clamp_min(0)
@@ -89,11 +95,12 @@ def intervals(low: float, high: float, count: int = 1) -> Bins:
 class ParameterSpace:
     """The levels of all combinations of some parameters' bins; a distribution and a space.
 
-    A level is a tensordict with an entry for each parameter, float64 or int64, and the ``seed`` of
-    its reset, int64: two episodes on it begin alike.
+    A level is a tensordict with an entry for each parameter, float64 or int64, and if it is seeded
+    the ``seed`` of its reset, int64: two episodes on it begin alike.
 
     Args:
         bins: of each parameter, by name.
+        seeded: whether levels have seeds.
 
     Example:
         >>> space = ParameterSpace({"gravity": points([5, 10]), "force": intervals(2.0, 18.0, 4)})
@@ -101,8 +108,8 @@ class ParameterSpace:
         (8, ['gravity', 'force', 'seed'])
     """
 
-    def __init__(self, bins: Mapping[str, Bins]) -> None:
-        self.bins = dict(bins)
+    def __init__(self, bins: Mapping[str, Bins], seeded: bool = True) -> None:
+        self.bins, self._seeded = dict(bins), seeded
         self.axes = {name: part.middles for name, part in self.bins.items()}
         self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
 
@@ -132,8 +139,9 @@ class ParameterSpace:
             name: part.draw(place, generator)
             for (name, part), place in zip(self.bins.items(), places, strict=True)
         }
-        seeds = torch.randint(LARGEST_SEED, choices.shape, generator=generator)
-        return TensorDict({**level, SEED: seeds}, choices.shape)
+        if self._seeded:
+            level[SEED] = torch.randint(LARGEST_SEED, choices.shape, generator=generator)
+        return TensorDict(level, choices.shape)
 
 
 def _scaled(values: Sequence[Number]) -> Tensor:

@@ -17,12 +17,12 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
-    level_keys,
     replay_weights,
     rescore,
     score_weights,
     staleness_weights,
 )
+from proposer_rl.curricula.keys import level_keys
 
 # Five levels of a buffer; the same in every test that says "the table".
 SCORE = torch.tensor([0.9, 0.1, 0.5, 0.5, -0.2], dtype=torch.float64)

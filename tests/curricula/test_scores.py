@@ -230,14 +230,38 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
         torch.testing.assert_close(here, share * (1 - share), atol=1e-6, rtol=0)
 
 
-def test_without_a_rollout_success_and_return_are_what_a_level_is_scored_by() -> None:
+def test_without_a_rollout_an_episode_is_a_step_and_the_last_return_the_critic() -> None:
+    """As of a rollout of one step, whose value is the return before."""
+    reached, value = torch.tensor([[0.2, 0.9, -1.0]]), torch.tensor([[0.5, 0.3, -torch.inf]])
+    best = torch.tensor([[0.5, 0.7, -torch.inf]])
+    outcome = TensorDict({"return": reached, "success": (reached > 0).float()}, [1, 3])
+    known = value.where(value.isfinite(), reached)  # at first there is nothing to learn
+    step = torch.ones(1, 3, 1, 1, dtype=torch.bool)
+    after = {"done": step, "terminated": step, "success": outcome["success"].view(1, 3, 1, 1) > 0}
+    after |= {"reward": reached.view(1, 3, 1, 1), "state_value": torch.zeros(1, 3, 1, 1)}
+    rollout = TensorDict(
+        {"state_value": known.view(1, 3, 1, 1), "next": after},
+        [1, 3, 1],
+        names=[None, None, "time"],
+    )
+    unsolved = torch.zeros(1, 3, dtype=torch.bool)
+    for name in (*STEPWISE, "regret"):
+        scorer = Scorer(name, "episodes")
+        found = scorer.of_outcome(LEARNER, outcome, best, unsolved, value)
+        expected = scorer.of_rollouts(LEARNER, [rollout], best, unsolved)
+        torch.testing.assert_close(found, expected, msg=name)
+
+
+def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own() -> None:
     outcome = TensorDict(
         {"return": torch.tensor([[0.2]]), "success": torch.tensor([[0.25]])}, [1, 1]
     )
-    best = torch.tensor([[0.5]])
-    for name, expected in (("learnability", 0.1875), ("regret", 0.3)):
-        found = Scorer(name, "episodes").of_outcome(LEARNER, outcome, best, UNSOLVED)
-        assert float(found.score) == pytest.approx(expected)
-        assert float(found.best) == 0.5 and bool(found.solved)
-    with pytest.raises(ValueError, match="score=max_mc: the outcome has no rollout"):
-        Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, best, UNSOLVED)
+    known = torch.tensor([[0.5]]), UNSOLVED, torch.tensor([[0.5]])
+    found = Scorer("learnability", "episodes").of_outcome(LEARNER, outcome, *known)
+    assert float(found.score) == pytest.approx(0.1875)
+    assert float(found.best) == 0.5 and bool(found.solved)
+    outcome["score"] = torch.tensor([[7.0]])
+    assert float(Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, *known).score) == 7
+    for name, lacking in (("return_variance", "rollout"), ("learnability", "success")):
+        with pytest.raises(ValueError, match=f"score={name}: the outcome has no {lacking}"):
+            Scorer(name, "episodes").of_outcome(LEARNER, outcome.select("return"), *known)

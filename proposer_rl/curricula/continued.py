@@ -1,0 +1,293 @@
+"""Episodes that go on from update to update: each gets a level, and is credited to it.
+
+An update then trains on parts of episodes. Levels are proposed before it, as many as ended episodes
+in the last one and one more for each environment; those that are left over come first in the next
+update, the oldest being given up where there are too many. Where all are used up a level is played
+again. What came of a level is known when its episode is over, an update or many later: the batch is
+observed in parts, as soon as it is known which of its levels are played.
+
+Of K students that train side by side a batch has a level each in every place, and it is observed
+when the last of them is over; levels that one of them did not come to are left out.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, pad
+from torch import Tensor
+
+from proposer_rl.curricula.batches import of_kind, packed
+from proposer_rl.curricula.contract import Batch, Curriculum, outcome_of
+from proposer_rl.curricula.student import Student
+from proposer_rl.learning import PPO, Update
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
+
+WAITING, BEGUN, ENDED, OBSERVED, GIVEN_UP = range(5)
+
+GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
+"""Needs of a curriculum that reads what a policy has seen off rollouts."""
+
+Place = tuple[int, int]
+"""Of a level: the number of its batch, and where it stands in it."""
+
+Played = tuple[Levels, TensorDictBase]
+"""Levels [K, m], and a rollout [K, m, T] of an episode on each."""
+
+Credit = tuple[Batch, TensorDict]
+"""A batch or a part of one, and its outcome."""
+
+
+class ContinuedLevels:
+    """Trains a learner whose episodes go on, on a curriculum's levels.
+
+    Args:
+        curriculum: that proposes.
+        student: to whom.
+        learner: PPO with ``continue_episodes``, of K Solvers in environments [K, P].
+        like: levels of the task's kind, [n].
+    """
+
+    def __init__(
+        self, curriculum: Curriculum, student: Student, learner: PPO, like: Levels
+    ) -> None:
+        if learner.collector.episodes is None:
+            raise ValueError("the learner's episodes do not go on: see continue_episodes")
+        self._curriculum, self._student, self._learner = curriculum, student, learner
+        self._episodes = learner.collector.episodes
+        self._episodes.next_levels = self._next_levels
+        copies, count = learner.env.batch_size
+        self._batches: dict[int, _Outstanding] = {}
+        self._proposed = 0
+        self._waiting: list[deque[Place]] = [deque() for _ in range(copies)]
+        self._levels = like[:1].expand(copies, count).clone()  # that are played, or set
+        self._playing = torch.full((copies, count, 2), -1)  # number of the batch, and place
+        self._over: dict[tuple[int, int], list[Place]] = defaultdict(list)
+        self._most = count  # episodes of a student that ended in an update
+        self._steps = torch.zeros(copies, count, dtype=torch.int64)  # of the present episodes
+        self._history: TensorDictBase | None = None  # [K, P, H], which ends with the last update
+        self._shown: Played | None = None
+
+    def update(self, streams: Sequence[Streams]) -> tuple[Update, list[Credit]]:
+        """One update; the actions and the levels are drawn from streams of its own, K of them.
+
+        Returns:
+            The update, and what is to be observed now.
+        """
+        self._propose(streams)
+        update = self._learner.update([stream.generator("actions") for stream in streams])
+        self._learner.check()
+        self._cut(update.rollout)
+        credits = [credit for each in self._batches.values() for credit in each.settled()]
+        self._batches = {n: each for n, each in self._batches.items() if not each.over}
+        if credits:
+            batch, outcome = credits[-1]
+            self._shown = batch.levels, outcome["rollout"]
+        elif self._shown is None:
+            self._shown = self._levels[:, :0], update.rollout[:, :0]
+        return update, credits
+
+    def _propose(self, streams: Sequence[Streams]) -> None:
+        count = self._steps.shape[1]
+        wanted = count + self._most - min(map(len, self._waiting))
+        batch = self._curriculum.propose(self._student, max(wanted, 1), streams)
+        self._batches[self._proposed] = _Outstanding(batch.levels, batch)
+        for copy, waiting in enumerate(self._waiting):
+            while len(waiting) > count:
+                number, place = waiting.popleft()
+                self._batches[number].state[copy, place] = GIVEN_UP
+            waiting.extend((self._proposed, place) for place in range(batch.count))
+        self._proposed += 1
+
+    def _next_levels(self, begins: Tensor) -> Levels:
+        """What is played from now on where episodes begin, bool [K, P]."""
+        if self._episodes.fresh:
+            self._forget()
+        for copy, env in begins.nonzero().tolist():
+            number, place = self._playing[copy, env].tolist()
+            self._over[copy, env].append((number, place))
+            if self._waiting[copy]:
+                number, place = self._waiting[copy].popleft()
+                self._batches[number].state[copy, place] = BEGUN
+                self._playing[copy, env] = torch.tensor([number, place])
+                self._levels[copy, env] = self._batches[number].levels[copy, place]
+        if self._episodes.fresh:
+            self._over.clear()  # what had been played before has no end
+        return self._levels
+
+    def _forget(self) -> None:
+        """Give up the episodes that have been broken off."""
+        for copy, row in enumerate(self._playing.tolist()):
+            for number, place in row:
+                if number in self._batches:
+                    self._batches[number].give_up(copy, place)
+        self._history, self._steps = None, torch.zeros_like(self._steps)
+
+    def _cut(self, rollout: TensorDictBase) -> None:
+        """Take the episodes that have ended in a rollout [K, P, T] out of what was played."""
+        kept = rollout.exclude("advantage", "value_target")
+        if not GRADIENTS & {*self._curriculum.needs}:
+            seen = self._learner.agent.step_keys
+            kept = kept.exclude(*seen, *(("next", key) for key in seen))
+        history = kept if self._history is None else torch.cat([self._history, kept], 2)
+        before, length = history.shape[2] - rollout.shape[2], history.shape[2]
+        begun = before - self._steps
+        ends = rollout["next", "done"].squeeze(-1).nonzero()
+        for copy, env, step in ends.tolist():
+            number, place = self._over[copy, env].pop(0)
+            end = before + step + 1
+            episode = history[copy, env, int(begun[copy, env]) : end]
+            begun[copy, env] = end
+            if number in self._batches:
+                self._batches[number].end(copy, place, episode)
+        self._most = int(ends[:, 0].bincount(minlength=1).max())
+        self._steps = length - begun
+        self._history = history[:, :, length - int(self._steps.max()) :].clone()
+
+    @property
+    def shown(self) -> Played:
+        """The levels that were observed last, and the episodes on them; none of both at first."""
+        assert self._shown is not None  # after an update
+        return self._shown
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs, the actions of episodes that are not over included."""
+        memory = self._learner.collector.memory
+        discounted = self._learner.statistics.discounted
+        return {
+            "proposed": self._proposed,
+            "waiting": [list(waiting) for waiting in self._waiting],
+            "levels": packed(self._levels),
+            "playing": self._playing.clone(),
+            "most": self._most,
+            "steps": self._steps.clone(),
+            "history": None if self._history is None else packed(self._history),
+            "memory": None if memory is None else packed(memory),
+            "discounted": None if discounted is None else discounted.clone(),
+            "shown": None if self._shown is None else [*map(packed, self._shown)],
+            "batches": {number: each.state_dict() for number, each in self._batches.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with it: episodes that are not over are played again up to where they were."""
+        shape = self._steps.shape
+        self._proposed, self._most = state["proposed"], state["most"]
+        self._waiting = [deque(map(tuple, waiting)) for waiting in state["waiting"]]
+        self._levels = of_kind(self._levels, state["levels"], shape)
+        self._playing, self._steps = state["playing"].clone(), state["steps"].clone()
+        self._batches = {
+            number: _Outstanding.of_state(each, self._levels)
+            for number, each in state["batches"].items()
+        }
+        self._history = self._shown = None
+        if state["shown"] is not None:
+            levels, episodes = state["shown"]
+            size = episodes["action"].shape[:3]
+            self._shown = (
+                of_kind(self._levels, levels, size[:2]),
+                TensorDict.from_dict(episodes, batch_size=size),
+            )
+        if state["history"] is not None:
+            length = state["history"]["action"].shape[2]
+            self._history = TensorDict.from_dict(state["history"], batch_size=[*shape, length])
+            self._episodes.stand(self._levels, self._history["action"], self._steps)
+        if state["discounted"] is not None:
+            self._learner.statistics.discounted = state["discounted"].clone()
+        if state["memory"] is not None:
+            self._learner.collector.memory = TensorDict.from_dict(state["memory"], batch_size=shape)
+
+
+class _Outstanding:
+    """A proposed batch some of whose levels have not been observed yet.
+
+    Attributes:
+        levels: as they were proposed, [K, n].
+        state: of each, int64 [K, n].
+    """
+
+    def __init__(self, levels: Levels, batch: Batch) -> None:
+        self.levels = levels
+        self.state = torch.full(levels.shape[:2], WAITING)
+        self._batch = batch  # or what of it is played
+        self._places: Tensor | None = None  # int64 [m], of the levels that the batch is kept to
+        self._played: dict[tuple[int, int], TensorDictBase] = {}
+
+    @property
+    def over(self) -> bool:
+        """Whether there is nothing left to be observed."""
+        if self._places is None:
+            return False
+        state = self.state[:, self._places]
+        return bool(((state == OBSERVED) | (state == GIVEN_UP)).any(0).all())
+
+    def give_up(self, copy: int, place: int) -> None:
+        """Leave a level out that is not over."""
+        if self.state[copy, place] <= BEGUN:
+            self.state[copy, place] = GIVEN_UP
+
+    def end(self, copy: int, place: int, episode: TensorDictBase) -> None:
+        """Take the first episode [T] on a level; further ones do not count."""
+        if self.state[copy, place] == BEGUN:
+            self.state[copy, place] = ENDED
+            self._played[copy, place] = episode.clone()
+
+    def settled(self) -> Iterator[Credit]:
+        """The part of it that has become known, if there is one."""
+        if bool((self.state == WAITING).any()):
+            return
+        copies = len(self.state)
+        if self._places is None:
+            self._places = (self.state != GIVEN_UP).all(0).nonzero().flatten()
+            self._batch = self._batch.keep(self._places.expand(copies, -1))
+        ready = (self.state[:, self._places] == ENDED).all(0).nonzero().flatten()
+        if not len(ready):
+            return
+        places = self._places[ready].tolist()
+        self.state[:, places] = OBSERVED
+        episodes = [[self._played.pop((copy, p)) for p in places] for copy in range(copies)]
+        yield self._batch[:, ready], outcome_of_episodes(episodes)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "levels": packed(self.levels),
+            "notes": packed(self._batch.notes),
+            "state": self.state.clone(),
+            "places": None if self._places is None else self._places.clone(),
+            "played": [[*place, packed(episode)] for place, episode in self._played.items()],
+        }
+
+    @classmethod
+    def of_state(cls, state: Mapping[str, Any], like: Levels) -> _Outstanding:
+        """What :meth:`state_dict` returned, with levels of a kind."""
+        shape = state["state"].shape
+        levels = of_kind(like, state["levels"], shape)
+        places = state["places"]
+        kept = levels if places is None else levels[:, places]
+        notes = TensorDict.from_dict(state["notes"], batch_size=kept.shape[:2])
+        each = cls(levels, Batch(kept, notes))
+        each.state, each._places = state["state"].clone(), places
+        each._played = {
+            (copy, place): TensorDict.from_dict(episode, batch_size=[len(episode["action"])])
+            for copy, place, episode in state["played"]
+        }
+        return each
+
+
+def outcome_of_episodes(episodes: Sequence[Sequence[TensorDictBase]]) -> TensorDict:
+    """What came of levels [K, m] from the one episode [T] on each of them.
+
+    They are filled up with zeros to one rollout [K, m, T]: steps of an episode that does not end,
+    which no score counts.
+    """
+    steps = torch.tensor([[len(episode) for episode in row] for row in episodes])
+    longest = int(steps.max())
+    rows: list[Any] = [
+        torch.stack([pad(episode, [0, longest - len(episode)]) for episode in row])
+        for row in episodes
+    ]
+    outcome = outcome_of(torch.stack(rows))
+    return outcome.set("steps", steps.to(outcome["steps"]))

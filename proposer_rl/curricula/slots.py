@@ -1,0 +1,187 @@
+"""The slots of one student's buffer, changed level by level: NumPy, since a level is a few numbers.
+
+``numbers`` are the entries of a buffer's row by name, arrays [N] that are changed in place; see
+:mod:`~proposer_rl.curricula.buffer`. Scores only move the ranks between the old place and the new,
+so that a level costs microseconds and not another sort of all N.
+
+Of more than :data:`AT_ONCE` levels, as thousands of environments ask for them, so many at a time
+count as simultaneous: the shares are those before the first of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = Mapping[str, NDArray[Any]]
+Floats = NDArray[np.float64]
+Weigh = Callable[[Floats], Floats]
+"""Shares by rank, adding up to one, of scores that fall."""
+
+AT_ONCE = 256
+
+
+def at_once(count: int) -> int:
+    """How many of so many levels count as simultaneous."""
+    return 1 if count <= AT_ONCE else AT_ONCE
+
+
+def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) -> NDArray[np.int64]:
+    """Draw slots one after another: each draw advances the clock and makes its level fresh.
+
+    Args:
+        numbers: of a row with a level.
+        by_score: shares of the slots by their scores, [N].
+        staleness: share of the draws that go by age.
+        noise: uniform in [0, 1), [P].
+
+    Returns:
+        The slots, int64 [P].
+    """
+    touched, filled = numbers["touched"], numbers["filled"]
+    clock, last = int(numbers["clock"][0]), len(filled) - 1
+    by_score = (1 - staleness) * by_score.cumsum()
+    count = filled.cumsum().astype(np.float64)
+    ages = ((clock - touched) * filled).cumsum().astype(np.float64)  # whole numbers
+    slots = np.empty(len(noise), np.int64)
+    some, shares = at_once(len(noise)), np.empty_like(count)
+    for start in range(0, len(noise), some):
+        marks = noise[start : start + some]
+        old = ages if ages[-1] > 0 else count
+        np.multiply(old, staleness / old[-1], out=shares)
+        shares += by_score
+        # An empty slot adds nothing to the sum, so that no mark lies in it.
+        which = np.minimum(shares.searchsorted(marks * shares[-1], "right"), last)
+        slots[start : start + some] = which
+        if some == 1:
+            slot, clock = which[0], clock + 1
+            ages += count
+            ages[slot:] -= clock - touched[slot]
+            touched[slot] = clock
+        else:
+            touched[which] = clock + np.arange(1, len(which) + 1)
+            clock += len(which)
+            ages = ((clock - touched) * filled).cumsum().astype(np.float64)
+    numbers["clock"][:] = clock
+    return slots
+
+
+class Ranks:
+    """The slots by falling score, of equal scores the earlier slot first, and their shares.
+
+    Args:
+        score: of all slots, [N], which :meth:`change` changes.
+        weigh: shares by rank.
+        by_rank: whether these are the same whatever the scores are, as long as two of them differ.
+    """
+
+    def __init__(self, score: Floats, weigh: Weigh, by_rank: bool) -> None:
+        self._score, self._weigh, self._by_rank = score, weigh, by_rank
+        self._slots = np.argsort(-score, kind="stable")
+        self._falling = -score[self._slots]  # rising, as searchsorted takes it
+        self._table = weigh(-self._falling)
+        self._uniform = self._falling[0] == self._falling[-1]
+        self.shares = np.empty_like(self._table)
+        self.shares[self._slots] = self._table
+
+    def change(self, slot: int, score: float) -> None:
+        """Give a slot another score."""
+        old = self._place(slot, self._score[slot])
+        new = self._place(slot, score)
+        new -= new > old  # its own place does not count
+        for line, value in ((self._slots, slot), (self._falling, -score)):
+            if new < old:
+                line[new + 1 : old + 1] = line[new:old]
+            else:
+                line[old:new] = line[old + 1 : new + 1]
+            line[new] = value
+        self._score[slot] = score
+        uniform = self._falling[0] == self._falling[-1]
+        if self._by_rank and not uniform and not self._uniform:
+            moved = slice(min(old, new), max(old, new) + 1)
+        else:
+            self._table, moved = self._weigh(-self._falling), slice(None)
+        self.shares[self._slots[moved]] = self._table[moved]
+        self._uniform = uniform
+
+    def _place(self, slot: int, score: float) -> int:
+        """How many slots are before one with this score."""
+        first = int(self._falling.searchsorted(-score, "left"))
+        last = int(self._falling.searchsorted(-score, "right"))
+        return first + int(self._slots[first:last].searchsorted(slot))
+
+
+def insert(
+    numbers: Numbers,
+    keys: list[int],
+    scores: list[float],
+    staleness: float,
+    weigh: Weigh,
+    by_rank: bool,
+) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Insert levels one after another into the slots of a row.
+
+    Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
+
+    Args:
+        numbers: of the row.
+        keys: of the new levels, [M].
+        scores: of them; one that is not finite is not kept.
+        staleness: share of the draws that go by age.
+        weigh: shares by rank of scores that fall.
+        by_rank: as of :class:`Ranks`.
+
+    Returns:
+        Which new level has gone into each slot, int64 [N], -1 for none; and (slot, level) of those
+        that were there already.
+    """
+    filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
+    clock, some = int(numbers["clock"][0]), at_once(len(keys))
+    place = dict(zip(key[filled].tolist(), filled.nonzero()[0].tolist(), strict=True))
+    free = iter((~filled).nonzero()[0].tolist())
+    source, again = np.full(len(filled), -1), []
+    ranks: Ranks | None = None
+    victims: Iterator[int] = iter(())
+    victim, left = -1, 0
+    for i, (own, value) in enumerate(zip(keys, scores, strict=True)):
+        clock += 1
+        if not math.isfinite(value):
+            continue
+        slot = place.get(own, -1)
+        if slot >= 0:
+            again.append((slot, i))
+        else:
+            slot = next(free, -1)
+            if slot < 0:
+                if left == 0:
+                    ranks = ranks or Ranks(score, weigh, by_rank)
+                    age = clock - touched
+                    shares = ranks.shares * (1 - staleness) + age * (
+                        staleness / max(int(age.sum()), 1)
+                    )
+                    left = some
+                    if some == 1:
+                        victim = int(shares.argmin())
+                    else:
+                        victims, ranks = iter(shares.argsort(kind="stable").tolist()), None
+                        victim, start = next(victims), clock
+                left -= 1
+                while some > 1 and touched[victim] >= start:  # has come again meanwhile
+                    victim = next(victims)
+                if not value > score[victim]:
+                    continue
+                slot = victim
+                del place[int(key[slot])]
+            filled[slot], key[slot], source[slot] = True, own, i
+            place[own] = slot
+        if ranks is None:
+            score[slot] = value
+        else:
+            ranks.change(slot, value)
+        touched[slot] = clock
+    numbers["clock"][:] = clock
+    return source, again

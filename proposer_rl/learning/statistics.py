@@ -1,0 +1,110 @@
+"""The moments by which an agent's observations and values are normalised, as it trains."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from proposer_rl.learning.rollout import set_values
+from proposer_rl.models import ActorCritic
+from proposer_rl.models.normalization import Normalization
+from proposer_rl.settings import ArgumentError, PPOSettings
+
+
+class Statistics:
+    """Gives an agent its normalisation, and takes in what it trains on.
+
+    Observations that a rollout has are taken in after it has been trained on, so that training
+    begins with the policy that acted; those of the very first one before, since until then there
+    are none. Rewards are taken in before, and the rollout's values are put into the new unit.
+
+    Args:
+        env: that the agent trains in.
+        agent: whose ``normalization`` is set.
+        settings: whether there is one.
+
+    Attributes:
+        discounted: rewards so far of episodes that go on, discounted, float64 [*B]; None where
+            all begin.
+
+    Raises:
+        ArgumentError: if there is nothing to be normalised.
+    """
+
+    def __init__(self, env: EnvBase, agent: ActorCritic, settings: PPOSettings) -> None:
+        self.discounted: Tensor | None = None
+        self._agent, self._settings = agent, settings
+        for name in ("normalize_observations", "normalize_rewards"):
+            if getattr(settings, name) and agent.level_keys:
+                raise ArgumentError(
+                    f"{name}=True: this Solver reads its level once for a whole rollout; "
+                    "leave False"
+                )
+        shapes = {}
+        if settings.normalize_observations:
+            specs = {key: env.observation_spec.get(key, None) for key in agent.step_keys}
+            shapes = {
+                key: spec.shape[env.batch_dims :]
+                for key, spec in specs.items()
+                if spec is not None and spec.dtype.is_floating_point
+            }
+            if not shapes:
+                raise ArgumentError(
+                    "normalize_observations=True: there are no numbers in what is observed, such "
+                    "as bytes of an image; leave False"
+                )
+        agent.normalization = None
+        if shapes or settings.normalize_rewards:
+            agent.normalization = Normalization(
+                agent.copies, shapes, rewards=settings.normalize_rewards
+            )
+
+    def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
+        """Take in the rewards of a rollout [*B, T], and put its values into their unit.
+
+        Args:
+            rollout: complete.
+            level: what the agent's encoder reads.
+            first: whether nothing was trained on before.
+        """
+        agent, normalization = self._agent, self._agent.normalization
+        if normalization is None:
+            return
+        unit = normalization.unit(rollout[agent.value_key])
+        if normalization.returns is not None:
+            normalization.returns.update(self._discounted(rollout))
+        if first:
+            normalization.update_observations(rollout)
+            set_values(agent, rollout, level)
+        else:
+            change = normalization.unit(rollout[agent.value_key]) / unit
+            for key in (agent.value_key, ("next", agent.value_key)):
+                rollout.set(key, rollout[key] * change)
+
+    def after(self, rollout: TensorDictBase, *, first: bool) -> None:
+        """Take in what was observed in a rollout [*B, T] that has been trained on."""
+        if self._agent.normalization is not None and not first:
+            self._agent.normalization.update_observations(rollout)
+
+    def in_units(self, steps: TensorDictBase, *keys: str) -> TensorDictBase:
+        """Entries of steps in the unit of the agent's values."""
+        normalization = self._agent.normalization
+        if normalization is not None and normalization.returns is not None:
+            unit = normalization.unit(steps[self._agent.value_key])
+            for key in set(keys) & set(steps.keys()):
+                steps.set(key, steps[key] / unit)
+        return steps
+
+    def _discounted(self, rollout: TensorDictBase) -> Tensor:
+        """The sum of an episode's discounted rewards up to each step: float64 [*B, T]."""
+        reward = rollout["next", "reward"].squeeze(-1).double()
+        going_on = ~rollout["next", "done"].squeeze(-1)
+        sums, so_far = [], self.discounted
+        for now, goes_on in zip(reward.unbind(-1), going_on.unbind(-1), strict=True):
+            total = now if so_far is None else self._settings.gamma * so_far + now
+            sums.append(total)
+            so_far = total * goes_on
+        self.discounted = so_far if self._settings.continue_episodes else None
+        return torch.stack(sums, -1)

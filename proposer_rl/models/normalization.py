@@ -1,0 +1,117 @@
+"""Running moments of what an agent sees and is paid, one set for each of K replicas.
+
+TorchRL's ``VecNormV2`` has one set for a whole batch of environments or one for each of them, and
+none for each row; and what a transform of an environment knows, an agent that is evaluated
+elsewhere does not. So they belong to the agent here, and stand still but where it trains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+LARGEST = 10.0
+"""Standard deviations from the mean at which a normalised number ends, as is usual."""
+
+TINY = 1e-8  # added to variances
+
+
+class RunningMoments(nn.Module):
+    """Mean and variance of all numbers so far, those of each replica by themselves.
+
+    Merged by Chan et al. 1983 ("Algorithms for computing the sample variance"), in float64.
+
+    Args:
+        copies: K, or None for a single set.
+        shape: of what has a mean and a variance.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, copies: int | None, shape: Sequence[int]) -> None:
+        super().__init__()
+        rows = [] if copies is None else [copies]
+        self._lead = len(rows)
+        zeros = torch.zeros(*rows, *shape, dtype=torch.float64)
+        self.register_buffer("count", torch.zeros(rows, dtype=torch.float64))
+        self.register_buffer("mean", zeros)
+        self.register_buffer("variance", torch.ones_like(zeros))
+
+    def update(self, values: Tensor) -> None:
+        """Take numbers [K, *B, *shape] in, or without replicas [*B, *shape]."""
+        shape = self.mean.shape[self._lead :]
+        rows = values.detach().double().reshape(*self.mean.shape[: self._lead], -1, *shape)
+        new = rows.shape[self._lead]
+        mean, variance = rows.mean(self._lead), rows.var(self._lead, correction=0)
+        before = self.count.reshape(*self.count.shape, *[1] * len(shape))
+        share = new / (before + new)
+        apart = mean - self.mean
+        # At first there is no variance, whatever stands there.
+        self.variance.copy_(
+            (1 - share) * self.variance + share * variance + share * (1 - share) * apart.square()
+        )
+        self.mean.add_(share * apart)
+        self.count.add_(new)
+
+    @property
+    def deviation(self) -> Tensor:
+        """float32 [K, *shape]; 1 before the first numbers."""
+        return (self.variance + TINY).sqrt().float()
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Numbers [K, *B, *shape] without their mean, in standard deviations, cut off far out."""
+        mean, deviation = (self.along(each, values) for each in (self.mean, self.deviation))
+        return ((values - mean.float()) / deviation).clamp(-LARGEST, LARGEST)
+
+    def along(self, moments: Tensor, values: Tensor) -> Tensor:
+        """Moments [K, *shape], to be broadcast against values [K, *B, *shape]."""
+        between = values.ndim - moments.ndim
+        lead = moments.shape[: self._lead]
+        return moments.reshape(*lead, *[1] * between, *moments.shape[self._lead :])
+
+
+class Normalization(nn.Module):
+    """What an agent is shown, and the unit of its values.
+
+    Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
+    deviation of the discounted return, and its loss is taken in that unit: the same as rewards
+    divided by it, and whoever reads a value need not know.
+
+    Args:
+        copies: K, or None for a single agent.
+        observations: shapes of the entries that are normalised, by name.
+        rewards: whether values have a unit.
+    """
+
+    def __init__(
+        self, copies: int | None, observations: Mapping[str, Sequence[int]], *, rewards: bool
+    ) -> None:
+        super().__init__()
+        self.observations = nn.ModuleDict(
+            {name: RunningMoments(copies, shape) for name, shape in observations.items()}
+        )
+        self.returns = RunningMoments(copies, []) if rewards else None
+
+    def seen(self, inputs: TensorDictBase) -> TensorDictBase:
+        """What a network gets of a tensordict [K, *B]; a copy without those entries."""
+        shown = inputs.copy()
+        for name, moments in self.observations.items():
+            shown.set(name, moments(inputs.get(name)))
+        return shown
+
+    def unit(self, values: Tensor) -> Tensor:
+        """Of values [K, *B, 1], to be broadcast against them; 1 where they have none."""
+        if self.returns is None:
+            return values.new_ones(())
+        return self.returns.along(self.returns.deviation, values)
+
+    def update_observations(self, observed: TensorDictBase) -> None:
+        """Take in what was seen, [K, *B]."""
+        for name, moments in self.observations.items():
+            assert isinstance(moments, RunningMoments)
+            moments.update(observed.get(name))

@@ -1,0 +1,376 @@
+"""Spaces of levels for loops of one's own: named ranges, items of a data set, a generator.
+
+They give curricula what a task gives them: levels to draw, bins, and where it is said a target and
+small edits. Inside, a level is a tensordict; what a loop gets is :meth:`LevelSpace.given`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.settings import ArgumentError
+from proposer_rl.task import Distribution, Levels
+from proposer_rl.tasks.parameters import Bins, ParameterSpace, intervals, points
+
+STEP = 0.1  # standard deviation of an edit, as a share of a range
+DRAWN = "level"  # the entry that holds a generator's tensors
+Ranges = Mapping[str, Any]
+
+
+class LevelSpace:
+    """What curricula take for a task: here one that has levels alone.
+
+    Attributes:
+        distributions: by name, for hand-designed curricula; ``all`` is the space itself.
+    """
+
+    distributions: Mapping[str, Distribution]
+
+    @property
+    def space(self) -> LevelSpace:
+        """What levels are chosen from."""
+        return self
+
+    @property
+    def target(self) -> Distribution:
+        """What is to be mastered.
+
+        Raises:
+            ArgumentError: if nothing was said of it.
+        """
+        if "target" not in self.distributions:
+            raise ArgumentError("target: missing: this curriculum needs a target of the space")
+        return self.distributions["target"]
+
+    def given(self, levels: Levels) -> Any:
+        """Levels [*B] as a loop gets them."""
+        return levels
+
+    def rows(self, levels: Levels) -> list[Any]:
+        """Levels [n] one by one, as a loop gets them that plays episode by episode."""
+        return list(self.given(levels).unbind(0))
+
+
+class Parameters(LevelSpace, ParameterSpace):
+    """Levels that are values of named parameters.
+
+    In batches a level is a tensordict with an entry for each parameter, float64 or int64, of texts
+    the place in their list. One by one it is a dict of numbers and texts.
+
+    Args:
+        ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
+            for whole numbers, a list for choices among rising numbers, or among texts.
+        bins: equal parts of a range that curricula tell apart; one number for all, or by name.
+        target: what is to be mastered, for some of the parameters, by name: a value or a part of
+            the range, as in ``ranges``; the others have all of theirs. None for no target.
+        named: further distributions like ``target``, by name, for hand-designed curricula.
+        seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
+
+    Raises:
+        ArgumentError: naming the parameter, for what is no range or lies outside of it.
+
+    Example:
+        >>> space = Parameters({"gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, bins=4)
+        >>> space.size, space.rows(space.generate(torch.tensor([[7]]), [torch.Generator()])[0])
+        (8, [{'gravity': 23.8..., 'ground': 'stairs'}])
+    """
+
+    def __init__(
+        self,
+        ranges: Ranges,
+        *,
+        bins: int | Mapping[str, int] = 8,
+        target: Ranges | None = None,
+        named: Mapping[str, Ranges] | None = None,
+        seeded: bool = False,
+    ) -> None:
+        if not ranges:
+            raise ArgumentError("ranges={}: must have at least one parameter")
+        counts = dict(bins) if isinstance(bins, Mapping) else dict.fromkeys(ranges, bins)
+        _check_names("bins", counts, ranges)
+        self._labels = {name: _labels(values) for name, values in ranges.items()}
+        parts = {
+            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self._labels[name])
+            for name, values in ranges.items()
+        }
+        super().__init__(parts, seeded)
+        given = {"target": target} if target is not None else {}
+        self.distributions = {
+            "all": self,
+            **{
+                name: ParameterSpace(self._part(name, part), seeded)
+                for name, part in {**given, **(named or {})}.items()
+            },
+        }
+
+    @property
+    def target_shares(self) -> Tensor:
+        """The target as shares of the bins, float [N]."""
+        target: Any = self.target
+        return self.shares(target)
+
+    def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
+        """Levels [n] as dicts of numbers and texts."""
+        columns = {str(name): entry.tolist() for name, entry in levels.items()}
+        for name, labels in self._labels.items():
+            if labels is not None:
+                columns[name] = [labels[place] for place in columns[name]]
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    def edit(
+        self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]
+    ) -> TensorDict:
+        """Levels [K, n] after so many steps along one parameter each.
+
+        A number moves by a tenth of its range in the standard deviation, and stays within; a whole
+        number moves by one at least; of texts another one is drawn.
+        """
+        return torch.stack(
+            [self._edited(own, count, g) for own, g in zip(levels, generators, strict=True)]
+        )
+
+    def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
+        levels, shape = levels.clone(), levels.batch_size
+        names = list(self.bins)
+        for _ in range(count):
+            which = torch.randint(len(names), shape, generator=generator)
+            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+            for i, (name, part) in enumerate(self.bins.items()):
+                low, high = part.low[0], part.high[-1]
+                labels = self._labels[name]
+                step = noise * STEP * (high - low)
+                old = levels[name]
+                if labels is not None:  # another one: so many places further on
+                    others = max(len(labels) - 1, 1)
+                    further = 1 + (noise.abs() * 1e6).long() % others
+                    new = (old + further) % len(labels)
+                elif not part.wide:
+                    near = part.low.double()
+                    at = (near - old.unsqueeze(-1)).abs().argmin(-1)
+                    places = (noise * max(STEP * len(near), 1)).round()
+                    at = (at + places.where(places != 0, noise.sign()).long()).clamp(
+                        0, len(near) - 1
+                    )
+                    new = part.low[at]
+                elif part.low.is_floating_point():
+                    new = (old + step).clamp(low, high)
+                else:
+                    whole = step.round()
+                    new = (old + whole.where(whole != 0, step.sign()).long()).clamp(low, high)
+                levels[name] = new.where(which == i, old)
+        return levels
+
+    def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
+        """The bins of a part of the space: one for each parameter or value."""
+        _check_names(key, ranges, self.bins)
+        parts = dict(self.bins)
+        for name, values in ranges.items():
+            whole, labels = self.bins[name], self._labels[name]
+            where = f"{key}.{name}"
+            if labels is not None:
+                chosen = values if isinstance(values, list) else [values]
+                if not set(chosen) <= set(labels):
+                    raise ArgumentError(f"{where}={values!r}: must be among {labels}")
+                parts[name] = points(sorted(labels.index(value) for value in chosen))
+                continue
+            values = [values] if isinstance(values, Real) else values
+            part = _bins(where, values, 1, None)
+            low, high = whole.low[0], whole.high[-1]
+            if part.low[0] < low or part.high[-1] > high:
+                raise ArgumentError(f"{where}={values}: must lie within {low:g} to {high:g}")
+            if not whole.low.is_floating_point() and part.low.is_floating_point():
+                raise ArgumentError(f"{where}={values}: must be whole, as the range is")
+            parts[name] = Bins(part.low.to(whole.low), part.high.to(whole.high))
+        return parts
+
+
+class Items(LevelSpace):
+    """The items of a data set, such as prompts: a level is the place of one of them, int64.
+
+    Each is a bin of its own.
+
+    Args:
+        count: number N of items.
+        features: numbers that tell what items are like, float [N, D]; None for their places alone.
+        target: places of those that are to be mastered; None for no target.
+        named: further distributions like ``target``, by name.
+
+    Raises:
+        ArgumentError: if there is no item, or not a row of features for each.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        features: Tensor | None = None,
+        target: Sequence[int] | None = None,
+        named: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        if count < 1:
+            raise ArgumentError(f"count={count}: must be at least 1")
+        self.size = count
+        self.axes = {"item": range(count)}
+        lines = torch.arange(count).unsqueeze(-1) if features is None else features
+        if len(lines) != count or lines.ndim != 2:
+            raise ArgumentError(f"features={list(lines.shape)}: must have a row for each item")
+        low, high = lines.amin(0), lines.amax(0)
+        self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
+        given = {**({} if target is None else {"target": target}), **(named or {})}
+        for key, places in given.items():
+            if not places or min(places) < 0 or max(places) >= count:
+                raise ArgumentError(f"{key}={places}: must be places from 0 to {count - 1}")
+        self._places = {name: torch.tensor(list(places)) for name, places in given.items()}
+        parts = {name: _SomeItems(places) for name, places in self._places.items()}
+        self.distributions = {"all": self, **parts}
+
+    @property
+    def target_shares(self) -> Tensor:
+        """The target as shares of the items, float [N]."""
+        places: Any = self.target
+        return places.places.bincount(minlength=self.size) / len(places.places)
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        """The items themselves."""
+        return TensorDict({"item": choices}, choices.shape)
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """Items drawn uniformly."""
+        return self.generate(torch.randint(self.size, (count,), generator=generator), [])
+
+    def given(self, levels: TensorDictBase) -> Tensor:
+        """Places, int64 [*B]."""
+        return levels["item"]
+
+    def rows(self, levels: TensorDictBase) -> list[int]:
+        """Places as Python's numbers."""
+        places: list[int] = levels["item"].tolist()
+        return places
+
+
+class _SomeItems:
+    def __init__(self, places: Tensor) -> None:
+        self.places = places
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        which = torch.randint(len(self.places), (count,), generator=generator)
+        return TensorDict({"item": self.places[which]}, [count])
+
+
+class LevelGenerator(LevelSpace):
+    """Levels that a function draws; there are no bins.
+
+    Args:
+        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict or a tensorclass.
+        target: the same for what is to be mastered; None for no target.
+        edit: ``edit(levels, count, generator)``: levels [n] after so many small random edits; None
+            where levels cannot be edited.
+        named: further functions like ``draw``, by name, for hand-designed curricula.
+
+    Raises:
+        ArgumentError: if levels are no such thing, or not as many as are asked for.
+    """
+
+    def __init__(
+        self,
+        draw: Callable[[int, torch.Generator], Any],
+        *,
+        target: Callable[[int, torch.Generator], Any] | None = None,
+        edit: Callable[[Any, int, torch.Generator], Any] | None = None,
+        named: Mapping[str, Callable[[int, torch.Generator], Any]] | None = None,
+    ) -> None:
+        drawn = {**({} if target is None else {"target": target}), **(named or {})}
+        parts = {name: _Drawn(name, function) for name, function in drawn.items()}
+        self.distributions = {"all": _Drawn("draw", draw), **parts}
+        if edit is not None:
+            self.edit = self._edits(edit)
+
+    def sample(self, count: int, generator: torch.Generator) -> Levels:
+        """Levels [count]."""
+        return self.distributions["all"].sample(count, generator)
+
+    def given(self, levels: Levels) -> Any:
+        """Levels as the function gives them."""
+        return levels[DRAWN] if DRAWN in levels.keys() else levels
+
+    @property
+    def axes(self) -> Any:
+        """There are none.
+
+        Raises:
+            ArgumentError: always.
+        """
+        raise ArgumentError(
+            "space: this curriculum draws from bins, which a generator of levels has not; give "
+            "Parameters, Items or a task"
+        )
+
+    size = coordinates = generate = axes
+
+    def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
+        def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
+            rows = zip(levels, generators, strict=True)
+            return torch.stack([_wrapped(edit(self.given(own), count, g)) for own, g in rows])
+
+        return edited
+
+
+class _Drawn:
+    def __init__(self, name: str, draw: Callable[[int, torch.Generator], Any]) -> None:
+        self._name, self._draw = name, draw
+
+    def sample(self, count: int, generator: torch.Generator) -> Levels:
+        levels = self._draw(count, generator)
+        if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (count,):
+            shape = list(getattr(levels, "shape", ())) or type(levels).__name__
+            raise ArgumentError(f"{self._name}={shape}: must give {count} levels, [{count}, ...]")
+        return _wrapped(levels)
+
+
+def _wrapped(levels: Any) -> Levels:
+    return TensorDict({DRAWN: levels}, levels.shape[:1]) if isinstance(levels, Tensor) else levels
+
+
+def _labels(values: Any) -> list[Any] | None:
+    """The choices, where they are no numbers."""
+    if isinstance(values, list) and any(not _is_number(value) for value in values):
+        return values
+    return None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
+    """The bins of a range."""
+    try:
+        if not isinstance(count, int) or count < 1:
+            raise ArgumentError(f"bins={count}: must be at least 1")
+        if labels is not None:
+            return points(list(range(len(labels))))
+        if isinstance(values, range) and values.step == 1 and len(values) > count:
+            edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
+            low = edges[:-1].ceil().long()
+            return Bins(low, torch.cat([low[1:], torch.tensor([values.stop])]) - 1)
+        if isinstance(values, tuple) and len(values) == 2 and all(map(_is_number, values)):
+            return intervals(float(values[0]), float(values[1]), count)
+        if isinstance(values, list | range) and len(values):
+            return points(list(values))
+    except ArgumentError:
+        raise
+    except ValueError as error:
+        raise ArgumentError(f"{key}={values!r}: {error}") from error
+    raise ArgumentError(f"{key}={values!r}: must be (low, high), a range or a list")
+
+
+def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise ArgumentError(f"{key}.{unknown[0]}: unknown; there are: {', '.join(known)}")

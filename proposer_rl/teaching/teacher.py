@@ -1,0 +1,440 @@
+"""A curriculum for a loop of one's own: levels out, results in."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from threading import RLock
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula import Batch, Curriculum, Student, outcome_of, require
+from proposer_rl.recipes import Recipe
+from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+from proposer_rl.teaching.abilities import adapted
+from proposer_rl.teaching.making import make_curriculum
+from proposer_rl.teaching.segments import Segments
+from proposer_rl.teaching.spaces import LevelSpace
+from proposer_rl.teaching.tickets import OUT, RESULTS, TOLD, Block, Tickets, as_array
+
+Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
+
+
+class Teacher:
+    """Proposes the levels of a space by a curriculum, and observes what came of them.
+
+    In batches, one after another:
+
+        levels = teacher.propose(32)
+        teacher.observe({"return": returns, "success": success})
+
+    Or by tickets, of which any number may be out; they come back in any order, in parts, or never:
+
+        ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
+        teacher.tell(ticket, return_=r, success=ok)
+
+    What was told is taken in when the curriculum proposes next, at every ``block`` tickets.
+    Whatever is refused counts nothing, and leaves the teacher as it was.
+
+    Args:
+        curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of one's own.
+        space: :class:`~proposer_rl.teaching.Parameters`, :class:`~proposer_rl.teaching.Items`,
+            :class:`~proposer_rl.teaching.LevelGenerator`, or a task.
+        seed: of every random draw.
+        students: number K of students that train side by side, each with levels of its own. All
+            levels and results then have a dimension [K] before the others.
+        device: where levels and tickets are given.
+        filter: of the proposed levels, as of :func:`proposer_rl.train`.
+        block: tickets that the curriculum proposes at once.
+        success: what in a rollout is a success where it has no such entry: ``"terminated"``,
+            ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
+        student: what the curriculum may ask of; None for one that can do what ``can`` says.
+        can: functions by their names, as of :class:`~proposer_rl.curricula.Student`. Where there is
+            one student, ``values``, ``performance``, ``exact_performance``, ``optimal_return`` and
+            ``play`` are called with levels [n] as :meth:`propose` gives them.
+
+    Raises:
+        ArgumentError: naming the argument.
+        UnfitStudentError: naming what the curriculum needs of the student, and how to give it.
+
+    Example:
+        >>> import proposer_rl as prl
+        >>> space = prl.Parameters({"gravity": (5.0, 25.0), "walls": range(60)}, bins=4)
+        >>> teacher = prl.Teacher(prl.curricula.plr(score="regret"), space)
+        >>> ticket, level = teacher.ask()
+        >>> sorted(level), teacher.tell(ticket, return_=0.5)
+        (['gravity', 'walls'], None)
+    """
+
+    _block: Block | None  # that tickets are handed out from
+    _at: int  # the next of them
+    _rows: list[Any]  # its levels one by one, from the first time on
+    _moved: Any  # its levels as the loop gets them, likewise
+
+    @checked
+    def __init__(
+        self,
+        curriculum: Recipe | Curriculum | str,
+        space: LevelSpace | Task,
+        *,
+        seed: int = 0,
+        students: Count = 1,
+        device: str | torch.device = "cpu",
+        filter: Mapping[str, Any] | str | None = None,
+        block: Count = 128,
+        success: Success | None = None,
+        student: Student | None = None,
+        **can: Any,
+    ) -> None:
+        self.space, self.device, self.block = space, torch.device(device), block
+        self._seeds = [seed + copy for copy in range(students)]
+        self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
+        alone = students == 1
+        given = getattr(space, "given", _same)
+        self.student = student or Student(
+            **{name: adapted(name, one, given) if alone else one for name, one in can.items()}
+        )
+        named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
+        require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
+        self._given, self._rows_of = given, getattr(space, "rows", list)
+        self._success = success
+        self._tickets = Tickets(students)
+        self._proposals = 0
+        self._whole: list[int] = []  # first tickets of what propose() has given
+        self._use(None, 0)
+        self._segments = Segments()
+        self._lock, self._process = RLock(), os.getpid()
+
+    @property
+    def students(self) -> int:
+        """The number K."""
+        return len(self._seeds)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """What must be told beside the return: ``success``, ``rollout``."""
+        return self.curriculum.reads
+
+    @checked
+    def propose(self, n: Count) -> Any:
+        """Levels [n] ([K, n] of several students) to be observed together."""
+        with self._here():
+            block = self._next(n)
+            self._tickets.hand_out(block.start, block.end)
+            self._whole.append(block.start)
+            return self._levels(block, slice(None))
+
+    def ask(self, n: int | None = None) -> tuple[Any, Any]:
+        """The next level and its ticket.
+
+        Args:
+            n: None for one level, as Python's numbers where the space has such; else so many.
+
+        Returns:
+            A ticket and a level; or tickets int64 [n] and levels [n], on the teacher's device. One
+            ticket holds the levels of all K students.
+        """
+        with self._here():
+            if n is None:
+                return self._one()
+            if not isinstance(n, int) or n < 0:
+                raise ArgumentError(f"n={n!r}: must be a whole number, not negative")
+            ids: list[Tensor] = []
+            levels: list[Any] = []
+            while n or not ids:
+                if self._block is None or (n and self._at == self._block.end):
+                    self._refill(max(self.block, n))
+                block, start = self._block, self._at
+                assert block is not None
+                self._at = end = min(start + n, block.end)
+                self._tickets.hand_out(start, end)
+                ids.append(torch.arange(start, end, device=self.device))
+                levels.append(self._levels(block, slice(start - block.start, end - block.start)))
+                n -= end - start
+            if len(ids) == 1:
+                return ids[0], levels[0]
+            return torch.cat(ids), torch.cat(levels, 0 if self.students == 1 else 1)
+
+    def tell(
+        self,
+        ids: Any,
+        return_: Any,
+        success: Any = None,
+        *,
+        score: Any = None,
+        episodes: Any = None,
+        steps: Any = None,
+    ) -> None:
+        """What came of levels.
+
+        Args:
+            ids: a ticket, or tickets [n] in any order.
+            return_: undiscounted, of an episode on each level or a mean of several: a number, or
+                numbers [n] ([K, n] of several students).
+            success: whether, or of how many of them; from 0 to 1.
+            score: how much there is to learn on the level, where the loop says so itself, such as
+                the mean of its absolute advantages; for curricula that score levels.
+            episodes: how many there were; None for one.
+            steps: how long they took together.
+
+        Raises:
+            ArgumentError: naming the argument: a ticket that is not out, a number that is missing
+                or not finite, another shape.
+        """
+        told = {
+            name: value
+            for name, value in zip(RESULTS, (return_, success, score, episodes, steps), strict=True)
+            if value is not None
+        }
+        with self._here():
+            if "rollout" in self.reads:
+                raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
+            self._require_success("success" in told, "tell it with success=")
+            if isinstance(ids, int) and self.students == 1:
+                self._tell_one(ids, told)
+            else:
+                self._tell(self._ids(ids), told)
+
+    def drop(self, ids: Any) -> None:
+        """Nothing will come of these levels: episodes that were cut off."""
+        with self._here():
+            self._tickets.close(self._tickets.places(self._ids(ids)))
+
+    def observe(self, outcome: Any, ids: Any = None) -> None:
+        """What came of the levels that were proposed, or of those of some tickets.
+
+        Args:
+            outcome: by name, ``return`` and where there is such a thing ``success``, [n]; as
+                :func:`~proposer_rl.curricula.outcome_of` makes it of a rollout [n, T] each row of
+                which began with a reset on its level. Or a rollout [*B, T] with ``level_id``, as
+                :class:`~proposer_rl.teaching.LevelTransform` puts it there: each episode that ends
+                in it is one on the level that it began on, wherever that was.
+            ids: the tickets; None for the levels of :meth:`propose`, if one batch is out.
+
+        Raises:
+            ArgumentError: as :meth:`tell`; if several batches are out, or a rollout does not say
+                which levels it is of.
+        """
+        with self._here():
+            if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
+                tickets, whole = self._segments.ended(outcome)
+                if not len(tickets):
+                    return
+                self._observe_rollout(tickets, whole)
+                self._segments.keep()
+                return
+            tickets = self._proposed() if ids is None else self._ids(ids)
+            if "rollout" in outcome.keys():
+                self._observe_rollout(tickets, self._of_students(outcome["rollout"]))
+            else:
+                if "rollout" in self.reads:
+                    raise ArgumentError("outcome: has no rollout, which this curriculum reads")
+                self._require_success("success" in outcome.keys(), "put it into the outcome")
+                told = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
+                if "return" not in told:
+                    raise ArgumentError(f"outcome={sorted(outcome.keys())}: has no return")
+                self._tell(tickets, told)
+            if ids is None:
+                self._whole.clear()
+
+    def log(self) -> dict[str, Any]:
+        """What the curriculum has to tell since the last call; empty if there is nothing."""
+        with self._here():
+            self._tickets.collect(self._observe)
+            return self.curriculum.log()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed loop needs, tickets that are out included."""
+        with self._here():
+            return {
+                "curriculum": self.curriculum.state_dict(),
+                "tickets": self._tickets.state_dict(),
+                "proposals": self._proposals,
+                "proposed": list(self._whole),
+                "block": None if self._block is None else self._block.start,
+                "at": self._at,
+                "rollout": self._segments.state_dict(),
+            }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on, bit by bit, with what :meth:`state_dict` returned."""
+        with self._here():
+            source: Any = self.space.space
+            like = source.sample(1, torch.Generator())[0]
+            self.curriculum.load_state_dict(state["curriculum"])
+            self._tickets.load_state_dict(state["tickets"], like, self.students)
+            self._proposals, self._at = state["proposals"], state["at"]
+            self._whole = list(state["proposed"])
+            blocks = {block.start: block for block in self._tickets.blocks}
+            self._use(blocks.get(state["block"]), self._at)
+            self._segments.load_state_dict(state["rollout"])
+
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "a teacher is not copied into another process, where it would be a second one; give "
+            "that process teacher.client()"
+        )
+
+    def _here(self) -> RLock:
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                "this is a copy of a teacher that a forked process has; give that process "
+                "teacher.client()"
+            )
+        return self._lock
+
+    def _one(self) -> tuple[int, Any]:
+        block = self._block
+        if block is None or self._at == block.end:
+            self._refill(self.block)
+            block = self._block
+            assert block is not None
+        ticket = self._at
+        self._at += 1
+        tickets = self._tickets
+        tickets.state[ticket - tickets.first] = OUT
+        if not self._rows:
+            each = [self._rows_of(levels) for levels in block.batch.levels.cpu()]
+            self._rows = each[0] if self.students == 1 else [*zip(*each, strict=True)]
+        return ticket, self._rows[ticket - block.start]
+
+    def _refill(self, count: int) -> None:
+        block = self._next(count)
+        self._use(block, block.start)
+
+    def _use(self, block: Block | None, at: int) -> None:
+        """Hand out tickets of a block from one on."""
+        self._block, self._at = block, at
+        self._rows, self._moved = [], None
+
+    def _next(self, count: int) -> Block:
+        """What the curriculum proposes, when it has observed what was told."""
+        self._tickets.collect(self._observe)
+        streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
+        batch = self.curriculum.propose(self.student, count, streams)
+        self._proposals += 1
+        return self._tickets.add(batch)
+
+    def _levels(self, block: Block, which: slice) -> Any:
+        """Some levels of a block, as the loop gets them."""
+        if block is not self._block or self._moved is None:
+            levels = block.batch.levels.to(self.device)
+            moved = self._given(levels[0] if self.students == 1 else levels)
+            if block is not self._block:
+                return moved[which] if self.students == 1 else moved[:, which]
+            self._moved = moved
+        return self._moved[which] if self.students == 1 else self._moved[:, which]
+
+    def _tell_one(self, ticket: int, told: Mapping[str, Any]) -> None:
+        tickets = self._tickets
+        place = ticket - tickets.first
+        if not (0 <= place < tickets.next - tickets.first and tickets.state[place] == OUT):
+            tickets.places(np.array([ticket]))  # says what is wrong with it
+        numbers = {name: _number(name, value) for name, value in told.items()}
+        for name, number in numbers.items():
+            tickets.results[name][0, place] = number
+        tickets.state[place] = TOLD
+        tickets.told = True
+
+    def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
+        shape = (len(ids),) if self.students == 1 else (self.students, len(ids))
+        arrays = {
+            name: as_array(_argument(name), value, shape).reshape(self.students, -1)
+            for name, value in told.items()
+        }
+        if "success" in arrays:
+            _check_share(arrays["success"])
+        self._tickets.tell(self._tickets.places(ids), arrays)
+
+    def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
+        """Observe a rollout [K, n, T], each row of which is of one ticket."""
+        if tuple(rollout.batch_size[:2]) != (self.students, len(ids)):
+            raise ArgumentError(
+                f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
+                f"{len(ids)} levels of {self.students} student(s)"
+            )
+        place = self._tickets.places(ids)
+        rollout, after = rollout.copy(), rollout["next"].copy()
+        known = "success" in after.keys()
+        if not known and self._success is not None:
+            rule = self._success
+            after["success"] = rule(after) if callable(rule) else after[rule]
+            known = True
+        self._require_success(known, "give Teacher(success=...), or the rollout a next success")
+        rollout["next"] = after
+        outcome = outcome_of(rollout)
+        if not known:
+            outcome = outcome.exclude("success")
+        for name in ("return", "success") if known else ("return",):
+            as_array(name, outcome[name], tuple(outcome.batch_size))
+        for block, which in self._tickets.parts(ids):
+            rows = torch.from_numpy(which)
+            part = block.batch[:, torch.from_numpy(ids[which] - block.start)]
+            self._observe(part, outcome[:, rows.to(outcome["return"].device)])
+        self._tickets.close(place)
+
+    def _of_students(self, rollout: TensorDictBase) -> TensorDictBase:
+        return rollout if self.students > 1 or rollout.ndim > 2 else rollout.unsqueeze(0)
+
+    def _observe(self, batch: Batch, outcome: TensorDict) -> None:
+        self.curriculum.observe(self.student, batch, outcome)
+
+    def _require_success(self, known: bool, how: str) -> None:
+        if "success" in self.reads and not known:
+            raise ArgumentError(f"success: missing: this curriculum reads it; {how}")
+
+    def _proposed(self) -> NDArray[np.int64]:
+        """The tickets of the one batch that is out."""
+        if len(self._whole) != 1:
+            out = f"{len(self._whole)} batches are out" if self._whole else "nothing is out"
+            raise ArgumentError(
+                f"ids: missing: {out}; observe belongs to the last propose, and several at once "
+                "need ask(n) and its tickets"
+            )
+        (start,) = self._whole
+        block = next(block for block in self._tickets.blocks if block.start == start)
+        return np.arange(block.start, block.end)
+
+    def _ids(self, ids: Any) -> NDArray[np.int64]:
+        """Tickets as an array [n] on the CPU."""
+        array = np.asarray(ids.detach().cpu() if isinstance(ids, Tensor) else ids)
+        if array.size == 0:
+            return np.zeros(0, np.int64)
+        if array.ndim > 1 or array.dtype.kind not in "iu":
+            raise ArgumentError(
+                f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
+            )
+        return array.reshape(-1).astype(np.int64)
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{_argument(name)}={value!r:.60}: must be a number") from error
+    if not number - number == 0:
+        raise ArgumentError(f"{_argument(name)}={number}: must be finite")
+    if name == "success" and not 0 <= number <= 1:
+        _check_share(np.array([number]))
+    return number
+
+
+def _check_share(success: NDArray[np.float64]) -> None:
+    outside = success[(success < 0) | (success > 1)]
+    if outside.size:
+        raise ArgumentError(f"success={outside[0]:g}: must be from 0 to 1")
+
+
+def _argument(name: str) -> str:
+    return "return_" if name == "return" else name
+
+
+def _same(levels: Any) -> Any:
+    return levels

@@ -1,0 +1,222 @@
+"""Episodes that go on across rollouts: each level's outcome against playing it alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from proposer_rl.curricula import (
+    Batch,
+    Curriculum,
+    Inbox,
+    ReplayCurriculum,
+    ReplayRule,
+    Scorer,
+    Student,
+    TaskStudent,
+)
+from proposer_rl.curricula.batches import fresh_levels
+from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.experiment import Experiment
+from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.settings import ArgumentError, PPOSettings, ScheduleSettings, SolverSettings
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium.env import plays
+from proposer_rl.tasks.gymnasium.player import LevelPlayer
+from tests.same_run import assert_same_run
+from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task
+from tests.tiny import tiny_task, tiny_view_task
+
+K, P, T = 2, 3, 4
+SEEDS = list(range(K))
+
+
+def continued_task(**changed: Any) -> Any:
+    numbers: dict[str, Any] = {"horizon": T, "epochs": 2, "minibatches": 2, "learning_rate": 3e-3}
+    ppo = PPOSettings(continue_episodes=True, anneal_updates=30, **{**numbers, **changed})
+    return walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))
+
+
+TASK = continued_task()
+
+
+class Kept(Curriculum):
+    """Levels of the target; remembers what it has proposed and observed."""
+
+    def __init__(self) -> None:
+        self.inbox, self.proposed = Inbox(), []
+        self.observed: list[tuple[Batch, TensorDictBase]] = []
+
+    def propose(self, student: Student, count: int, streams: Any) -> Batch:
+        self.proposed.append(fresh_levels(TASK.target, count, streams, "levels"))
+        return self.inbox.batch(self.proposed[-1])
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        self.inbox.check(batch, outcome)
+        self.inbox.put(batch, reached=outcome["return"])
+        self.observed.append((batch, outcome))
+
+
+def played(level: TensorDictBase, actions: list[int]) -> tuple[float, bool]:
+    """Return and success of an episode on a level [1], by the environment alone."""
+    (play,) = plays(level)
+    player = LevelPlayer(TASK._make, PARAMETERS, play)
+    player.reset()
+    total = 0.0
+    for number, action in enumerate(actions, 1):
+        _, reward, terminated, truncated, _ = player.step(action + 1)
+        total += TASK.reward_scale * reward
+        assert (terminated or truncated) == (number == len(actions))
+    return total, terminated
+
+
+def test_each_episode_is_credited_to_its_level() -> None:
+    """Replica by replica and environment by environment, with queues that are plain lists."""
+    learner = TASK.learner([Streams(seed) for seed in SEEDS])
+    curriculum, updates = Kept(), 14
+    levels = ContinuedLevels(
+        curriculum, TaskStudent(TASK, learner), learner, TASK.evaluated_on["target"]
+    )
+    rollouts, sizes = [], []
+    for update in range(updates):
+        result, credits = levels.update([Streams(seed, update) for seed in SEEDS])
+        for credit in credits:
+            curriculum.observe(TaskStudent(TASK, learner), *credit)
+        rollouts.append(result.rollout)
+        sizes.append(curriculum.proposed[-1].shape[1])
+    whole: Any = torch.cat(rollouts, 2)
+    expected: dict[tuple[int, int], tuple[float, bool, int]] = {}  # by replica and level's seed
+    for k in range(K):
+        queue: list[TensorDictBase] = []
+        now: list[Any] = [None] * P
+        since = [0] * P
+        for t in range(updates * T):
+            if t % T == 0:  # a proposal; of what is left over the newest P stay
+                proposed = curriculum.proposed[t // T][k]
+                queue = queue[-P:] + [level.unsqueeze(0) for level in proposed]
+            if t == 0:
+                now = [queue.pop(0) for _ in range(P)]
+            for p in range(P):
+                if whole["next", "done"][k, p, t]:
+                    actions = whole["action"][k, p, since[p] : t + 1].tolist()
+                    seed = int(now[p]["seed"])
+                    expected.setdefault((k, seed), (*played(now[p], actions), len(actions)))
+                    now[p], since[p] = queue.pop(0) if queue else now[p], t + 1
+    seen: Counter[tuple[int, int]] = Counter()
+    for batch, outcome in curriculum.observed:
+        for k in range(K):
+            for m in range(batch.count):
+                key = k, int(batch.levels["seed"][k, m])
+                seen[key] += 1
+                total, success, steps = expected[key]
+                assert float(outcome["return"][k, m]) == pytest.approx(total, abs=1e-5)
+                assert float(outcome["success"][k, m]) == success
+                assert int(outcome["steps"][k, m]) == steps
+    assert max(seen.values()) == 1
+    assert len(seen) > 0.6 * len(expected)  # the rest is outstanding, or left out
+    lengths = [steps for _, _, steps in expected.values()]
+    assert max(lengths) == LIMIT > T > min(lengths)
+    assert len({*sizes}) > 2  # as many levels as episodes end
+    # In the order of the proposals, whatever the order in which they have come in.
+    numbers = [int(part["number"][0, 0]) for part in curriculum.inbox.take()]
+    assert numbers == sorted(numbers)
+
+
+def test_rollouts_go_on_where_the_last_one_ended() -> None:
+    learner = TASK.learner([Streams(seed) for seed in SEEDS])
+    learner.env.set_levels(torch.stack([TASK.evaluated_on["target"][:P]] * K))
+    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
+    first, second = (learner.collect(generators) for _ in range(2))
+    last = first["next"][:, :, -1]
+    going_on = ~last["done"].squeeze(-1)
+    assert going_on.any()
+    assert torch.equal(second["observation"][:, :, 0][going_on], last["observation"][going_on])
+    learner.restore(learner.snapshot())  # begins anew
+    third = learner.collect(generators)
+    assert torch.equal(third["observation"][:, :, 0], first["observation"][:, :, 0])
+
+
+def test_a_memory_goes_on_with_its_episode() -> None:
+    """Two rollouts are one of twice the length."""
+    halves, whole = (
+        tiny_view_task(
+            solver=SolverSettings(
+                batch_size=P, ppo=PPOSettings(horizon=horizon, continue_episodes=True)
+            )
+        ).learner([Streams(0)])
+        for horizon in (T, 2 * T)
+    )
+    task = tiny_view_task()
+    levels = task.target.sample(P, torch.Generator().manual_seed(0)).unsqueeze(0)
+    for learner in (halves, whole):
+        learner.env.set_levels(levels)
+    generators = [torch.Generator().manual_seed(0)], [torch.Generator().manual_seed(0)]
+    first, second = (halves.collect(generators[0]) for _ in range(2))
+    expected = whole.collect(generators[1])
+    found: Any = torch.cat([first, second], 2)
+    for key in ("action", "state_value", ("next", "recurrent_state_h"), "view"):
+        torch.testing.assert_close(found[key], expected[key])
+
+
+def test_whoever_reads_a_level_once_cannot_go_on() -> None:
+    ppo = PPOSettings(horizon=T, continue_episodes=True)
+    task = tiny_task(solver=SolverSettings(batch_size=P, ppo=ppo))
+    with pytest.raises(ArgumentError, match=r"^continue_episodes=True: this Solver reads its"):
+        task.learner([Streams(0)])
+
+
+def test_others_watch_whole_episodes_elsewhere() -> None:
+    """What a score plays leaves the episodes of the training where they are."""
+    learner = TASK.learner([Streams(seed) for seed in SEEDS])
+    student = TaskStudent(TASK, learner)
+    assert isinstance(learner.collector, RolloutCollector)
+    levels = torch.stack([TASK.evaluated_on["target"][:2]] * K)
+    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
+    learner.env.set_levels(torch.stack([TASK.evaluated_on["target"][:P]] * K))
+    before = learner.collect(generators)
+    rollout = student.play(levels, generators)
+    assert rollout.shape == (K, 2, max(LIMIT, T)) and rollout["next", "done"].any(2).all()
+    after = learner.collect(generators)
+    going_on = ~before["next", "done"][:, :, -1, 0]
+    assert torch.equal(
+        after["observation"][:, :, 0][going_on],
+        before["next", "observation"][:, :, -1][going_on],
+    )
+
+
+def experiment(folder: Path, updates: int) -> Experiment:
+    task = continued_task(normalize_observations=True, normalize_rewards=True)
+    learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
+    rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
+    curriculum = ReplayCurriculum(
+        task.space, Scorer("positive_value_loss", "episodes"), rule, capacity=8
+    )
+    return Experiment(
+        task,
+        learner,
+        curriculum,
+        schedule=ScheduleSettings(
+            updates=updates,
+            cycle_length=5,
+            evaluate_every=1,
+            checkpoint_every=3,
+            checkpoint_seconds=None,
+            headline="target_success",
+        ),
+        seeds=SEEDS,
+        folder=RunFolder(folder),
+        progress=False,
+    )
+
+
+def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(tmp_path: Path) -> None:
+    for updates in (5, 12):
+        experiment(tmp_path / "resumed", updates).run()
+    experiment(tmp_path / "whole", 12).run()
+    assert_same_run(tmp_path / "resumed", tmp_path / "whole")

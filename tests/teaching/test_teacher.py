@@ -1,0 +1,447 @@
+"""The teacher in loops of one's own: what goes in comes out, in any order, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as profile
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+import proposer_rl as prl
+from proposer_rl.curricula import Batch, Curriculum
+from proposer_rl.recipes import available
+from proposer_rl.settings import ArgumentError
+from tests.curricula.test_contract import same
+from tests.tiny import TASK
+
+SPACE = prl.Parameters(
+    {"gravity": (5.0, 25.0), "walls": range(60), "ground": ["flat", "stairs"]},
+    bins=4,
+    target={"gravity": 25.0, "ground": "stairs"},
+    named={"easy": {"walls": range(0, 10)}},
+)
+ITEMS = prl.Items(100)
+SMALL = {"capacity": 32, "fill": 0.25}
+PROGRESS = prl.curricula.learning_progress(source="episodes")
+
+
+def plr(**settings: Any) -> prl.Teacher:
+    return prl.Teacher(prl.curricula.plr(**{**SMALL, **settings}), SPACE, block=8)
+
+
+class Spy(Curriculum):
+    """Levels that are numbered, and all that is observed of them."""
+
+    reads = ("success",)
+
+    def __init__(self) -> None:
+        self.seen: dict[int, tuple[float, float]] = {}
+        self.count = 0
+
+    def propose(self, student: Any, count: int, streams: Any) -> Batch:
+        number = torch.arange(self.count, self.count + count).expand(len(streams), -1)
+        self.count += count
+        levels = TensorDict({"item": number}, number.shape)
+        return Batch(levels, TensorDict({"number": number}, number.shape))
+
+    def observe(self, student: Any, batch: Batch, outcome: Any) -> None:
+        assert (batch.levels["item"] == batch.notes["number"]).all()
+        for number, *came in zip(
+            batch.notes["number"][0].tolist(),
+            outcome["return"][0].tolist(),
+            outcome["success"][0].tolist(),
+            strict=True,
+        ):
+            assert number not in self.seen
+            self.seen[number] = tuple(came)
+
+
+@profile(max_examples=30)
+@given(st.data())
+def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
+    """Against a plain dict: singles, batches and parts, any number outstanding, in any order."""
+    spy = Spy()
+    teacher = prl.Teacher(spy, ITEMS, block=data.draw(st.integers(1, 5)))
+    out: dict[int, int] = {}  # ticket to level
+    told: dict[int, tuple[float, float]] = {}
+    for step in range(data.draw(st.integers(1, 25))):
+        do = data.draw(st.sampled_from(["one", "many", "tell", "part", "drop", "resume"]))
+        if do == "one":
+            ticket, level = teacher.ask()
+            assert ticket not in out
+            out[ticket] = level
+        elif do == "many":
+            ids, levels = teacher.ask(data.draw(st.integers(0, 9)))
+            assert ids.dtype == torch.int64 and not set(ids.tolist()) & set(out)
+            out |= dict(zip(ids.tolist(), levels.tolist(), strict=True))
+        elif do == "resume":
+            state = io.BytesIO()
+            torch.save(teacher.state_dict(), state)
+            state.seek(0)
+            other = prl.Teacher(spy, ITEMS, block=teacher.block)
+            spy.load_state_dict = lambda state: None  # type: ignore[method-assign]
+            other.load_state_dict(torch.load(state, weights_only=True))
+            teacher = other
+        elif out:
+            few = data.draw(st.integers(1, len(out)))
+            some = data.draw(st.permutations(sorted(out)))[: 1 if do == "tell" else few]
+            numbers = [out.pop(ticket) for ticket in some]
+            if do == "drop":
+                teacher.drop(some)
+                continue
+            returns = [step + number / 8 for number in numbers]
+            if do == "tell":
+                teacher.tell(some[0], returns[0], True)
+            else:
+                teacher.tell(torch.tensor(some), returns, [1.0] * len(some))
+            told |= {n: (r, 1.0) for n, r in zip(numbers, returns, strict=True)}
+    teacher.log()
+    assert spy.seen == told
+
+
+def test_it_forgets_what_is_over() -> None:
+    teacher = prl.Teacher(Spy(), ITEMS, block=16)
+    for _ in range(200):
+        ids, _ = teacher.ask(40)
+        teacher.tell(ids, torch.zeros(40), torch.zeros(40))
+    assert len(teacher._tickets.blocks) <= 4 and len(teacher._tickets.state) == 1024
+
+
+FREE = {  # of what needs nothing of a learner, settings that are small
+    "domain_randomization": {},
+    "target": {},
+    "hand_designed": {"distributions": ["easy", "target"], "until": [2]},
+    "plr": SMALL,
+    "alp_gmm": {"warmup": 16, "refit": 12, "components": 3},
+    "learning_progress": {"source": "episodes"},
+}
+SPACES: dict[str, Callable[[], Any]] = {
+    "ranges": lambda: SPACE,
+    "items": lambda: prl.Items(24, target=[3, 4], named={"easy": [0, 1]}),
+    "a task": lambda: TASK,
+    "a generator": lambda: prl.LevelGenerator(
+        lambda n, g: torch.rand(n, 3, generator=g),
+        target=lambda n, g: torch.ones(n, 3),
+        named={"easy": lambda n, g: torch.zeros(n, 3)},
+    ),
+}
+
+
+def play(teacher: prl.Teacher, rounds: int) -> list[Any]:
+    """Both ways of asking; what the levels were."""
+    levels = []
+    for i in range(rounds):
+        ids, several = teacher.ask(5)
+        ticket, level = teacher.ask()
+        teacher.tell(ticket, 0.1 * i, i % 2)
+        teacher.tell(ids[2:], torch.arange(3.0) - i, torch.tensor([True, False, True]))
+        levels += [several, level]
+        if i % 3 == 0:
+            levels.append(teacher.propose(4))
+            teacher.observe({"return": [0.0, 1.0, 2.0, float(i)], "success": [0, 1, 0, 1]})
+    return levels
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", FREE)
+def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: str) -> None:
+    """It resumes bit by bit, with tickets that are out."""
+    settings = FREE[name]
+    if space == "a task" and name == "hand_designed":
+        settings = {"distributions": ["id", "id"], "until": [2]}
+    recipe = getattr(prl.curricula, name)(**settings)
+    bins = {"alp_gmm", "learning_progress"}
+    if space == "a generator" and name in bins:
+        with pytest.raises(ArgumentError, match="space: this curriculum draws from bins"):
+            prl.Teacher(recipe, SPACES[space]())
+        return
+    whole = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
+    assert whole.curriculum.needs == ()
+    play(whole, 7)
+    file = io.BytesIO()
+    torch.save(whole.state_dict(), file)
+    file.seek(0)
+    parts = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
+    parts.load_state_dict(torch.load(file, weights_only=True))
+    for one, other in zip(play(whole, 6), play(parts, 6), strict=True):
+        assert same(plain(one), plain(other))
+    assert same(whole.state_dict(), parts.state_dict())
+    assert whole.log().keys() == parts.log().keys()
+
+
+def plain(levels: Any) -> Any:
+    return levels.to_dict() if hasattr(levels, "to_dict") else levels
+
+
+def test_all_that_need_nothing_are_here() -> None:
+    """No method with ``needs == ()`` is left out above."""
+    free = set()
+    for name in available("method"):
+        settings = {"hand_designed": {"distributions": ["easy"], "until": []}}.get(name, {})
+        try:
+            teacher = prl.Teacher(getattr(prl.curricula, name)(**settings), SPACE)
+        except (prl.ArgumentError, TypeError, ValueError):
+            continue
+        free |= {name} if teacher.curriculum.needs == () else set()
+    assert free - {"learning_progress"} == FREE.keys() - {"learning_progress"}
+
+
+def test_every_update_has_draws_of_its_own() -> None:
+    """One ``Streams(0)`` at each update gives the same levels for ever; here there is none."""
+    teacher = prl.Teacher(prl.curricula.domain_randomization(), SPACE)
+    first, second = teacher.propose(8), teacher.propose(8)
+    assert not (first["gravity"] == second["gravity"]).any()
+    other = prl.Teacher(prl.curricula.domain_randomization(), SPACE)
+    assert (other.propose(8) == first).all()
+    third = prl.Teacher(prl.curricula.domain_randomization(), SPACE, seed=1).propose(8)
+    assert not (third["gravity"] == first["gravity"]).any()
+
+
+def test_several_students_have_levels_of_their_own() -> None:
+    teacher = prl.Teacher(prl.curricula.plr(**SMALL), SPACE, students=2, block=8)
+    alone = prl.Teacher(prl.curricula.plr(**SMALL), SPACE, seed=1, block=8)
+    for i in range(8):
+        ids, levels = teacher.ask(8)
+        own_ids, own = alone.ask(8)
+        assert levels.batch_size == (2, 8)
+        assert (levels[1] == own).all()
+        returns = torch.arange(16.0).view(2, 8) * (i + 1) % 7
+        teacher.tell(ids, returns)
+        alone.tell(own_ids, returns[1])
+    assert not (levels[0] == levels[1])["gravity"].all()
+    with pytest.raises(ArgumentError, match=r"return_: has shape \[8\], but must have \[2, 8"):
+        teacher.tell(teacher.ask(8)[0], torch.zeros(8))
+
+
+def test_levels_with_progress_come_again() -> None:
+    """Replay by returns alone: a level on which the return moves gets the largest share."""
+    items = prl.Items(16)
+    curriculum = prl.curricula.plr(
+        score="l1_value_loss", capacity=16, fill=0.5, staleness=0.1, temperature=0.1
+    )
+    teacher = prl.Teacher(curriculum, items, block=8)
+    drawn = torch.zeros(16)
+    for i in range(1200):
+        ticket, item = teacher.ask()
+        drawn[item] += i > 600
+        teacher.tell(ticket, float(np.random.default_rng(i).random()) if item == 5 else 0.5)
+    assert int(drawn.argmax()) == 5 and float(drawn[5]) > 3 * float(drawn.median())
+
+
+def test_a_loop_may_score_levels_itself() -> None:
+    teacher = prl.Teacher(
+        prl.curricula.plr(capacity=16, fill=0.5, staleness=0.0, temperature=0.1),
+        prl.Items(16),
+        block=8,
+    )
+    for _ in range(40):
+        ids, items = teacher.ask(8)
+        teacher.tell(ids, torch.zeros(8), score=items.double())
+    buffer = teacher.curriculum.buffer[0]
+    filled = buffer["filled"]
+    assert (buffer["level", "item"].double() == buffer["score"])[filled].all()
+
+
+def observe(teacher: prl.Teacher, **outcome: Any) -> None:
+    teacher.propose(4)
+    teacher.observe(outcome)
+
+
+NAN, ZEROS = float("nan"), [0.0] * 4
+REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
+    "a ticket that was never given": (lambda t: t.tell(99, 0.0, 1), "ids=99: is no ticket"),
+    "a negative ticket": (lambda t: t.tell(-1, 0.0, 1), "ids=-1: is no ticket"),
+    "one that is not out yet": (lambda t: t.tell(6, 0.0, 1), "ids=6: has not been handed out"),
+    "told twice": (lambda t: [t.tell(0, 0.0, 1)] * 2 and t.tell(0, 0.0, 1), "ids=0: has been told"),
+    "twice at once": (lambda t: t.tell([1, 0, 1], [0.0] * 3, [1] * 3), "ids=1: is there more than"),
+    "not finite": (lambda t: t.tell(0, NAN, 1), "return_=nan: must be finite"),
+    "not finite, several": (lambda t: t.tell([0, 1], [0.0, NAN], [1, 1]), "return_=nan: must be"),
+    "no number": (lambda t: t.tell(0, "much", 1), "return_='much': must be a number"),
+    "no numbers": (lambda t: t.tell([0, 1], ["a", "b"], [1, 1]), "return_=.*: must be numbers"),
+    "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum reads it; tell it"),
+    "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7: must be from 0 to 1"),
+    "too few": (
+        lambda t: t.tell([0, 1, 2], [0.0, 1.0], [1, 0, 0]),
+        r"return_: has shape \[2\], but",
+    ),
+    "nine results for eight levels": (
+        lambda t: t.tell([0, 1, 2], [0.0] * 3, [1] * 4),
+        r"success: has shape \[4\], but must have \[3\]",
+    ),
+    "a matrix": (lambda t: t.tell([0, 1], [[0.0, 1.0]], [1, 0]), r"return_: has shape \[1, 2\]"),
+    "tickets that are none": (
+        lambda t: t.tell([0.5, 1.5], [0.0] * 2, [1] * 2),
+        "ids: must be whole",
+    ),
+    "observed before it was proposed": (
+        lambda t: t.observe({"return": ZEROS, "success": ZEROS}),
+        "ids: missing: nothing is out",
+    ),
+    "several batches": (
+        lambda t: [t.propose(4), t.propose(4), t.observe({"return": ZEROS, "success": ZEROS})],
+        "ids: missing: 2 batches are out",
+    ),
+    "no success observed": (lambda t: observe(t, **{"return": ZEROS}), "success: missing"),
+    "no return observed": (lambda t: observe(t, success=ZEROS), "outcome=.*: has no return"),
+    "a rollout of one step": (
+        lambda t: observe(t, **{"return": [[0.0] * 3] * 4, "success": ZEROS}),
+        r"return_: has shape \[4, 3\], but must have \[4\]",
+    ),
+    "a rollout that says no level": (
+        lambda t: t.observe(TensorDict({"next": {"done": torch.ones(4, 3, 1)}}, [4, 3])),
+        "rollout: has no level_id",
+    ),
+    "asked for less than none": (lambda t: t.ask(-1), "n=-1: must be a whole number"),
+    "proposed none": (lambda t: t.propose(0), "n=0: input should be greater"),
+}
+
+
+@pytest.mark.parametrize("curriculum", [PROGRESS, prl.curricula.alp_gmm(source="episodes")])
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_wrong_is_named_and_counts_nothing(what: str, curriculum: Any) -> None:
+    if curriculum is not PROGRESS and "success" in what and "above" not in what:
+        pytest.skip("reads no success")
+    teacher = prl.Teacher(curriculum, SPACE, block=8)
+    tickets = [teacher.ask()[0] for _ in range(6)]
+    wrong, message = REFUSED[what]
+    with pytest.raises(ArgumentError, match=message) as refused:
+        wrong(teacher)
+    assert "\n" not in str(refused.value)
+    # It is as it was, and goes on.
+    left = [ticket for ticket in tickets if what != "told twice" or ticket]
+    teacher.tell(left, torch.ones(len(left)), torch.ones(len(left)))
+    teacher.ask(20)
+    assert torch.tensor(teacher.log()["histogram"]).sum() == 6
+
+
+def test_a_rollout_without_success_is_refused_where_termination_may_be_failure() -> None:
+    """Falling early terminates, surviving does not: [True, False] would be wrong."""
+
+    def rollout(**entries: Any) -> TensorDict:
+        ends = torch.zeros(2, 3, 1, dtype=torch.bool)
+        ends[0, 1] = ends[1, 2] = True
+        fell = ends & torch.tensor([True, False]).view(2, 1, 1)
+        after = {"done": ends, "terminated": fell, "truncated": ends & ~fell}
+        after |= {"reward": torch.ones(2, 3, 1), **entries}
+        return TensorDict({"next": after}, [2, 3])
+
+    def reached(**how: Any) -> list[float]:
+        teacher = prl.Teacher(PROGRESS, SPACE, **how)
+        teacher.propose(2)
+        teacher.observe(prl.outcome_of(rollout()))
+        teacher.ask(1)  # what came in is taken in
+        known = teacher.curriculum.scores["fast"][0]
+        return sorted(known[known.isfinite()].tolist())
+
+    with pytest.raises(ArgumentError, match="success: missing: this curriculum reads it; give Tea"):
+        reached()
+    assert reached(success="truncated") == reached(
+        success=lambda after: after["done"] & ~after["terminated"]
+    )
+
+
+def test_a_copy_in_another_process_is_refused() -> None:
+    teacher = plr()
+    for copied in (pickle.dumps, copy.deepcopy):
+        with pytest.raises(TypeError, match=r"give that process teacher\.client"):
+            copied(teacher)
+    teacher._process -= 1
+    with pytest.raises(RuntimeError, match="a forked process has"):
+        teacher.ask()
+
+
+NEEDS = {
+    "sfl": "sfl needs a student with exact_performance: it has no exact_performance(levels)",
+    "robust_plr": "robust_plr needs a student with play: it has no play(levels, generators)",
+    "accel": "accel needs a student with play",
+    "currot": "currot needs a student with performance",
+    "first_order_sampled": "first_order_sampled needs a student with play",
+    "pace": "pace needs a student with gradient_norms",
+}
+
+
+@pytest.mark.parametrize("name", NEEDS)
+def test_what_is_missing_of_a_student_is_named(name: str) -> None:
+    with pytest.raises(TypeError, match=re.escape(NEEDS[name])):
+        prl.Teacher(getattr(prl.curricula, name)(), SPACE)
+
+
+@pytest.mark.parametrize("name", ["perf_gain", "task_difficulty", "paired", "first_order_proposer"])
+def test_what_a_space_lacks_is_named(name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"curriculum={name}: needs .* of a task"):
+        prl.Teacher(getattr(prl.curricula, name)(), SPACE)
+    with pytest.raises(ArgumentError, match="target: missing"):
+        prl.Teacher("target", prl.Parameters({"gravity": (0.0, 1.0)}))
+
+
+def solved(levels: Any) -> dict[str, Any]:
+    """A student whose success falls with the number of walls."""
+    success = 1 - levels["walls"] / 60
+    return {"return": success, "success": success}
+
+
+def episodes(levels: Any, generator: torch.Generator) -> dict[str, Any]:
+    success = torch.rand(len(levels), generator=generator) < solved(levels)["success"]
+    return {"return": success.float(), "success": success}
+
+
+CAN: dict[str, tuple[Any, dict[str, Any]]] = {
+    "sfl": (prl.curricula.sfl(candidates=64, keep=8), {"exact_performance": solved}),
+    "sfl from episodes": (
+        prl.curricula.sfl(source="episodes", rollouts=16, candidates=64, keep=8),
+        {"play": episodes},
+    ),
+    "currot": (prl.curricula.currot(probes=2), {"performance": solved}),
+    "robust_plr": (prl.curricula.robust_plr(score="max_mc", **SMALL), {"play": episodes}),
+    "accel": (prl.curricula.accel(score="regret", **SMALL), {"play": episodes}),
+    "regret": (
+        prl.curricula.regret(**SMALL),
+        {
+            "exact_performance": solved,
+            "optimal_return": lambda levels: torch.ones(len(levels)),
+        },
+    ),
+    "ncc": (prl.curricula.ncc(capacity=16), {"exact_performance": solved}),
+    "learning_progress": (prl.curricula.learning_progress(probes=2), {"performance": solved}),
+}
+
+
+@pytest.mark.parametrize("name", CAN)
+def test_functions_of_levels_are_all_that_others_need(name: str) -> None:
+    recipe, can = CAN[name]
+    teacher = prl.Teacher(recipe, SPACE, block=8, **can)
+    for _ in range(6):
+        ids, levels = teacher.ask(8)
+        teacher.tell(ids, **{f"{k}_" if k == "return" else k: v for k, v in solved(levels).items()})
+    if name.startswith("sfl"):
+        walls = teacher.curriculum.kept["walls"].double().mean()
+        assert 18 < float(walls) < 42  # p (1 - p) is largest in the middle
+
+
+def test_filtering_works_on_spaces() -> None:
+    teacher = prl.Teacher(
+        "domain_randomization", SPACE, filter="learnability", exact_performance=solved
+    )
+    walls = teacher.propose(256)["walls"].double()
+    assert float((walls - 29.5).abs().mean()) < 11  # of uniform draws it is 15
+    with pytest.raises(ArgumentError, match="filter='hard': must be one of"):
+        prl.Teacher("target", SPACE, filter="hard")
+    with pytest.raises(ArgumentError, match="times=1"):
+        prl.Teacher("target", SPACE, filter={"times": 1})
+
+
+def test_recipes_of_ones_own_and_their_settings() -> None:
+    with pytest.raises(ArgumentError, match="capacity=0: input should be"):
+        prl.Teacher(prl.curricula.plr(capacity=0), SPACE)
+    with pytest.raises(AttributeError, match="there is no 'plrr'"):
+        prl.Teacher("plrr", SPACE)
