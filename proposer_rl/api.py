@@ -44,7 +44,15 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
-from proposer_rl.teaching import Items, LevelGenerator, Parameters, Teacher
+from proposer_rl.teaching import (
+    Items,
+    LevelGenerator,
+    LevelTransform,
+    Parameters,
+    TaughtEnv,
+    Teacher,
+    TeacherSampler,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,6 +73,7 @@ __all__ = [
     "Level",
     "LevelGenerator",
     "LevelSpec",
+    "LevelTransform",
     "MapEncoder",
     "MazeEnv",
     "Mixed",
@@ -90,7 +99,9 @@ __all__ = [
     "Student",
     "Task",
     "TaskStudent",
+    "TaughtEnv",
     "Teacher",
+    "TeacherSampler",
     "UNet",
     "curricula",
     "generate_levels",
@@ -147,7 +158,7 @@ class Run:
         from proposer_rl.cli.stored import stored_run
 
         run = stored_run(self.folder)
-        return run.task, run.learner(run.files[-1])[2].agent
+        return run.task, run.stage().learner.agent
 
     def _table(self, name: str) -> pd.DataFrame:
         import pandas as pd

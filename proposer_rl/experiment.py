@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
@@ -27,7 +28,7 @@ from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, ScheduleSettings
+from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -35,6 +36,18 @@ Log = Callable[[str, Mapping[str, Any], int], None]
 
 RECORDED_LEVELS = 8
 MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
+
+
+@settings
+class _Counted:
+    """What a checkpoint, which may come from anybody, has counted."""
+
+    updates: Annotated[int, Ge(0)]
+    cycles: Annotated[int, Ge(0)]
+    curriculum_frames: Annotated[int, Ge(0)]
+    evaluations: Annotated[int, Ge(0)]
+    seconds: NotNegative
+    rows: dict[str, Annotated[int, Ge(0)]]
 
 
 class Experiment:
@@ -374,18 +387,20 @@ class Experiment:
         return True
 
     def _restore(self, state: State) -> None:
+        length = self.schedule.cycle_length
+        read = _Counted(**{name: state[name] for name in _Counted.__annotations__})
+        updates, cycles = read.updates, read.cycles
+        if not (cycles - 1) * length <= updates <= cycles * length:
+            raise ValueError(f"cycles={cycles}, of {length} updates each, but updates={updates}")
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
-        self.curriculum.load_state_dict(state["curriculum"])
+        self.curriculum.load_state_dict(dict(state["curriculum"]))
         if self._continued is not None:
             self._continued.load_state_dict(state["episodes"])
-        self.updates, self.cycles = state["updates"], state["cycles"]
-        self.student.frames, self.student.evaluations = (
-            state["curriculum_frames"],
-            state["evaluations"],
-        )
-        self._seconds_before = state["seconds"]
+        self.updates, self.cycles = updates, cycles
+        self.student.frames, self.student.evaluations = read.curriculum_frames, read.evaluations
+        self._seconds_before = read.seconds
         self._started = time.monotonic()
-        self._headline = state["headline"]
+        self._headline = [float(value) for value in state["headline"]]
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:

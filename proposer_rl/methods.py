@@ -22,6 +22,7 @@ from proposer_rl.curricula import (
     FirstOrderProposer,
     LearningProgressCurriculum,
     MixtureCurriculum,
+    Modelled,
     PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
@@ -36,8 +37,6 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula.buffer import Prioritization
-from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
@@ -55,6 +54,7 @@ from proposer_rl.settings import (
     ArgumentError,
     Count,
     FilterSettings,
+    ModelSettings,
     NotNegative,
     Positive,
     PPOSettings,
@@ -66,6 +66,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 
 class Workers(NamedTuple):
@@ -104,43 +105,64 @@ class Components(NamedTuple):
 
 
 def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculum:
-    """A curriculum that draws more levels than are trained on, and keeps some by their scores.
-
-    Args:
-        curriculum: any.
-        config: how; None to leave the curriculum as it is.
+    """A curriculum that draws more levels than are trained on; as it is, for a config of None.
 
     Raises:
-        ValueError: if a value is wrong, naming its key.
+        ArgumentError: if a value is wrong, naming its setting.
     """
     if config is None:
         return curriculum
-    try:
-        scorer = Scorer(config.score, config.source, config.rollouts)
-        return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
-    except ValueError as error:
-        raise ValueError(f"filter.{error}") from error
+    scorer = Scorer(config.score, config.source, config.rollouts)
+    return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
 
 
-def _takes_numbers_of(make: Callable[..., Curriculum], *given: str) -> Callable[[F], F]:
-    """Put a curriculum's own numbers in the place of ``**numbers`` in its factory's signature.
+def modelled(curriculum: Curriculum, task: Any, config: ModelSettings | None) -> Curriculum:
+    """A curriculum that asks a model of outcomes wherever it would ask about performance.
 
     Args:
-        make: the curriculum's class.
-        given: those that the factory gives itself.
+        curriculum: any.
+        task: whose levels have the features, or a space of levels alone.
+        config: of the model; None to leave the curriculum as it is.
+
+    Raises:
+        ArgumentError: if the task's levels have no features.
+    """
+    if config is None:
+        return curriculum
+    task.features(task.space.sample(1, Streams(0).generator())[None])
+    return Modelled(curriculum, task.features, **asdict(config))
+
+
+def _takes_numbers_of(*makers: Any, given: str = "") -> Callable[[F], F]:
+    """Put the numbers of a curriculum and its parts in the place of a factory's ``**numbers``.
+
+    Args:
+        makers: the parts' classes, and last the curriculum's, whose numbers have names alone.
+        given: the name of one that the factory gives itself.
     """
 
     def decorate(factory: F) -> F:
         own = [p for p in inspect.signature(factory).parameters.values() if p.name != "numbers"]
-        gives = {*given, *(p.name for p in own)}
-        parameters = inspect.signature(make).parameters.values()
-        numbers = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in gives]
-        hints = get_type_hints(make.__init__, include_extras=True)
-        factory.__signature__ = inspect.Signature([*own, *numbers])  # type: ignore[attr-defined]
-        factory.__annotations__ |= {number.name: hints[number.name] for number in numbers}
+        numbers = {}
+        for make in makers:
+            hints = get_type_hints(make.__init__, include_extras=True)
+            for number in inspect.signature(make).parameters.values():
+                known = {given, *(p.name for p in own)}
+                named = number.kind is number.KEYWORD_ONLY or make is not makers[-1]
+                if named and number.name not in known:
+                    numbers[number.name] = number.replace(kind=number.KEYWORD_ONLY)
+                    factory.__annotations__[number.name] = hints[number.name]
+        every = sorted([*own, *numbers.values()], key=lambda p: p.kind)
+        factory.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
         return factory
 
     return decorate
+
+
+def _part(make: Callable[..., T], numbers: dict[str, Any]) -> T:
+    """A part of a curriculum, of its own among the numbers; the others remain there."""
+    own = inspect.signature(make).parameters.keys() & numbers.keys()
+    return make(**{name: numbers.pop(name) for name in own})
 
 
 def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curriculum]:
@@ -256,7 +278,10 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
     """
     _one_solver(components)
     if not checkpoint:
-        raise ValueError("checkpoint=: name a run's folder or a checkpoint that has a Proposer")
+        raise ArgumentError(
+            f"checkpoint={checkpoint!r}: must name a run's folder or a checkpoint that has a "
+            "Proposer"
+        )
     task, config = components.task, components.proposer
     agent = proposer_agent(task, config)
     _load(agent, checkpoint, config.observes)
@@ -272,11 +297,7 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
 
 @_takes_numbers_of(TransportCurriculum)
 def currot(components: Components, **numbers: Any) -> TransportCurriculum:
-    """Train on the way to the target; see :class:`TransportCurriculum` for the numbers.
-
-    Raises:
-        TypeError: if the task does not say where its target lies.
-    """
+    """Train on the way to the target, of a task that says where that lies."""
     if not isinstance(components.task, LocatedTarget):
         raise TypeError(
             f"currot moves towards the target: {type(components.task).__name__} must define "
@@ -285,52 +306,36 @@ def currot(components: Components, **numbers: Any) -> TransportCurriculum:
     return TransportCurriculum(components.task.space, components.task.target_shares, **numbers)
 
 
-@_takes_numbers_of(ReplayCurriculum, "edit")
+@_takes_numbers_of(Scorer, ReplayRule, ReplayCurriculum, given="edit")
 def replay(
-    components: Components,
-    score: str,
-    source: Source,
-    rollouts: int,
-    prioritization: Prioritization,
-    temperature: float,
-    best: int | None,
-    staleness: float,
-    new_levels: dict[str, list[float]] | None,
-    **numbers: Any,
+    components: Components, new_levels: dict[str, list[float]] | None = None, **numbers: Any
 ) -> ReplayCurriculum:
     """Train on levels that are kept by their scores.
 
-    ``score``, ``source`` and ``rollouts`` are those of :class:`Scorer`, ``prioritization``,
-    ``temperature``, ``best`` and ``staleness`` those of :class:`ReplayRule`. ``new_levels`` says
-    what bins new levels come from, for some of the space's axes, by name, the values that count;
-    None for the whole space. Further numbers: see :class:`ReplayCurriculum`.
+    Args:
+        components: the task.
+        new_levels: the bins that new levels come from: for some of the space's axes, by name, the
+            values that count; None for the whole space.
+        numbers: those of :class:`Scorer`, :class:`ReplayRule` and :class:`ReplayCurriculum`.
     """
-    rule = ReplayRule(
-        prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
-    )
-    space, edit = components.task.space, getattr(components.task, "edit", None)
+    task = components.task
     try:
-        new = space if new_levels is None else SomeBins(space, new_levels)
+        new = task.space if new_levels is None else SomeBins(task.space, new_levels)
     except ArgumentError as error:
         raise ArgumentError(f"new_levels.{str(error).removeprefix('values.')}") from error
-    scorer = Scorer(score, source, rollouts)
-    curriculum = ReplayCurriculum(new, scorer, rule, edit=edit, **numbers)
+    scorer, rule = _part(Scorer, numbers), _part(ReplayRule, numbers)
+    curriculum = ReplayCurriculum(new, scorer, rule, edit=getattr(task, "edit", None), **numbers)
     curriculum.check(len(components.seeds))
     return curriculum
 
 
-@_takes_numbers_of(SelectionCurriculum)
-def learnability(
-    components: Components, score: str, source: Source, rollouts: int, **numbers: Any
-) -> SelectionCurriculum:
-    """Train on levels that stood out among many, and on new ones.
-
-    The scorer as for :func:`replay`; further numbers: see :class:`SelectionCurriculum`.
-    """
-    return SelectionCurriculum(components.task.space, Scorer(score, source, rollouts), **numbers)
+@_takes_numbers_of(Scorer, SelectionCurriculum)
+def learnability(components: Components, **numbers: Any) -> SelectionCurriculum:
+    """Train on levels that stood out among many, and on new ones."""
+    return SelectionCurriculum(components.task.space, _part(Scorer, numbers), **numbers)
 
 
-@_takes_numbers_of(FirstOrderProposer, "probe_levels")
+@_takes_numbers_of(FirstOrderProposer, given="probe_levels")
 def first_order_proposer(
     components: Components,
     epochs: Count,
@@ -398,8 +403,8 @@ def _problem_policy(
 def _one_solver(components: Components) -> None:
     if len(components.seeds) > 1:
         raise ValueError(
-            f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; "
-            "give one run for each, as in -m seed=0,1,2"
+            f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; give "
+            "each a run of its own"
         )
 
 
@@ -407,21 +412,22 @@ def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
     """Give a Proposer the weights of one that has learnt with the same network.
 
     Raises:
-        ValueError: if the checkpoint holds no such Proposer.
-        CheckpointError: if it cannot be read.
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
     """
-    learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
     try:
+        learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
         observed = [name for name in learnt["observed"] if name != "probes"]
         load_agent(agent, TensorDict(learnt["proposer"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+    except CheckpointError as error:
+        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ArgumentError(
             f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
         ) from error
     if observed != list(observes):
-        raise ValueError(
-            f"proposer.observes={list(observes)}: the Proposer of checkpoint={checkpoint} has "
-            f"learnt with {observed}"
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
+            f"{list(observes)}"
         )
 
 
@@ -434,14 +440,11 @@ def _with_proposer(state: State) -> State:
 def _curriculum_state(path: Path) -> State:
     """The curriculum's part of a checkpoint, or of a run's newest one, or what it left of it."""
     if not path.exists():
-        raise CheckpointError(f"checkpoint={path}: there is no such file or folder")
-    if path.is_dir():
-        latest = load_latest(path / "checkpoints")
-        if latest is not None:
-            return latest[1]["curriculum"]
-        path = path / PROPOSER
-        if not path.exists():
-            raise CheckpointError(
-                f"checkpoint={path.parent}: the folder holds no checkpoints and no {PROPOSER}"
-            )
-    return load_checkpoint(path)[1]["curriculum"]
+        raise CheckpointError("there is no such file or folder")
+    latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
+    if latest is None and (path / PROPOSER).exists():
+        latest = load_checkpoint(path / PROPOSER)
+    if latest is None:
+        raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
+    state: State = latest[1]["curriculum"]
+    return state

@@ -24,21 +24,28 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Categorical
+from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import PPO, first_episode_return, first_episode_success
 from proposer_rl.learning.episodes import mean_performance
 from proposer_rl.learning.rollout import RolloutCollector
-from proposer_rl.models import ActorCritic, Population, categorical, normal
+from proposer_rl.models import (
+    ActorCritic,
+    Population,
+    categorical,
+    joint_categorical,
+    normal,
+)
 from proposer_rl.runs.pictures import pixels, png, written
-from proposer_rl.settings import SolverSettings
+from proposer_rl.settings import ArgumentError, SolverSettings
 from proposer_rl.streams import Streams, each_from
 
 Levels = Any
 """A tensordict or tensorclass of levels."""
 
 SAMPLES = 6  # levels of each distribution that a reader is shown
+MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
 NAMED = 128  # levels of a distribution that are evaluated one by one
 
 
@@ -222,8 +229,7 @@ class Task(ABC):
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
         """K networks as the agent of an environment [K, P]."""
         module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
-        discrete = isinstance(env.full_action_spec["action"], Categorical)
-        distribution = categorical if discrete else normal
+        distribution = distribution_of(env.full_action_spec["action"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
@@ -275,8 +281,8 @@ class Task(ABC):
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
         """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
 
-        Here at the beginning of each level: probabilities of n actions, or the means of continuous
-        ones, [K, C, D].
+        Here at the beginning of each level: probabilities of n actions, of each choice where there
+        are several, or the means of continuous ones, [K, C, D].
         """
         copies = for_copies(agent, levels)
         if not copies.batch_size.numel():
@@ -284,11 +290,20 @@ class Task(ABC):
         state = self.evaluation_environment(copies).reset()
         state.update(agent.no_memory(state))
         logits = agent(state)[agent.logits_key]
-        return logits.softmax(-1) if logits.ndim == 3 else logits[..., 0]
+        continuous = agent.distribution_class is normal
+        return logits[..., 0] if continuous else logits.softmax(-1).flatten(2)
 
     def probe_encoder(self, features: int) -> nn.Module:
         """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
         return nn.Linear(self._actions, features)
+
+    def features(self, levels: Levels) -> Tensor:
+        """What a model of outcomes knows of levels [K, n]: float [K, n, F], each about -1 to 1.
+
+        Here by where they lie in the space, which then needs ``locate(levels)``; a task may add
+        others.
+        """
+        return space_features(self.space, levels)
 
     @property
     def metrics(self) -> list[str]:
@@ -439,9 +454,11 @@ class Task(ABC):
 
     @property
     def _actions(self) -> int:
-        """Number of actions to choose from, or of the parts of a continuous one."""
+        """Numbers of a probe of one level."""
         level = next(iter(self.evaluated_on.values()))[:1]
         spec = self.evaluation_environment(level.expand(1, 1)).full_action_spec["action"]
+        if isinstance(spec, MultiCategorical):
+            return len(spec.nvec[0, 0]) * int(spec.nvec.max())
         return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
 
     def _numbers(self, levels: Levels) -> list[str]:
@@ -523,6 +540,43 @@ class EditableTask(Protocol):
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
         """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+
+
+def space_features(space: Any, levels: Levels) -> Tensor:
+    """Features of levels by where they lie in a space, among the bins or beside them.
+
+    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
+    unless there are more than :data:`MANY_BINS`.
+
+    Args:
+        space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
+            coordinates of levels [*B]: float [*B, D].
+        levels: [*B].
+
+    Returns:
+        float64 [*B, 1 + 2 D + N] on the CPU.
+
+    Raises:
+        ArgumentError: if the space cannot locate levels.
+    """
+    if not hasattr(space, "locate"):
+        raise ArgumentError(
+            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
+            "from which a model of outcomes tells them apart"
+        )
+    c, places = space.locate(levels).double().cpu(), space.coordinates.double()
+    parts = [torch.ones_like(c[..., :1]), c, c.square()]
+    if len(places) <= MANY_BINS:
+        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
+        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
+    return torch.cat(parts, -1)
+
+
+def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
+    """What makes a policy's distribution of actions of logits, by the actions' spec."""
+    if isinstance(acts, MultiCategorical):
+        return joint_categorical
+    return categorical if isinstance(acts, Categorical) else normal
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:

@@ -135,5 +135,5 @@ def test_settings_are_checked_where_they_are_made() -> None:
         SolverSettings(batch_size=0)
     with pytest.raises(ArgumentError, match=r"^action\.spread=-1: input should be greater than 0"):
         ProposerSettings(action={"kind": "mixture", "spread": -1})
-    with pytest.raises(ArgumentError, match=r"^action\.kind='x': .* 'mixture', 'problems'"):
+    with pytest.raises(ArgumentError, match=r"^action=.*: input tag 'x' .* 'mixture', 'problems'"):
         ProposerSettings(action={"kind": "x"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -67,7 +68,7 @@ def test_a_run_ends_with_its_picture(train) -> None:
 @pytest.mark.parametrize(
     ("checkpoint", "said"),
     [
-        ("null", "checkpoint=: name a run's folder or a checkpoint that has a Proposer"),
+        ("null", "checkpoint=None: must name a run's folder or a checkpoint that has a Proposer"),
         ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
         (".", "checkpoint=.: the folder holds no checkpoints and no proposer.pt"),
     ],
@@ -83,7 +84,7 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     assert train("+method=perf_gain", *FEW, "hydra.run.dir=learnt") == 0
     arguments = ["+method=frozen_proposer", *SMOKE, "checkpoint=learnt", "hydra.run.dir=run"]
     assert train(*arguments, "proposer.observes=[return,progress]") == 2
-    said = "the Proposer of checkpoint=learnt has learnt with ['log_success', 'progress']"
+    said = "checkpoint=learnt: its Proposer has learnt with observes=['log_success', 'progress']"
     assert said in capsys.readouterr().err and not Path("run").exists()
     assert train(*arguments, "schedule.updates=1") == 0
     # The checkpoint moves on, and the Proposer that this run began with does not.
@@ -147,7 +148,7 @@ def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, 
     assert train(*arguments) == 0
     shutil.rmtree("run/checkpoints")
     assert "ended after 2 updates and has no checkpoint to go on from" in refused(4)
-    monkeypatch.setattr("proposer_rl.cli.build.make_log", None)  # nothing is left to be logged
+    monkeypatch.setattr("proposer_rl.cli.run.logger", None)  # nothing is left to be logged
     assert train(*arguments) == 0
 
 
@@ -199,6 +200,29 @@ def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> No
     monkeypatch.setattr("proposer_rl.cli.run.train", broken)
     with pytest.raises(ValueError, match="a bug"):
         train("+method=target", *SMOKE, "hydra.run.dir=run")
+
+
+@pytest.mark.parametrize(
+    ("function", "place"),
+    [
+        ("hydra.core.utils._save_config", "run"),
+        ("proposer_rl.cli.run.draw_run", "run"),
+        ("logging.FileHandler._open", "run/train.log"),
+    ],
+)
+def test_a_disk_that_takes_no_more_is_named_with_its_folder(
+    function: str, place: str, train, monkeypatch, capsys
+) -> None:
+    """Whoever writes: Hydra, logging or matplotlib, which do not say where."""
+
+    def full(*_: object, **__: object) -> None:
+        named = [str(Path("run/train.log").absolute())] if place != "run" else []
+        raise OSError(errno.EFBIG, "File too large", *named)
+
+    monkeypatch.setattr(function, full)
+    assert train("+method=target", *FEW, "hydra.run.dir=run") == 4
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == f"error: cannot use {Path(place).absolute()}: File too large"
 
 
 def test_a_damaged_summary_is_named(train, capsys) -> None:

@@ -125,7 +125,7 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
     [
         (["nowhere"], "nowhere: there is no such file or folder"),
         (["."], ".: holds no checkpoints; give a run's folder or a checkpoint"),
-        (["{run}/metrics.csv"], "metrics.csv"),
+        (["{run}/metrics.csv"], "is no run's folder: it has no config.json"),
         (
             ["{run}", "--levels", "mazes"],
             "--levels mazes: must be one of: shapes, small, a file ",

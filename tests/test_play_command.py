@@ -93,7 +93,7 @@ def own_addresses() -> set[str]:
     [
         (["nowhere"], "nowhere: is no run's folder: it has no config.json"),
         (["empty"], "empty: is no run's folder: it has no config.json"),
-        (["fresh"], "fresh: holds no checkpoints; give the folders of runs"),
+        (["fresh"], "fresh: holds no checkpoints; give a run's folder or a checkpoint"),
         (["foreign"], "config.json: does not hold the settings of a run"),
         (["{run}", "--port", "65536"], "must be a whole number from 0 to 65,535, got '65536'"),
         (["{run}", "--port", "http"], "must be a whole number from 0 to 65,535, got 'http'"),

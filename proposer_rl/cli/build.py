@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import ConfigError, Maker, RunConfig, curriculum_maker, task_maker
+from proposer_rl.cli.config import ConfigError, RunConfig, curriculum_maker, key, task_maker
 from proposer_rl.cli.errors import one_line
-from proposer_rl.cli.loggers import make_log, require_logger
-from proposer_rl.cli.outcome import run_name
+from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
-from proposer_rl.experiment import Experiment, check_headline
+from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Components, Workers, filtered
+from proposer_rl.methods import Components, Workers, filtered, modelled
 from proposer_rl.models import available_cores
+from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, ComputeSettings, SolverSettings
+from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -50,22 +50,18 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
         ConfigError: if settings that are each valid do not go together.
     """
     require_logger(config.logger)
-    try:
-        task = make_task(config)
-        with _key("solver.ppo"):
-            learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-        with _key("schedule"):
-            check_headline(task, config.schedule)
-        curriculum = _curriculum(config, task, signals, status)
-        try:
-            require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
-        except TypeError as error:
-            raise ConfigError(f"curriculum: {one_line(error)}") from error
-        return Made(task, learner, curriculum)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(one_line(error)) from error
+    task = make_task(config)
+    with key("task"):
+        checked(TaskFacts, task.facts, "task")  # as the run's readers will
+    with key("solver.ppo", other=""):
+        learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
+    _check_memory(learner)
+    with key("schedule"):
+        check_headline(task, config.schedule)
+    curriculum = _curriculum(config, task, signals, status)
+    with key("curriculum", other="curriculum: "):
+        require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
+    return Made(task, learner, curriculum)
 
 
 def build(
@@ -74,35 +70,19 @@ def build(
     folder: RunFolder,
     signals: StopSignals | None = None,
     status: Status | None = None,
+    log: Log | None = None,
 ) -> Experiment:
-    """Put an experiment together.
-
-    Args:
-        config: the run's settings.
-        made: as :func:`parts` makes it.
-        folder: the run's.
-        signals: which may ask the run to stop.
-        status: which tells what the run is doing.
-    """
+    """Put an experiment together of the parts that :func:`parts` has made."""
     return Experiment(
         *made,
         schedule=config.schedule,
         seeds=config.seeds,
         folder=folder,
-        log=make_log(config.logger, folder.path, run_name(config)),
+        log=log,
         progress=config.compute.progress,
         signals=signals,
         status=status,
     )
-
-
-@contextmanager
-def _key(name: str) -> Iterator[None]:
-    """Put a key of the configuration before what is said of one of its arguments."""
-    try:
-        yield
-    except ArgumentError as error:
-        raise ConfigError(f"{name}.{one_line(error)}") from error
 
 
 def make_task(config: RunConfig) -> Task:
@@ -113,22 +93,36 @@ def make_task(config: RunConfig) -> Task:
     """
     compute = config.compute
     device = _device(compute.device)
-    use(device)
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
     context = ComputeContext(device, config.precision, compute.cores)
-    try:
-        task = task_maker(config.task)(solver=config.solver, context=context)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"task.{one_line(error)}") from error
-    return recorded(task) if compute.graphs else task
+    with key("task", other="task."):
+        task: Task = _made(
+            task_maker(config.task), config.solver, context, compute.graphs, str(device)
+        )
+    return task
 
 
-def _make_in_worker(
-    maker: Maker, solver: SolverSettings, context: ComputeContext, graphs: bool, device: str
+def _check_memory(learner: PPO) -> None:
+    """Refuse a rollout that no memory holds: it is collected step by step, until that is full."""
+    levels = learner.agent.level_keys  # of which there is one for all steps
+    step = learner.env.fake_tensordict().exclude(*levels, *(("next", name) for name in levels))
+    taken, device = step.bytes() * learner.horizon, learner.env.device
+    there = memory()
+    if device is not None and device.type == "cuda":
+        there = torch.cuda.get_device_properties(device).total_memory
+    if taken > there:
+        raise ConfigError(
+            f"solver.ppo.horizon={learner.horizon}: a rollout takes at least {taken / 1e9:,.0f} GB "
+            f"of memory, there are {there / 1e9:,.0f}"
+        )
+
+
+def _made(
+    maker: partial[Any], solver: SolverSettings, context: ComputeContext, graphs: bool, device: str
 ) -> Any:
+    """The task on a device; a worker calls it, too."""
+    use(torch.device(device))
     task = maker(solver=solver, context=context._replace(device=torch.device(device)))
     return recorded(task) if graphs else task
 
@@ -144,28 +138,23 @@ def _curriculum(
         tell(done)
         signals.check()
 
-    components = Components(
-        task, config.proposer, config.seeds, on_update, _workers(config, task, tell)
-    )
-    try:
-        with _key("curriculum"):
-            curriculum = curriculum_maker(config.curriculum)(components)
-    except ConfigError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"curriculum: {one_line(error)}") from error
-    if not isinstance(curriculum, Curriculum):
-        kind = type(curriculum).__name__
-        raise ConfigError(f"curriculum: must make a Curriculum, but makes {kind}")
+    workers = _workers(config, task, tell)
+    components = Components(task, config.proposer, config.seeds, on_update, workers)
+    with key("curriculum", other="curriculum: "):
+        curriculum = curriculum_maker(config.curriculum)(components)
+        if not isinstance(curriculum, Curriculum):
+            raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
-    if components.workers is not None and not learned:
+    if workers is not None and not learned:
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)
-    return filtered(curriculum, config.filter)
+    with key("filter"):
+        curriculum = filtered(curriculum, config.filter)
+    return modelled(curriculum, task, config.model)
 
 
 def _check_cycle(config: RunConfig) -> None:
@@ -192,10 +181,10 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
     """
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
-        for key in ("workers", "worker_devices"):
-            if getattr(compute, key) is not None:
+        for name in ("workers", "worker_devices"):
+            if getattr(compute, name) is not None:
                 raise ConfigError(
-                    f"compute.{key}={getattr(compute, key)}: there are workers only with "
+                    f"compute.{name}={getattr(compute, name)}: there are workers only with "
                     "compute.collector=multiprocess or ray"
                 )
     if compute.collector != "ray" and compute.ray_address is not None:
@@ -209,33 +198,20 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
             f"compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
         )
     on_gpus = task.device.type == "cuda"
-    available = torch.cuda.device_count() if on_gpus else available_cores()
-    count = compute.workers or min(copies, available)
-    with _key("compute"):
+    gpus = torch.cuda.device_count()
+    count = compute.workers or min(copies, gpus if on_gpus else available_cores())
+    with key("compute"):
         shares(copies, count)
-    devices = compute.worker_devices or _devices(compute, task.device)
-    if compute.collector == "multiprocess":
+    devices = compute.worker_devices or [task.device.type]
+    if compute.collector == "multiprocess":  # Ray shows a worker only those that it reserved
+        if on_gpus and compute.worker_devices is None:
+            devices = [f"cuda:{index}" for index in range(gpus)]
         devices = [str(_device(name, "worker_devices")) for name in devices]
     cores = compute.cores or max(1, available_cores() // count)
-    settings = WorkerSettings(
-        engine=compute.collector,
-        workers=count,
-        devices=devices,
-        cores=cores,
-        ray_address=compute.ray_address,
-    )
+    settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
     context = ComputeContext(precision=task.precision, cores=cores)
-    make: Callable[[str], Any] = partial(
-        _make_in_worker, task_maker(config.task), config.solver, context, compute.graphs
-    )
+    make = partial(_made, task_maker(config.task), config.solver, context, compute.graphs)
     return Workers(settings, make, tell)
-
-
-def _devices(compute: ComputeSettings, device: torch.device) -> list[str]:
-    """All GPUs in turn where the run is on one; Ray shows a worker only those that it reserved."""
-    if device.type == "cuda" and compute.collector == "multiprocess":
-        return [f"cuda:{index}" for index in range(torch.cuda.device_count())]
-    return [device.type]
 
 
 def _device(name: str, key: str = "device") -> torch.device:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
@@ -25,6 +28,7 @@ from proposer_rl.settings import (
     FilterSettings,
     HandDesignedSettings,
     LoggerSettings,
+    ModelSettings,
     PoolSettings,
     ProposerSettings,
     ScheduleSettings,
@@ -54,6 +58,26 @@ class ConfigError(ValueError):
     exit_code = 2
 
 
+@contextmanager
+def key(name: str, other: str = "") -> Iterator[None]:
+    """Put a key of the configuration before what is said of the arguments that stand below it.
+
+    Args:
+        name: the key.
+        other: what comes before any other TypeError or ValueError.
+
+    Raises:
+        ConfigError: in place of all of these.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except (TypeError, ValueError) as error:
+        lead = f"{name}." if isinstance(error, ArgumentError) else other
+        raise ConfigError(f"{lead}{one_line(error)}") from error
+
+
 @settings
 class RunConfig:
     """Every setting of a run; names and meaning as in ``conf/train.yaml``.
@@ -66,6 +90,7 @@ class RunConfig:
     ablation: str
     curriculum: dict[str, Any]
     filter: FilterSettings | None
+    model: ModelSettings | None
     task: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]
@@ -80,18 +105,6 @@ class RunConfig:
     logger: LoggerSettings
 
 
-@dataclass(frozen=True)
-class Maker:
-    """What makes a part of a run: a callable, and the checked arguments that its settings are."""
-
-    make: Callable[..., Any]
-    settings: Mapping[str, Any]
-
-    def __call__(self, *parts: Any, **others: Any) -> Any:
-        """Make it of what else it needs."""
-        return self.make(*parts, **self.settings, **others)
-
-
 def read_config(config: DictConfig) -> RunConfig:
     """Check a composed configuration.
 
@@ -102,9 +115,9 @@ def read_config(config: DictConfig) -> RunConfig:
         known = ", ".join(methods())
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
     values = _resolved(config)
-    for key, value in _leaves(values):
+    for name, value in _leaves(values):
         if isinstance(value, int | float) and abs(value) > LARGEST:
-            raise ConfigError(f"{key}={value!r}: must be finite and at most {LARGEST:,} in size")
+            raise ConfigError(f"{name}={value!r}: must be finite and at most {LARGEST:,} in size")
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
     checked = _checked(values)
@@ -119,60 +132,47 @@ def read_config(config: DictConfig) -> RunConfig:
     return checked
 
 
-def task_maker(settings: Mapping[str, Any]) -> Maker:
-    """What makes the task, called with ``solver`` and ``context`` besides.
-
-    Args:
-        settings: ``task`` of the configuration.
+def task_maker(values: Mapping[str, Any]) -> partial[Any]:
+    """What makes the task of these settings, given ``solver`` and ``context``.
 
     Raises:
         ConfigError: if there is no such maker, or a setting is wrong, naming its key.
     """
-    make, values = _target("task", settings)
-    missing = [name for name in GIVEN_TO_TASKS if name not in inspect.signature(make).parameters]
-    if missing:
-        target = settings["_target_"]
-        raise ConfigError(
-            f"task._target_={target}: makes no task: it takes no argument {missing[0]!r}"
-        )
-    return _maker("task", make, values, GIVEN_TO_TASKS)
+    return _maker("task", values, lambda _: GIVEN_TO_TASKS)
 
 
-def curriculum_maker(settings: Mapping[str, Any]) -> Maker:
-    """What makes the curriculum, called with its parts as the first argument.
-
-    Args:
-        settings: ``curriculum`` of the configuration.
+def curriculum_maker(values: Mapping[str, Any]) -> partial[Any]:
+    """What makes the curriculum of these settings, given its parts as the first argument.
 
     Raises:
         ConfigError: as :func:`task_maker`.
     """
-    make, values = _target("curriculum", settings)
-    return _maker("curriculum", make, values, [*inspect.signature(make).parameters][:1])
-
-
-def _target(key: str, settings: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """The callable that ``_target_`` names, and its arguments; of these, too, some may be made."""
-    target = settings.get("_target_")
-    if not isinstance(target, str):
-        raise ConfigError(f"{key}._target_: missing: the class or function that makes the {key}")
-    try:
-        made = instantiate({**settings, "_partial_": True}, _convert_="all")
-        inspect.signature(made.func)
-    except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ConfigError(f"{key}._target_={target}: {_why_not_found(error)}") from error
-    return made.func, made.keywords
+    return _maker("curriculum", values, lambda names: names[:1])
 
 
 def _maker(
-    key: str, make: Callable[..., Any], values: Mapping[str, Any], given: Sequence[str]
-) -> Maker:
+    name: str, values: Mapping[str, Any], given: Callable[[list[str]], Sequence[str]]
+) -> partial[Any]:
+    """The callable that ``_target_`` names with its arguments, of which some may be made, too."""
+    target = values.get("_target_")
+    if not isinstance(target, str):
+        raise ConfigError(f"{name}._target_: missing: the class or function that makes the {name}")
     try:
-        return Maker(make, arguments(make, values, given))
+        made = instantiate({**values, "_partial_": True}, _convert_="all")
+        known = [*inspect.signature(made.func).parameters]
+    except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(f"{name}._target_={target}: {_why_not_found(error)}") from error
+    others = given(known)
+    for missing in set(others) - set(known):
+        raise ConfigError(
+            f"{name}._target_={target}: makes no {name}: it takes no argument {missing!r}"
+        )
+    try:
+        return partial(made.func, **arguments(made.func, made.keywords, others))
     except ArgumentError as error:
-        raise ConfigError(f"{key}.{error}") from error
+        raise ConfigError(f"{name}.{error}") from error
     except (NameError, TypeError) as error:  # of annotations that name nothing
-        raise ConfigError(f"{key}._target_={make.__name__}: {one_line(error)}") from error
+        raise ConfigError(f"{name}._target_={target}: {one_line(error)}") from error
 
 
 def saved_config(folder: Path) -> RunConfig:
@@ -195,10 +195,7 @@ def saved_config(folder: Path) -> RunConfig:
 
 
 def stored_config(file: Path) -> Any:
-    """The settings in a run's folder, as they stand there: nothing that they name is made.
-
-    Args:
-        file: the folder's ``config.json``.
+    """The settings in a run's ``config.json``, as they stand there: nothing that they name is made.
 
     Raises:
         ConfigError: if it is no JSON, or far too large to be settings.
@@ -235,13 +232,38 @@ def check_groups(given: Sequence[str]) -> None:
             raise ConfigError(
                 f"+scale={scale}: is of task={scaled}; task={task} has numbers of its own"
             )
-    changed_by = None
-    for override in given:
-        group = override.partition("=")[0]
-        if group in CHANGING:
-            changed_by = changed_by or group
-        elif group in ("+method", "+scale") and changed_by is not None:
-            raise ConfigError(f"{group}: must come before {changed_by}, or it would undo it")
+    groups = [override.partition("=")[0] for override in given]
+    changing = [place for place, group in enumerate(groups) if group in CHANGING]
+    for group in groups[min(changing, default=len(groups)) :]:
+        if group in ("+method", "+scale"):
+            raise ConfigError(
+                f"{group}: must come before {groups[changing[0]]}, or it would undo it"
+            )
+
+
+def check_packages(config: DictConfig) -> None:
+    """Refuse a file of one's own that Hydra has put below its group, for want of its first line.
+
+    Args:
+        config: as composed by Hydra.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    top = {field.name for field in fields(RunConfig)}
+    for group, name in HydraConfig.get().runtime.choices.items():
+        below = config.get(group)
+        if not isinstance(below, DictConfig) or not top & {*below}:
+            continue
+        folders = (Path(source.path) for source in HydraConfig.get().runtime.config_sources)
+        files = [folder / group / f"{name}.yaml" for folder in folders]
+        file = next((file for file in files if file.is_file()), files[0])
+        marked = file.is_file() and file.read_bytes().startswith(codecs.BOM_UTF8)
+        hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
+        raise ConfigError(
+            f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
+            f"become {group}.{next(map(str, below))} and so on{hidden if marked else ''}"
+        )
 
 
 def methods() -> list[str]:
@@ -273,15 +295,9 @@ def _resolved(config: DictConfig) -> Any:
     try:
         return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        # Its key; where a value is missing, that one rather than those that refer to it.
-        leaves = _leaves(OmegaConf.to_container(config))
-        for key, value in sorted(leaves, key=lambda leaf: leaf[1] != "???"):
-            try:
-                OmegaConf.select(config, key, throw_on_missing=True)
-            except OmegaConfBaseException as found:
-                reason = "missing" if value == "???" else str(found).splitlines()[0]
-                raise ConfigError(f"{key}={value}: {reason}") from error
-        raise ConfigError(str(error)) from error
+        missing = isinstance(error, MissingMandatoryValue)
+        reason = "missing" if missing else str(error).splitlines()[0]
+        raise ConfigError(f"{error.full_key}: {reason}") from error
 
 
 def _checked(values: Mapping[str, Any]) -> RunConfig:
@@ -291,10 +307,10 @@ def _checked(values: Mapping[str, Any]) -> RunConfig:
         raise ConfigError(str(error)) from error
 
 
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Every value that is no mapping or list, with its dotted key."""
     if isinstance(value, dict | list):
         for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(inner, f"{key}.{part}" if key else str(part))
+            yield from _leaves(inner, f"{name}.{part}" if name else str(part))
     else:
-        yield key, value
+        yield name, value

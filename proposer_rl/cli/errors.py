@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from signal import SIGINT
 from typing import NoReturn
 
@@ -30,9 +31,9 @@ def command(body: Callable[[], None]) -> None:
         refuse(error)
 
 
-def refuse(error: Exception) -> NoReturn:
-    """Say in one line what is wrong, and exit."""
-    print(f"error: {one_line(error)}", file=sys.stderr)
+def refuse(error: Exception, folder: Path | None = None) -> NoReturn:
+    """Say in one line what is wrong, as :func:`one_line` does, and exit."""
+    print(f"error: {one_line(error, folder)}", file=sys.stderr)
     sys.exit(exit_code(error))
 
 
@@ -51,11 +52,16 @@ def lacks_memory(error: BaseException) -> bool:
     return torchs or isinstance(error, MemoryError)
 
 
-def one_line(error: BaseException) -> str:
-    """An error's message without line breaks and other control characters."""
+def one_line(error: BaseException, folder: Path | None = None) -> str:
+    """An error's message without line breaks and other control characters.
+
+    Args:
+        error: what has happened.
+        folder: that was written to, for an error of the disk that names no file.
+    """
     text = str(error)
-    if isinstance(error, OSError) and error.filename is not None:
-        text = f"cannot use {error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror and (place := error.filename or folder):
+        text = f"cannot use {place}: {error.strerror}"
     if lacks_memory(error):
         text = f"the run does not fit in memory: {text}"
     return "".join(c for c in " ".join(text.split()) if c.isprintable())

@@ -13,7 +13,6 @@ import math
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +24,8 @@ from rich.table import Table
 from rich.text import Text
 from tqdm import tqdm
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, saved_config
-from proposer_rl.cli.stored import read_checkpoint, restored, write_rows
-from proposer_rl.models import ActorCritic
+from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 from proposer_rl.report.reading import UnreadableRun, begun, find_runs
 from proposer_rl.report.runs import Run
 from proposer_rl.report.scores import (
@@ -47,27 +44,24 @@ from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.lock import taking_turns
-from proposer_rl.task import LevelResult, Task
+from proposer_rl.task import LevelResult
 
 SHOWN = 36  # levels in the table and on the sheet of pictures
 COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """The result of an evaluation.
+class Evaluation(NamedTuple):
+    """The results of Solvers on a set of levels.
 
     Attributes:
-        run: the run's folder.
-        updates: Solver updates made at the checkpoint.
-        seeds: of the run's Solvers, in their order.
+        run: of the Solvers.
+        updates: that they have made.
         levels: what was evaluated on.
         results: one for each level and Solver.
     """
 
-    run: Path
+    run: StoredRun
     updates: int
-    seeds: list[int]
     levels: str
     results: Sequence[LevelResult]
 
@@ -75,8 +69,8 @@ class Evaluation:
         """One mapping for each level and Solver, for JSON and CSV."""
         return [
             {
-                "run": self.run.name,
-                "seed": self.seeds[result.solver],
+                "run": self.run.folder.name,
+                "seed": self.run.config.seeds[result.solver],
                 "updates": self.updates,
                 "level": result.level,
                 **result.about,
@@ -195,38 +189,27 @@ def _added(new: list[RunScore], scores: list[RunScore], output: Path | None) -> 
 
     Where there is one it counts as it is by now: other processes may have added to it.
     """
+    places = {score[:4] for score in new}
     if output is None or not new:
-        return _replaced(scores, new)
+        return [score for score in scores if score[:4] not in places] + new
     with taking_turns(output):
-        scores = _replaced(_stored(output), new)
+        scores = _added(new, _stored(output), None)
         write_atomically(output, write_scores(scores))
     return scores
-
-
-def _replaced(scores: list[RunScore], new: list[RunScore]) -> list[RunScore]:
-    place = {score[:4] for score in new}
-    return [score for score in scores if score[:4] not in place] + new
 
 
 def _missing(
     run: Run, names: Sequence[str], scores: list[RunScore], max_steps: int | None
 ) -> list[RunScore]:
     """Scores of a run that are missing, or were of something else."""
-    digests = {name: _digest(run.folder, name) for name in names}
-    known = {name: scored(run, scores, name) for name in names}
-    todo = [
-        name
-        for name, score in known.items()
-        if score is None or digests[name] not in ("", score.digest)
-    ]
-    if not todo:
-        return []
-    loaded = load(run.folder)
-    return [
-        score
-        for name in todo
-        for score in _summed(evaluate(loaded, name, max_steps), name, digests[name])
-    ]
+    missing: list[RunScore] = []
+    loaded = None
+    for name in names:
+        digest, known = _digest(run.folder, name), scored(run, scores, name)
+        if known is None or digest not in ("", known.digest):
+            loaded = loaded or load(run.folder)
+            missing += _summed(evaluate(loaded, name, max_steps), name, digest)
+    return missing
 
 
 def _digest(folder: Path, levels: str) -> str:
@@ -248,55 +231,33 @@ def _digest(folder: Path, levels: str) -> str:
 
 def _summed(evaluation: Evaluation, name: str, digest: str) -> list[RunScore]:
     """The mean of each Solver."""
-    summed = []
-    for solver, seed in enumerate(evaluation.seeds):
+    summed, run = [], evaluation.run
+    for solver, seed in enumerate(run.config.seeds):
         own = [each.results for each in evaluation.results if each.solver == solver]
         means = {key: float(np.mean([results[key] for results in own])) for key in own[0]}
         success = means.get("success", math.nan)
-        place = (evaluation.run.name, seed, evaluation.updates, name, len(own))
+        place = (run.folder.name, seed, evaluation.updates, name, len(own))
         summed.append(RunScore(*place, success, means["return"], digest))
     return summed
 
 
-class Loaded(NamedTuple):
-    """A run's Solvers as a checkpoint has them.
-
-    Attributes:
-        run: the run's folder.
-        updates: of the Solvers.
-        seeds: of them, in their order.
-        task: of the run.
-        agent: the Solvers.
-    """
-
-    run: Path
-    updates: int
-    seeds: list[int]
-    task: Task
-    agent: ActorCritic
-
-
-def load(checkpoint: Path) -> Loaded:
-    """Load the Solvers of a checkpoint.
-
-    Args:
-        checkpoint: a run's folder, for its newest checkpoint, or a checkpoint in it.
+def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
+    """The Solvers of a run's newest checkpoint, or of the one that is given.
 
     Raises:
         ConfigError, CheckpointError: if there is no such run, or its checkpoint cannot be used.
     """
-    run, state = read_checkpoint(checkpoint)
-    config = saved_config(run)
-    task = make_task(config)
-    agent = restored(task, config, state).agent
-    return Loaded(run, int(state["updates"]), config.seeds, task, agent)
+    run = stored_run(checkpoint)
+    return run, run.stage(checkpoint if checkpoint.is_file() else None)
 
 
-def evaluate(loaded: Loaded, name: str | None, max_steps: int | None = None) -> Evaluation:
+def evaluate(
+    loaded: tuple[StoredRun, Stage], name: str | None, max_steps: int | None = None
+) -> Evaluation:
     """Evaluate Solvers on a set of levels.
 
     Args:
-        loaded: the Solvers.
+        loaded: as :func:`load` returns them.
         name: of levels that the run's task knows; None for what it takes by default.
         max_steps: step limit of every level; None for the task's choice.
 
@@ -304,19 +265,21 @@ def evaluate(loaded: Loaded, name: str | None, max_steps: int | None = None) -> 
         ValueError: if there are no such levels, or they are none for this Solver.
         OSError: if a file cannot be read.
     """
-    run, updates, seeds, task, agent = loaded
-    name = name or task.default_levels
-    return Evaluation(run, updates, seeds, name, task.level_results(agent, name, max_steps))
+    run, stage = loaded
+    name = name or run.task.default_levels
+    results = run.task.level_results(stage.learner.agent, name, max_steps)
+    return Evaluation(run, stage.updates, name, results)
 
 
 def _print(evaluation: Evaluation) -> None:
     first = [each for each in evaluation.results if each.solver == 0]
     shown = _hardest(first)
     some = f", the {len(shown)} hardest of {len(first)} levels" if len(shown) < len(first) else ""
-    seeds = ", ".join(map(str, evaluation.seeds))
-    run = f"{evaluation.run.name}, seed {seeds}, {evaluation.updates} updates"
+    seeds = evaluation.run.config.seeds
+    run = f"{evaluation.run.folder.name}, seed {', '.join(map(str, seeds))}"
+    run += f", {evaluation.updates} updates"
     title = f"{run}: {evaluation.levels}{some}"
-    caption = "Means over the seeds." if len(evaluation.seeds) > 1 else ""
+    caption = "Means over the seeds." if len(seeds) > 1 else ""
     table = Table(box=SIMPLE_HEAD, title=Text(title), caption=caption)
     table.add_column("level", overflow="fold", min_width=16)
     for name in (*first[0].about, *first[0].results):
@@ -350,9 +313,8 @@ def _sheet(evaluation: Evaluation) -> bytes:
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(max(SIDE * columns, 5), (SIDE + 0.45) * rows + 0.7), layout="tight")
     # Names come from files: a dollar sign in one is no formula.
-    figure.suptitle(
-        f"{evaluation.run.name}, {evaluation.updates} updates", fontsize=9, parse_math=False
-    )
+    title = f"{evaluation.run.folder.name}, {evaluation.updates} updates"
+    figure.suptitle(title, fontsize=9, parse_math=False)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()

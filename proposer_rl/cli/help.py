@@ -34,7 +34,7 @@ def help_text(arguments: Sequence[str]) -> str:
     Args:
         arguments: of the command; a folder given with ``--config-dir`` is looked into, too.
     """
-    folders = [CONFIG_FOLDER, *_own_folders(arguments)]
+    folders = [CONFIG_FOLDER, *own_folders(arguments)]
     parts = [USAGE]
     for option, meaning in GROUPS.items():
         parts.append(f"{option} {meaning}")
@@ -81,12 +81,14 @@ def _first_comment(file: Path) -> str:
 
 
 def _comments(file: Path) -> Iterator[str]:
-    for line in file.read_text(encoding="utf-8").splitlines():
+    # What is no UTF-8 is refused where it is used.
+    for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         if line.startswith("#") and not line.startswith(PACKAGE_LINE):
             yield line.lstrip("# ")
 
 
-def _own_folders(arguments: Sequence[str]) -> Iterator[Path]:
+def own_folders(arguments: Sequence[str]) -> Iterator[Path]:
+    """Folders of configurations that a command names."""
     option = "--config-dir"
     for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         name, equals, value = argument.partition("=")

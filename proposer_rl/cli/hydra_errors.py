@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import sys
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.help import own_folders
 from proposer_rl.cli.places import ADDED, CONFIG_FOLDER, names
 from proposer_rl.extras import install_command
 
@@ -22,6 +24,8 @@ def explained(error: Exception) -> str:
     Args:
         error: of Hydra or of OmegaConf.
     """
+    if isinstance(error, UnicodeDecodeError):
+        return _not_utf8(error)
     if isinstance(error, MissingConfigException):
         return _no_such_file(error)
     cause = error.__cause__
@@ -38,6 +42,13 @@ def explained(error: Exception) -> str:
             "than letters, digits and /:-+.$%*@?|_ has quotes of its own: \"KEY='VALUE'\""
         )
     return one_line(error)
+
+
+def _not_utf8(error: UnicodeDecodeError) -> str:
+    """Of all files in the folders that the command names, the one that was read."""
+    files = (file for folder in own_folders(sys.argv) for file in sorted(folder.rglob("*.yaml")))
+    named = [f"{file}: " for file in files if file.read_bytes().startswith(error.object)]
+    return f"{''.join(named[:1])}is not encoded in UTF-8; save it so ({one_line(error)})"
 
 
 def _no_such_file(error: MissingConfigException) -> str:

@@ -1,67 +1,152 @@
-"""Rows of a run's tables to TensorBoard or Weights & Biases, through TorchRL's loggers."""
+"""Rows of a run's tables, its levels and curves to TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torchrl.record.loggers import get_logger
 
 from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import one_line
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.report.records import numbers, picture
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import LoggerSettings
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
+ID = "wandb_id.txt"
+
+Picture = NDArray[np.uint8]
+Write = Callable[[Mapping[str, float], Mapping[str, Picture], int], None]
+"""Writes numbers and pictures uint8 [H, W, 3], by their names, of an update."""
 
 
 def require_logger(settings: LoggerSettings) -> None:
     """Check that a logger can be used, before anything is written.
 
     Raises:
-        ConfigError: if its package, of the same name, is not installed.
+        ConfigError: if its package, of the same name, is not installed, or it knows no user.
     """
-    if settings.type != "csv" and find_spec(settings.type) is None:
+    if settings.type == "csv":
+        return
+    if find_spec(settings.type) is None:
         raise ConfigError(
             f"logger={settings.type}: its package is missing; install it with: "
             f"{install_command(settings.type)}"
         )
+    mode = settings.mode or os.environ.get("WANDB_MODE", "online")
+    if settings.type == "wandb" and mode == "online":
+        import wandb
+
+        try:
+            wandb.login()
+        except (wandb.Error, ValueError) as error:
+            raise _refusal(error) from error
 
 
-def make_log(settings: LoggerSettings, path: Path, name: str) -> Log | None:
-    """A function that logs a row of a table, or None where the run's folder is enough.
+@contextmanager
+def logger(
+    settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
+) -> Iterator[Write | None]:
+    """What writes to a logger of an installed package; None where the run's folder is enough.
 
     Args:
-        settings: which logger, of an installed package.
+        settings: which logger.
         path: the run's folder, where files of the logger go.
         name: of the run.
+        config: the run's settings.
     """
-    if settings.type == "csv":
-        return None
-    options: dict[str, Any] = {}
-    if settings.type == "wandb":
-        # Of a sweep in one process each run is its own.
-        reinit = "finish_previous"
-        options["wandb_kwargs"] = {
-            "project": settings.project, "mode": settings.mode, "reinit": reinit
-        }  # fmt: skip
-    logger = get_logger(settings.type, str(path), name, **options)
+    if settings.type == "tensorboard":
+        with _tensorboard(path / name, config) as write:
+            yield write
+    elif settings.type == "wandb":
+        with _wandb(settings, path, name, config) as write:
+            yield write
+    else:
+        yield None
+
+
+def log_of(write: Write, path: Path) -> Log:
+    """What takes rows of a run's tables, and writes what of them is a number or can be shown."""
 
     def log(table: str, row: Mapping[str, Any], step: int) -> None:
-        for key, value in _numbers(row):
-            logger.log_scalar(f"{table}/{key}", value, step=step)
-        # TorchRL's loggers have no images; TensorBoard's writer below has.
-        if settings.type == "tensorboard":
-            for key, image in _images(row, path):
-                logger.experiment.add_image(f"{table}/{key}", image, step, dataformats="HWC")
-            logger.experiment.flush()  # so that it is seen during the run
+        found = {f"{table}/{key}": value for key, value in _numbers(row)}
+        write(found, {f"{table}/{key}": image for key, image in _images(row, path)}, step)
 
     return log
+
+
+@contextmanager
+def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[Write]:
+    from torch.utils.tensorboard import SummaryWriter
+
+    def write(found: Mapping[str, float], images: Mapping[str, Picture], step: int) -> None:
+        for key, value in found.items():
+            writer.add_scalar(key, value, step)
+        for key, image in images.items():
+            writer.add_image(key, image, step, dataformats="HWC")
+        writer.flush()  # so that it is seen during the run
+
+    with SummaryWriter(folder) as writer:
+        for key, value in config.items():
+            writer.add_text(f"config/{key}", str(value))
+        yield write
+
+
+@contextmanager
+def _wandb(
+    settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
+) -> Iterator[Write]:
+    """What its own variables say, such as WANDB_MODE, holds where the settings say nothing."""
+    import wandb
+
+    try:
+        run = wandb.init(
+            project=settings.project or os.environ.get("WANDB_PROJECT", "proposer_rl"),
+            mode=settings.mode,
+            dir=path,
+            name=name,
+            id=wandb_id(path),
+            resume="allow",
+            config=dict(config),
+            reinit="finish_previous",  # of a sweep in one process each run is its own
+        )
+    except (wandb.Error, ValueError) as error:
+        raise _refusal(error) from error
+
+    def write(found: Mapping[str, float], images: Mapping[str, Picture], step: int) -> None:
+        # What comes of one update, in one row; a run that goes on repeats rows, which are there.
+        shown = {key: wandb.Image(image) for key, image in images.items()}
+        run.log({**found, **shown}, step=step)
+
+    try:
+        yield write
+    except BaseException:
+        run.finish(exit_code=1)
+        raise
+    run.finish()
+
+
+def wandb_id(path: Path) -> str:
+    """The id of a run at Weights & Biases, kept in its folder: one that goes on is no second."""
+    file = path / ID
+    if not file.is_file():
+        write_atomically(file, secrets.token_hex(4).encode())
+    return file.read_text(encoding="utf-8").strip()
+
+
+def _refusal(error: Exception) -> ConfigError:
+    return ConfigError(
+        f"logger=wandb: {one_line(error)}; logger.mode=offline or WANDB_MODE=offline need none"
+    )
 
 
 def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
@@ -74,8 +159,8 @@ def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield f"{key}_mean", float(found.mean())
 
 
-def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """What of a row is seen better than read, as uint8 [H, W, 3]."""
+def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, Picture]]:
+    """What of a row is seen better than read."""
     levels = row.get("levels", ())
     for name, records in levels.items() if isinstance(levels, Mapping) else [("levels", levels)]:
         found = [picture(record.get("picture")) for record in records]
@@ -90,7 +175,7 @@ def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, NDArray[n
             yield "histogram", image
 
 
-def _sheet(tiles: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def _sheet(tiles: Sequence[Picture]) -> Picture:
     """Pictures side by side on white, four in a row."""
     height, width = (max(tile.shape[side] for tile in tiles) + GAP for side in (0, 1))
     rows = -(-len(tiles) // COLUMNS)

@@ -78,7 +78,7 @@ def open_session(folder: Path) -> Session:
         title=run_name(stored.config),
         task=stored.task,
         seeds=stored.config.seeds,
-        load=lambda file: stored.learner(file)[1:],
+        load=lambda file: stored.stage(file)[1:],
     )
 
 

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import ConfigError, RunConfig
+from proposer_rl.cli.config import LARGEST_FILE, ConfigError, RunConfig
 from proposer_rl.cli.errors import SIGNALLED, one_line
+from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import as_begun, check_same_run
-from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
+from proposer_rl.meta.workers import WorkersError
 from proposer_rl.report.pictures import draw_run
-from proposer_rl.runs.checkpoint import (
-    checkpoint_bytes,
-    checkpoint_files,
-    load_latest,
-)
-from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
+from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
+from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
@@ -34,16 +33,11 @@ SUMMARY = "summary.json"
 def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
     """Carry a run out for the command line: where it is stopped, say how it goes on, and end.
 
-    Args:
-        config: the run's settings.
-        path: the run's folder.
-        signals: which may ask the run to stop.
-
     Returns:
-        The headline measurement at the end.
+        The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        value = carry_out(config, path, signals)
+        return carry_out(config, path, signals)
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
@@ -52,7 +46,6 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
         raise
-    return value
 
 
 def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
@@ -74,89 +67,73 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     with locked(path), signals:
         try:
-            value = proceed(config, made, path, signals, status)
+            result = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin
-            return value
+        except WorkersError as error:
+            raise WorkersError(f"compute.{error}") from error
         finally:
             made.curriculum.close()
-
-
-def proceed(
-    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status | None = None
-) -> float:
-    """Begin a run, go on with it, or say that it is finished.
-
-    Args:
-        config: the run's settings.
-        made: as :func:`parts` makes it.
-        path: the run's folder.
-        signals: which may ask the run to stop.
-        status: which tells what the run is doing.
-
-    Returns:
-        The headline measurement at the end.
-    """
-    folder = RunFolder(path)
-    # What `auto` has become, so that a run goes on in the same precision elsewhere.
-    precision: Any = made.task.precision
-    check_same_run(folder, replace(config, precision=precision))
-    finished = _finished(path, config)
-    if finished is None:
-        return run(build(config, made, folder, signals, status), config)
-    tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
-    return _value(finished, config)
-
-
-def run(experiment: Experiment, config: RunConfig) -> float:
-    """Run to the end, write summary and picture, print the results.
-
-    Returns:
-        The headline measurement at the end, e.g. for a Hydra sweeper.
-    """
-    folder = experiment.folder
-    facts = identity(experiment, config)
-    described = {"planned_updates": config.schedule.updates, "task": experiment.task.facts}
-    folder.write_json("run.json", {**facts, **described})
-    try:
-        result = experiment.run()
-    except DivergedError as error:
-        kept = folder.path / "checkpoints"
-        if not checkpoint_files(kept):
-            raise
-        raise DivergedError(
-            f"{error}; the last checkpoints before it are kept in {kept}"
-        ) from error
-    if learnt := experiment.curriculum.learnt():
-        content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
-        write_atomically(folder.path / PROPOSER, content)
-    folder.write_json(SUMMARY, {**facts, **result})
-    announce(result, config, folder, draw_run(folder.path, title=run_name(config)))
-    return _value(result, config)
-
-
-def _value(result: dict[str, Any], config: RunConfig) -> float:
     finals = [float(row[config.schedule.headline]) for row in result["final"]]
     return sum(finals) / len(finals)
 
 
-def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
-    """The summary of a run that is already at the end of its schedule.
+def proceed(
+    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status
+) -> dict[str, Any]:
+    """Begin a run, go on with it, or say that it is finished; returns its summary."""
+    folder = RunFolder(path)
+    # What `auto` has become, so that a run goes on in the same precision elsewhere.
+    precision: Any = made.task.precision
+    check_same_run(folder, replace(config, precision=precision))
+    finished = _finished(path, config.schedule.updates)
+    if finished is not None:
+        tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
+        return finished
+    with logger(config.logger, path, run_name(config), asdict(config)) as write:
+        log = None if write is None else log_of(write, path)
+        experiment = build(config, made, folder, signals, status, log)
+        facts = identity(experiment, config)
+        described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
+        folder.write_json("run.json", {**facts, **described})
+        try:
+            result = experiment.run()
+        except DivergedError as error:
+            kept = path / "checkpoints"
+            if not checkpoint_files(kept):
+                raise
+            raise DivergedError(
+                f"{error}; the last checkpoints before it are kept in {kept}"
+            ) from error
+        if learnt := made.curriculum.learnt():
+            content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
+            write_atomically(path / PROPOSER, content)
+        folder.write_json(SUMMARY, {**facts, **result})
+        picture = draw_run(path, title=run_name(config))
+        if write is not None:
+            with Image.open(picture) as image:
+                write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
+    announce(result, config, folder, picture)
+    return result
+
+
+def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
+    """The summary of a run that is already at the end of a schedule of so many updates.
 
     One that goes on to a longer schedule has none until it ends again.
 
     Raises:
         ConfigError: if the run cannot come to the end of this schedule.
     """
-    updates, file, checkpoints = config.schedule.updates, folder / SUMMARY, folder / "checkpoints"
+    file, checkpoints = folder / SUMMARY, folder / "checkpoints"
+    wrong = f"schedule.updates={updates}: the run in {folder}"
     if not file.exists():
         latest = load_latest(checkpoints)
-        if latest is not None and (made := latest[1].get("updates", 0)) > updates:
-            raise ConfigError(
-                f"schedule.updates={updates}: the run in {folder} has made {made} updates already"
-            )
+        made = 0 if latest is None else latest[1].get("updates")
+        if isinstance(made, int) and made > updates:
+            raise ConfigError(f"{wrong} has made {made} updates already")
         return None
     try:
-        summary: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        summary: dict[str, Any] = json.loads(read_bounded(file, LARGEST_FILE))
         ended = int(summary["updates"])
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
@@ -166,8 +143,7 @@ def _finished(folder: Path, config: RunConfig) -> dict[str, Any] | None:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"schedule.updates={updates}: the run in {folder} ended after {ended} updates and has "
-            "no checkpoint to go on from"
+            f"{wrong} ended after {ended} updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()

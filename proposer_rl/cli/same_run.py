@@ -17,11 +17,8 @@ FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_chec
 def check_same_run(folder: RunFolder, config: RunConfig) -> None:
     """Refuse to go on with a run that was started with other settings.
 
-    The stored configuration is compared with the present one and used for nothing else.
-
-    Args:
-        folder: the run's; its ``config.json`` is written if there is none.
-        config: the settings that are asked for.
+    The stored configuration is compared with the present one and used for nothing else. If there is
+    none, the present one is written.
 
     Raises:
         ConfigError: naming the settings that differ, or what the folder holds instead of a run.
@@ -29,29 +26,28 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
     """
     now = {key: value for key, value in asdict(config).items() if key not in FREE}
     now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
-    file = folder.path / "config.json"
+    file, wrong = folder.path / "config.json", f"hydra.run.dir={folder.path}:"
     if not file.exists():
         # Tables here are no run's of ours, and a run begins by removing what is left of one.
         foreign = sorted([*folder.lengths(), *(p.name for p in folder.path.glob("checkpoints"))])
         if foreign:
             raise ConfigError(
-                f"hydra.run.dir={folder.path}: holds {foreign[0]} but no config.json, so it is no "
-                "run's folder; give another"
+                f"{wrong} holds {foreign[0]} but no config.json, so it is no run's folder; give "
+                "another"
             )
         folder.write_json(file.name, now)
         return
     before = stored_config(file)
-    gone = sorted(before.keys() - now.keys()) if isinstance(before, dict) else []
-    if gone:
+    if isinstance(before, dict) and (gone := before.keys() - now.keys()):
         raise ConfigError(
-            f"hydra.run.dir={folder.path}: the run there was begun by another version, which had "
-            f"{', '.join(gone)}; it can be read, but not gone on with"
+            f"{wrong} the run there was begun by another version, which had "
+            f"{', '.join(sorted(gone))}; it can be read, but not gone on with"
         )
     differing = _different(before, now)
     if differing:
         key, (old, new) = next(iter(differing.items()))
         raise ConfigError(
-            f"{key}={_short(new)}: the run in {folder.path} was started with {_short(old)}; "
+            f"{key}={new!r:.80}: the run in {folder.path} was started with {old!r:.80}; "
             f"differing keys: {', '.join(differing)}"
         )
 
@@ -59,20 +55,17 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
 def as_begun(config: RunConfig, path: Path) -> RunConfig:
     """The settings, with what ``precision=auto`` was on the machine where the run was begun.
 
-    Args:
-        config: the settings that are asked for.
-        path: the run's folder, whether or not there is one.
-
     Raises:
         ConfigError: if the folder's ``config.json`` is no JSON.
         StorageError: if it cannot be read.
     """
-    if config.precision != "auto":
-        return config
     file = path / "config.json"
-    begun = stored_config(file) if file.is_file() else None
-    precision: Any = begun.get("precision") if isinstance(begun, dict) else None
-    return replace(config, precision=precision) if precision in ("fp32", "bf16") else config
+    if config.precision != "auto" or not file.is_file():
+        return config
+    match stored_config(file):
+        case {"precision": ("fp32" | "bf16") as precision}:
+            return replace(config, precision=precision)
+    return config
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
@@ -84,8 +77,3 @@ def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, 
         for key in sorted(before.keys() | now.keys())
         for name, values in _different(before.get(key), now.get(key), f"{prefix}{key}.").items()
     }
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -25,17 +25,22 @@ from proposer_rl.task import Task
 
 
 class Stage(NamedTuple):
-    """The first Solver of a run after some updates.
+    """A run's Solvers after some updates.
 
     Attributes:
         step: the checkpoint's.
-        updates: that the Solver has made.
-        solver: its snapshot, batch [1].
+        updates: that the Solvers have made.
+        learner: PPO of them.
     """
 
     step: int
     updates: int
-    solver: TensorDict
+    learner: PPO
+
+    @property
+    def solver(self) -> TensorDict:
+        """A snapshot of the first of them, batch [1]."""
+        return self.learner.snapshot()[:1]
 
 
 class StoredRun(NamedTuple):
@@ -53,74 +58,47 @@ class StoredRun(NamedTuple):
     task: Task
     files: list[Path]
 
-    def stage(self, file: Path) -> Stage:
-        """The first Solver in one of the files.
+    def stage(self, file: Path | None = None) -> Stage:
+        """The Solvers in one of the files; None for the newest that is intact.
 
         Raises:
             CheckpointError: if it cannot be used.
         """
-        step, updates, learner = self.learner(file)
-        return Stage(step, updates, learner.snapshot()[:1])
+        if file is not None:
+            return self._stage(*load_checkpoint(file))
+        latest = load_latest(self.files[-1].parent)
+        assert latest is not None, "there is a checkpoint"
+        return self._stage(*latest)
 
-    def learner(self, file: Path) -> tuple[int, int, PPO]:
-        """The checkpoint's step, the updates made there, and the Solvers.
+    def _stage(self, step: int, state: State) -> Stage:
+        learner = self.task.learner([Streams(seed) for seed in self.config.seeds])
+        try:
+            learner.restore(TensorDict(state["solver"], [len(self.config.seeds)]))
+            return Stage(step, int(state["updates"]), learner)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(
+                "the checkpoint holds no Solver with the network of its run's config.json"
+            ) from error
 
-        Raises:
-            CheckpointError: if it cannot be used.
-        """
-        step, state = load_checkpoint(file)
-        learner = restored(self.task, self.config, state)
-        return step, int(state["updates"]), learner
 
-
-def stored_run(folder: Path) -> StoredRun:
+def stored_run(path: Path) -> StoredRun:
     """A run that has checkpoints.
 
-    Raises:
-        ConfigError: if the folder holds none.
-    """
-    files = [file for _, file in checkpoint_files(folder / "checkpoints")]
-    if not files:
-        raise ConfigError(f"{folder}: holds no checkpoints; give the folders of runs")
-    config = saved_config(folder)
-    return StoredRun(folder, config, make_task(config), files)
-
-
-def read_checkpoint(path: Path) -> tuple[Path, State]:
-    """A run's folder and the state in one of its checkpoints.
-
     Args:
-        path: the folder, for its newest checkpoint, or a checkpoint in it.
+        path: the folder, or one of its checkpoints, which is the only file then.
 
     Raises:
-        ConfigError: if there is none.
-        CheckpointError: if it cannot be used.
+        ConfigError: if there are none, or the folder is no run's.
     """
     if not path.exists():
         raise ConfigError(f"{path}: there is no such file or folder")
+    folder, files = path.resolve(), [file for _, file in checkpoint_files(path / "checkpoints")]
     if not path.is_dir():
-        return path.resolve().parent.parent, load_checkpoint(path)[1]
-    latest = load_latest(path / "checkpoints")
-    if latest is None:
+        folder, files = folder.parent.parent, [path]
+    if not files:
         raise ConfigError(f"{path}: holds no checkpoints; give a run's folder or a checkpoint")
-    return path.resolve(), latest[1]
-
-
-def restored(task: Task, config: RunConfig, state: State) -> PPO:
-    """PPO of the Solvers in a checkpoint.
-
-    Raises:
-        CheckpointError: if they have another network than the settings say.
-    """
-    learner = task.learner([Streams(seed) for seed in config.seeds])
-    try:
-        learner.restore(TensorDict(state["solver"], [len(config.seeds)]))
-        int(state["updates"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(
-            "the checkpoint holds no Solver with the network of its run's config.json"
-        ) from error
-    return learner
+    config = saved_config(folder)
+    return StoredRun(folder, config, make_task(config), files)
 
 
 def write_rows(rows: Sequence[Any], file: Path | None) -> None:

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 HYDRAS_OWN = {".hydra", "train.log", "multirun.yaml"}
 
+_folder: Path | None = None
 # Folders that were not there when the command began, the innermost first.
 _new: list[Path] = []
 
@@ -32,6 +33,11 @@ class Traces(Callback):
         _note(config, "hydra.sweep.dir")
 
 
+def folder() -> Path | None:
+    """The folder of the run or sweep; None before the command has come so far."""
+    return _folder
+
+
 def remove_traces() -> None:
     """Remove the folders that the command has made, unless there is more in them than Hydra's."""
     for folder in _new:
@@ -41,8 +47,9 @@ def remove_traces() -> None:
 
 
 def _note(config: DictConfig, key: str) -> None:
+    global _folder
     _new.clear()
     # A folder's name that cannot be told is refused by Hydra right after this.
     with suppress(OmegaConfBaseException):
-        path = Path(OmegaConf.select(config, key)).absolute()
+        _folder = path = Path(OmegaConf.select(config, key)).absolute()
         _new.extend(folder for folder in (path, *path.parents) if not folder.exists())

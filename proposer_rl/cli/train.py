@@ -20,7 +20,14 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli.config import ConfigError, check_groups, overrides, read_config
+from proposer_rl.cli import traces
+from proposer_rl.cli.config import (
+    ConfigError,
+    check_groups,
+    check_packages,
+    overrides,
+    read_config,
+)
 from proposer_rl.cli.errors import UNFORESEEN, command, exit_code, one_line, refuse
 from proposer_rl.cli.hydra_errors import explained
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -44,13 +51,18 @@ def _compose_and_run() -> None:
     try:
         with _unchecked_help():
             _main()
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
+    except OSError as error:  # of Hydra's own files
+        remove_traces()
+        refuse(error, traces.folder())
     except ValueError as error:
         if BEGUN:
             raise
         remove_traces()
+        if isinstance(error.__cause__, OSError):  # of the file that logging cannot open
+            refuse(error.__cause__)
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
 
 
@@ -75,16 +87,17 @@ def _main(hydra_config: DictConfig) -> float:
     try:
         forget_failure(path)
         check_groups(overrides())
+        check_packages(hydra_config)
         config = read_config(hydra_config)
         from proposer_rl.cli.run import train  # only now: it takes seconds
 
         return train(config, path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return record_failure(path, error, one_line(error), exit_code(error))
+            return record_failure(path, error, one_line(error, path), exit_code(error))
         if exit_code(error) != UNFORESEEN:
             remove_traces()
-            refuse(error)
+            refuse(error, path)
         raise
 
 

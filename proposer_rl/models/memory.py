@@ -124,5 +124,5 @@ class _MemoryHead(TensorDictModuleBase):
         )
         outputs = self.population(begins, hidden[:, :, 0], cell[:, :, 0], *observed)
         for key, output in zip(self.out_keys, outputs, strict=True):
-            tensordict.set(key, output.reshape(*batch, output.shape[-1]))
+            tensordict.set(key, output.reshape(*batch, *output.shape[3:]))
         return tensordict

@@ -23,9 +23,10 @@ from typing import Any
 
 import torch
 
-from proposer_rl.runs.folder import storage, write_atomically
+from proposer_rl.runs.folder import read_bounded, storage, write_atomically
 
 FORMAT = 2
+LARGEST = 2**36  # bytes
 
 _LOG = logging.getLogger(__name__)
 _FILE_NAME = re.compile(r"step_(\d+)\.pt")
@@ -145,11 +146,13 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
         )
     try:
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever torch raises, what it read is not a state that we wrote
-        reason = str(error).partition("\n")[0]
+    except Exception:  # whatever torch raises, what it read is not a state that we wrote
+        state = None  # what it says ends in advice on how to run the code that may be in it
+    if not isinstance(state, dict):
         raise CheckpointError(
-            f"the checkpoint {path} is refused by torch.load: {reason}"
-        ) from error
+            f"the checkpoint {path} is refused by torch.load: it holds more than tensors and plain "
+            "data, and was not written by proposer_rl"
+        )
     return step, state
 
 
@@ -175,8 +178,10 @@ def _plain(value: object, where: str) -> object:
 
 def _verified(path: Path) -> tuple[int, int, bytes]:
     """Returns format, step and payload of a file, none of them looked at before the checksum."""
-    with storage(path, "read"):
-        content = path.read_bytes()
+    try:
+        content = read_bounded(path, LARGEST)
+    except ValueError as error:
+        raise CheckpointError(str(error)) from error
     digest, _, body = content.partition(b"\n")
     if digest != hashlib.sha256(body).hexdigest().encode():
         raise _DamagedError(
@@ -184,7 +189,9 @@ def _verified(path: Path) -> tuple[int, int, bytes]:
         )
     line, _, payload = body.partition(b"\n")
     try:
-        header = json.loads(line)
-        return int(header["format"]), int(header["step"]), payload
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise CheckpointError(f"{path} is not a checkpoint of proposer_rl") from None
+        match json.loads(line):
+            case {"format": int(version), "step": int(step)}:
+                return version, step, payload
+    except (ValueError, RecursionError):
+        pass
+    raise CheckpointError(f"{path} is not a checkpoint of proposer_rl")

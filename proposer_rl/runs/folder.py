@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import accumulate
@@ -188,14 +189,17 @@ def read_bounded(path: Path, largest: int) -> bytes:
     """A file that may come from anybody.
 
     Raises:
-        ValueError: if it has more than ``largest`` bytes.
+        ValueError: if it has more than ``largest`` bytes, or is no file but a pipe or a device,
+            which might never end.
         StorageError: if it cannot be read.
     """
-    with storage(path, "read"), open(path, "rb") as file:
-        content = file.read(largest + 1)
-    if len(content) > largest:
-        raise ValueError(f"{path}: is larger than {largest:,} bytes")
-    return content
+    with storage(path, "read"):
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise ValueError(f"{path}: is no plain file")
+        if found.st_size > largest:
+            raise ValueError(f"{path}: is larger than {largest:,} bytes")
+        return path.read_bytes()
 
 
 @contextmanager

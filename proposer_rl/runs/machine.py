@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import platform
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -14,3 +16,11 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def memory() -> int:
+    """Bytes that this process can have: the machine's, or what a container or Slurm allows."""
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):  # "max", or no such file
+        return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return whole

@@ -73,7 +73,8 @@ class StopSignals:
         job into the queue again and exits; if it returns, the run goes on.
 
         Raises:
-            Interrupted: if there was no such handler.
+            Interrupted: if there was no such handler, or it raises, as submitit's does where a job
+                has run out of time too often to be queued again.
         """
         signum, self._pending = self._pending, None
         if signum is None:
@@ -81,7 +82,10 @@ class StopSignals:
         before = self._before[signum]
         if not callable(before) or before is signal.default_int_handler:
             raise Interrupted(signum)
-        before(signum, None)
+        try:
+            before(signum, None)
+        except Exception as error:
+            raise Interrupted(signum) from error
 
     def _keep(self, signum: int, frame: FrameType | None) -> None:
         if signum == signal.SIGINT and self._pending == signal.SIGINT:

@@ -144,7 +144,9 @@ def test_the_order_in_which_parts_come_back_has_no_effect(name: str) -> None:
 LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "first order, sampled", "paired"]
 
 
-@pytest.mark.parametrize("name", [*LEARNING, "filtered bins", "schedule", "mixed"])
+@pytest.mark.parametrize(
+    "name", [*LEARNING, "transport on a model", "filtered bins", "schedule", "mixed"]
+)
 def test_what_comes_back_makes_a_difference(name: str) -> None:
     """Otherwise the test above would show nothing."""
     missing = [(1, slice(None)), (0, slice(0, 1))]
@@ -197,7 +199,7 @@ WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase
 }
 
 
-@pytest.mark.parametrize("name", ["plr", "progress of episodes", "alp_gmm", "paired"])
+@pytest.mark.parametrize("name", ["plr", "progress of episodes", "alp_gmm", "paired", "spread"])
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:
     curriculum, student = EVERY[name](), TaskStudent(TASK, solvers([0]))

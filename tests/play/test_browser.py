@@ -20,9 +20,7 @@ from playwright.sync_api import (
 )
 from playwright.sync_api import Page as Tab
 
-from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
+from proposer_rl.cli.stored import stored_run
 from proposer_rl.models import cell_logits
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
@@ -123,15 +121,15 @@ def success(
     run: Path, rows: list[str], number: int, limit: int | None = None, solver: int = 0
 ) -> str:
     """What the page must say, computed without it."""
-    folder, state = read_checkpoint(stored_run(run).files[number])
-    config = saved_config(folder)
-    agent = restored(make_task(config), config, state).agent
+    stored = stored_run(run)
+    stage = stored.stage(stored.files[number])
+    agent = stage.learner.agent
     level = Level.from_text("\n".join(rows))
     logits = cell_logits(agent, planes(level.expand(2, 1)))[solver, 0].detach()
     evaluator = ExactEvaluator(limit or max(10, 2 * path_length(level)))
     chance = float(evaluator(level, logits)["success"])
     digits = 1 if 0.0005 <= chance <= 0.9995 else 0
-    return f"After {state['updates']} updates: {100 * chance:.{digits}f} % success"
+    return f"After {stage.updates} updates: {100 * chance:.{digits}f} % success"
 
 
 def slide(tab: Tab, number: int) -> None:

@@ -8,6 +8,7 @@ import shutil
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import torch
 from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.evaluate import evaluate, load
-from proposer_rl.cli.stored import read_checkpoint, restored, stored_run
+from proposer_rl.cli.stored import stored_run
 from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.play.server import STATIC
 from proposer_rl.runs.folder import read_jsonl
@@ -204,10 +205,8 @@ def test_cars_are_looked_at_though_they_cannot_be_drawn(car_page: Page) -> None:
     assert told["board"] is None and told["task_levels"] == "cars"
     question = {"source": "distribution", "name": "all", "seed": 0, "checkpoint": 2, "solver": 0}
     drawn = asked(car_page, "levels", question)
-    run, state = read_checkpoint(car_page.run)
-    config = saved_config(run)
-    task = make_task(config)
-    agent = restored(task, config, state).agent
+    stored = stored_run(car_page.run)
+    task, agent = stored.task, stored.stage().learner.agent
     streams = Streams(0, "play", "all")
     levels = task.distributions["all"].sample(task.batch_size, streams.generator("levels"))
     with torch.no_grad():
@@ -364,22 +363,38 @@ def test_forms_and_other_methods_are_refused(page: Page) -> None:
 
 
 @pytest.mark.usefixtures("alive")
-def test_oversized_bodies_are_not_read(page: Page) -> None:
-    def endless() -> Iterator[bytes]:
-        for _ in range(200):
+def test_oversized_bodies_are_refused_in_words(page: Page) -> None:
+    def in_pieces() -> Iterator[bytes]:
+        for _ in range(20):
             yield b" " * LARGEST_BODY
 
-    for content in (b" " * (LARGEST_BODY + 1), endless()):
-        try:
-            answer = CLIENT.post(f"{page.address}api/examine", content=content, headers=JSON)
-            refused(answer, 413)
-        except httpx.TransportError:
-            pass  # the server has hung up while it was still being sent
+    for content in (b" " * (LARGEST_BODY + 1), b" " * 5_000_000, in_pieces()):
+        answer = CLIENT.post(f"{page.address}api/examine", content=content, headers=JSON)
+        assert "at most 262,144 bytes" in refused(answer, 413)
+    with suppress(httpx.TransportError):  # without an end it is not read to its end
+        content = iter(lambda: b" " * LARGEST_BODY, b"")
+        CLIENT.post(f"{page.address}api/examine", content=content, headers=JSON)
     largest = ["S" + "." * (LARGEST_SIDE - 2) + "G", *["." * LARGEST_SIDE] * (LARGEST_SIDE - 1)]
     assert asked(page, "examine", {**EXAMINE, "rows": largest})["max_steps"] == 126
     with socket.create_connection(("127.0.0.1", page.port)) as connection:
         connection.sendall(b"GET /" + b"a" * 10**6 + b" HTTP/1.1\r\n\r\n")
         assert b" 400 " in connection.recv(100)
+
+
+@pytest.mark.usefixtures("alive")
+def test_who_only_waits_locks_nobody_out(page: Page) -> None:
+    half = b"POST /a HTTP/1.1\r\nHost: localhost\r\n"
+    waiting = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(400)]
+    try:
+        for connection in waiting[::2]:
+            with suppress(OSError):  # it was closed for another
+                connection.sendall(half)
+        for _ in range(3):
+            with httpx.Client(timeout=None, trust_env=False) as client:
+                assert client.get(f"{page.address}api/run").status_code == 200
+    finally:
+        for connection in waiting:
+            connection.close()
 
 
 @pytest.mark.usefixtures("alive")

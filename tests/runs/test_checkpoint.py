@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import pickle
 import subprocess
@@ -214,9 +215,13 @@ def test_another_format_is_named(tmp_path: Path, step: int, age: str) -> None:
         load_latest(tmp_path)
 
 
-def test_a_foreign_header_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "header",
+    [["format"], {"format": math.inf, "step": 1}, {"format": FORMAT, "step": "x"}, {"step": None}],
+)
+def test_a_foreign_header_is_refused(tmp_path: Path, header: object) -> None:
     path = tmp_path / "step_000000002.pt"
-    path.write_bytes(_envelope(["format"], b""))
+    path.write_bytes(_envelope(header, b""))
     with pytest.raises(CheckpointError, match="is not a checkpoint of proposer_rl"):
         load_checkpoint(path)
 
@@ -242,8 +247,24 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path, saver: str) -> None:
     path.write_bytes(content)
     with pytest.raises(CheckpointError, match=r"refused by torch\.load") as caught:
         load_latest(tmp_path)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and "weights_only" not in str(caught.value)
     assert not target.exists()
+
+
+def test_a_pipe_and_a_device_are_no_checkpoints(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "step_000000001.pt")
+    (tmp_path / "step_000000002.pt").symlink_to("/dev/zero")
+    for path in tmp_path.iterdir():
+        with pytest.raises(CheckpointError, match="is no plain file"):
+            load_checkpoint(path)
+
+
+def test_a_state_is_a_mapping(tmp_path: Path) -> None:
+    torch.save([1], payload := tmp_path / "payload")
+    path = tmp_path / "step_000000002.pt"
+    path.write_bytes(_envelope({"format": FORMAT, "step": 2}, payload.read_bytes()))
+    with pytest.raises(CheckpointError, match="was not written by proposer_rl"):
+        load_checkpoint(path)
 
 
 def test_a_crash_before_the_rename_costs_nothing(tmp_path: Path) -> None:

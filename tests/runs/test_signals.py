@@ -46,6 +46,22 @@ def test_a_second_sigint_is_not_kept() -> None:
             send(signal.SIGINT)
 
 
+def test_a_job_that_is_not_queued_again_is_interrupted() -> None:
+    """Submitit's handler raises where a job has run out of time too often."""
+
+    def refuse(*_: object) -> None:
+        raise RuntimeError("Job not requeued because: timed-out too many times.")
+
+    before = signal.signal(signal.SIGUSR2, refuse)
+    try:
+        with StopSignals() as signals:
+            send(signal.SIGUSR2)
+            with pytest.raises(Interrupted, match="stopped by SIGUSR2"):
+                signals.deliver()
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
 def test_a_handler_from_before_acts_after_the_checkpoint_and_may_let_the_run_go_on() -> None:
     """As submitit's does: it queues the job again and exits, or ignores SIGTERM."""
     acted = []

@@ -31,7 +31,7 @@ VIEWS = ["task=view_maze_smoke", "compute.progress=false"]
         ([*VIEWS, "+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23"),
         (
             [*VIEWS, "+method=target", "task.distributions.id.kind=spiral"],
-            "id.kind='spiral': input should be one of 'four_rooms', 'perfect', 'scattered'",
+            "input tag 'spiral' found using 'kind' does not match any of the expected tags",
         ),
     ],
 )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from itertools import cycle
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 import torch
@@ -21,10 +20,11 @@ from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
+    EVERY,
     WorkersError,
     WorkerSettings,
-    collect,
     lost,
+    quiet,
     start,
     stop,
 )
@@ -33,7 +33,6 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 
 ATTEMPTS = 3
-EVERY = 0.5  # seconds between two readings of how far the workers are
 
 
 class CopiesInWorkers:
@@ -70,6 +69,7 @@ class CopiesInWorkers:
         every = [copy for share in self._shares for copy in share]
         self._first = [every.index(copy) for copy in range(self._env.batch_size[0])]
         self._collector: BaseCollector | None = None
+        self._losses = 0
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
         """See :meth:`~proposer_rl.meta.copies.Copies.roll_out`.
@@ -79,19 +79,21 @@ class CopiesInWorkers:
             WorkersError: if workers are lost again and again.
         """
         self._env.view.draw_levels(streams)
-        for attempt in range(ATTEMPTS):
+        for attempt in range(1, ATTEMPTS + 1):
             try:
                 rollout, diverged = self._roll_out(solver, streams)
                 break
             except WorkersError:
                 raise
             except lost(self._settings) as error:
+                self._losses += 1
                 self.close()
-                reason = _last_line(error)
-                if attempt == ATTEMPTS - 1:
+                # A worker's error comes with its traceback before.
+                reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+                if attempt == ATTEMPTS:
                     raise WorkersError(
-                        f"workers were lost {ATTEMPTS} times in one cycle, last: {reason}; the "
-                        "same command goes on from the last checkpoint"
+                        f"workers={len(self._shares)}: were lost {ATTEMPTS} times in one cycle, "
+                        f"last: {reason}; the same command goes on from the last checkpoint"
                     ) from error
                 # It may have been the signal that ends this run, too.
                 self._env.on_update(0)
@@ -102,7 +104,10 @@ class CopiesInWorkers:
                 )
         for message in filter(None, diverged):
             raise DivergedError(message)
-        return self._proposer.complete(self._together(rollout))
+        rollout = rollout.flatten(0, 1)[self._first]  # [K, T], each from the first that has it
+        rollout = rollout.exclude("collector").to(self._env.device)
+        rollout.names = [None, "time"]
+        return self._proposer.complete(rollout)
 
     def trained(self, copy: int) -> Trained:
         """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
@@ -119,21 +124,20 @@ class CopiesInWorkers:
 
     def _roll_out(
         self, solver: TensorDictBase, streams: Streams
-    ) -> tuple[TensorDictBase, Sequence[str | None]]:
+    ) -> tuple[Any, Sequence[str | None]]:
         """The batch of all workers, [W, k, T], and what diverged in each."""
-        if self._collector is None:
-            self._collector = self._start()
-        collector, every = self._collector, len(self._shares)
+        collector = self._collector
+        if collector is None:
+            collector = self._collector = self._start()
         # One block of memory each: across processes, every tensor costs a file descriptor.
         origin = solver.cpu().consolidate()
         named = self._proposer.agent.named_parameters()
         weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
-        counts = torch.zeros(every, dtype=torch.int64).share_memory_()
-        orders = [(origin, streams, count) for count in counts]
-        collector.map_fn("env.fork", orders)
+        counts = torch.zeros(len(self._shares), dtype=torch.int64).share_memory_()
+        collector.map_fn("env.fork", [(origin, streams, count) for count in counts])
         collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
-        with _reported(counts, self._tell):
-            rollouts = collect(collector)
+        with quiet(), _reported(counts, self._tell):
+            rollouts = collector.next()
         return rollouts, collector.get_distant_attr("env.diverged")
 
     def _start(self) -> BaseCollector:
@@ -147,15 +151,9 @@ class CopiesInWorkers:
             [partial(make_worker_env, self._make_env, *place, threads) for place in placed],
             [partial(WorkerPolicy, agent, horizon, shape, device) for _, device in placed],
             frames=len(self._shares[0]) * horizon,
-            threads=threads,
+            check=partial(self._env.on_update, 0),
+            patient=self._losses > 0,
         )
-
-    def _together(self, rollouts: TensorDictBase) -> TensorDictBase:
-        """The rollout [K, T] of all replicas, each from the first worker that has it."""
-        rollout: Any = rollouts.flatten(0, 1)[self._first]
-        rollout = rollout.exclude("collector").to(self._env.device)
-        rollout.names = [None, "time"]
-        return rollout
 
 
 def shares(copies: int, workers: int) -> list[range]:
@@ -183,23 +181,18 @@ def _reported(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
     over = Event()
 
     def watch() -> None:
-        reported, last = 0, False
-        while not last:
+        told = 0
+        while True:
             last = over.wait(EVERY)
-            done = int(counts.min())
-            if done > reported:
-                tell(done)
-                reported = done
+            if (done := int(counts.min())) > told:
+                tell(told := done)
+            if last:
+                return
 
-    with ThreadPoolExecutor(1) as pool:
-        watched = pool.submit(watch)
-        try:
-            yield
-        finally:
-            over.set()
-        watched.result()  # raises what the report has raised
-
-
-def _last_line(error: Exception) -> str:
-    """What an error says in the end: a worker's comes with its traceback before."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
+    watcher = Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from typing import Any, Literal, NamedTuple
 
@@ -18,11 +19,14 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 # What a collector raises when a process of its own has died or cannot be reached any more.
 LOST = (RuntimeError, EOFError, OSError, ValueError)
 SECONDS_TO_CLOSE = 5.0
-SECONDS_TO_ANSWER = 10.0
+SECONDS_TO_ANSWER = 60.0  # of a cluster
+SECONDS_TO_START = 300.0  # of workers, which others may keep from a cluster's processors
+SECONDS_TO_SAY = 20.0  # between two lines on what is waited for
+EVERY = 0.5  # seconds between two looks at whoever is waited for
 
 
 class WorkersError(RuntimeError):
-    """The workers cannot do their work; the message is one line."""
+    """The workers cannot do their work; the message is one line ``argument=value: why``."""
 
     exit_code = 6
 
@@ -52,7 +56,8 @@ def start(
     environments: list[Callable[[], Any]],
     policies: list[Callable[[], Any]],
     frames: int,
-    threads: int,
+    check: Callable[[], None] = lambda: None,
+    patient: bool = False,
 ) -> BaseCollector:
     """Start the workers.
 
@@ -61,12 +66,13 @@ def start(
         environments: a factory for each worker, which can be pickled.
         policies: the same.
         frames: that each worker collects in a batch.
-        threads: of torch, in each process.
+        check: called while they are waited for; what it raises ends the wait.
+        patient: whether machines may come that are missing, as after one was lost.
 
     Raises:
-        WorkersError: if there is no such cluster, or it is too small.
+        WorkersError: if there is no such cluster, it is too small, or its workers do not come up.
     """
-    common = {
+    common: dict[str, Any] = {
         "policy_factory": policies,
         "frames_per_batch": frames * settings.workers,
         "reset_at_each_iter": True,
@@ -74,20 +80,39 @@ def start(
         "trust_policy": True,
     }
     unused = {"use_buffers": False, "auto_register_policy_transforms": False}
-    with _kept(), warnings.catch_warnings():
-        # TorchRL's, of a policy that it will not update: the weights come with every order.
-        warnings.filterwarnings("ignore", message="The policy is not an nn.Module")
-        if settings.engine == "ray":
-            return _ray(settings, environments, unused, common)
-        return MultiSyncCollector(
+    threads = torch.get_num_threads()
+    with quiet():
+        if settings.engine == "multiprocess":
+            return MultiSyncCollector(
+                environments,
+                cat_results="stack",
+                # TorchRL would leave this process fewer threads; its sums would round otherwise.
+                num_threads=threads,
+                num_sub_threads=threads,
+                **unused,
+                **common,
+            )
+        from torchrl.collectors.distributed import RayCollector
+
+        share = _cluster_share(settings, check, patient)
+        collector = RayCollector(
             environments,
-            cat_results="stack",
-            # TorchRL would leave this process fewer threads, and its sums would round otherwise.
-            num_threads=threads,
-            num_sub_threads=threads,
-            **unused,
+            total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
+            sync=True,
+            # One for each: TorchRL writes a worker's policy factory into them.
+            collector_kwargs=[unused.copy() for _ in environments],
+            remote_configs=[share.copy() for _ in environments],
+            # The weights travel with every order. TorchRL's scheme joins all in one torch process
+            # group, which a worker that replaces another cannot enter.
+            weight_sync_schemes={},
             **common,
         )
+        try:
+            _wait_for_all(collector, settings, check)
+        except BaseException:
+            stop(collector)
+            raise
+        return collector
 
 
 def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
@@ -101,44 +126,44 @@ def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
 
 def stop(collector: BaseCollector) -> None:
     """End the workers, whatever state they are in, and with Ray's the connection to its cluster."""
-    with _kept():
-        with suppress(Exception):  # of a collector whose workers are gone
-            collector.shutdown(timeout=SECONDS_TO_CLOSE)
-        if not isinstance(collector, MultiSyncCollector):
-            sys.modules["ray"].shutdown()
-            return
-        for process in collector.procs:
-            with suppress(ValueError):  # closed already
-                process.kill()
-                process.join()
+    with quiet(), suppress(Exception):  # of a collector whose workers are gone
+        collector.shutdown(timeout=SECONDS_TO_CLOSE)
+    if not isinstance(collector, MultiSyncCollector):
+        sys.modules["ray"].shutdown()
+        return
+    for process in collector.procs:
+        with suppress(ValueError):  # closed already
+            process.kill()
+            process.join()
 
 
-def collect(collector: BaseCollector) -> Any:
-    """The next batch of all workers, [W, K, T]."""
-    # A collector that loses a worker ends by itself.
-    with _kept(), warnings.catch_warnings():
-        # What TorchRL's weight synchronisation would do is done with every order.
-        warnings.filterwarnings("ignore", message="RayCollector iteration started before")
-        return collector.next()
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Put back the number of threads, which TorchRL's collectors change, and hide two warnings.
+
+    Both say that a worker's policy gets no weights: they come with every order.
+    """
+    threads = torch.get_num_threads()
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="The policy is not an nn.Module")
+            warnings.filterwarnings("ignore", message="RayCollector iteration started before")
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
-def _ray(
-    settings: WorkerSettings,
-    environments: list[Callable[[], Any]],
-    unused: dict[str, Any],
-    common: dict[str, Any],
-) -> BaseCollector:
+def _cluster_share(
+    settings: WorkerSettings, check: Callable[[], None], patient: bool
+) -> dict[str, Any]:
+    """Connect to the cluster, or start one, and say what of it a worker reserves.
+
+    Raises:
+        WorkersError: if it does not answer, or does not have as much.
+    """
     import ray
-    from torchrl.collectors.distributed import RayCollector
 
-    workers, address = settings.workers, settings.ray_address
-    on_gpus = any(torch.device(device).type == "cuda" for device in settings.devices)
-    visible = torch.cuda.device_count() if address is None else workers
-    share = {  # which Ray reserves for a worker; it is placed on another machine where it can be
-        "num_cpus": settings.cores,
-        "num_gpus": min(1.0, visible / workers) if on_gpus else 0,
-        "scheduling_strategy": "SPREAD",
-    }
+    workers, cores, address = settings.workers, settings.cores, settings.ray_address
     cluster: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address is not None:
         _knock(address)
@@ -146,61 +171,120 @@ def _ray(
     else:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # our own cluster reports to nobody
         # As many as are asked for, or Ray would wait for processors that will never be there.
-        processors = max(os.cpu_count() or 1, settings.cores * workers)
+        processors = max(os.cpu_count() or 1, cores * workers)
         cluster |= {"address": "local", "num_cpus": processors, "include_dashboard": False}
     try:
-        ray.init(**cluster, ignore_reinit_error=True)
-    except ConnectionError as error:  # Ray's, of an address such as auto
-        raise WorkersError(f"compute.ray_address={address}: no cluster answers there") from error
-    # Before the collector, which would wait for ever for what is not there.
-    available = ray.cluster_resources()
-    for name, amount in {"CPU": settings.cores * workers, "GPU": float(on_gpus)}.items():
-        if available.get(name, 0) < amount:
-            ray.shutdown()
-            raise WorkersError(
-                f"compute.workers={workers}: the Ray cluster has "
-                f"{available.get(name, 0):g} {name}, {amount:g} are needed"
-            )
-    return RayCollector(
-        environments,
-        total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
-        sync=True,
-        # One for each: TorchRL writes a worker's policy factory into them.
-        collector_kwargs=[unused.copy() for _ in range(workers)],
-        remote_configs=[share.copy() for _ in range(workers)],
-        # The weights travel with every order. TorchRL's scheme joins all in one torch process
-        # group, which a worker that replaces another cannot enter.
-        weight_sync_schemes={},
-        **common,
+        _elsewhere(lambda: ray.init(**cluster, ignore_reinit_error=True), check)
+    except TimeoutError:
+        reason = f"no cluster that this machine is part of answers in {SECONDS_TO_ANSWER:.0f} s"
+        raise WorkersError(f"ray_address={address}: {reason}") from None
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise WorkersError(f"ray_address={address}: no cluster answers there: {reason}") from error
+    on_gpus = any(torch.device(device).type == "cuda" for device in settings.devices)
+    visible = torch.cuda.device_count() if address is None else workers
+    share = {"num_cpus": cores, "num_gpus": min(1.0, visible / workers) if on_gpus else 0}
+    try:
+        _wait(lambda: _short_of(share, workers), workers, SECONDS_TO_START * patient, check)
+    except BaseException:
+        ray.shutdown()
+        raise
+    return {**share, "scheduling_strategy": "SPREAD"}  # on several machines where it can be
+
+
+def _short_of(share: dict[str, Any], workers: int) -> str | None:
+    """Why the cluster's machines have no place for so many workers; None where they have."""
+    import ray
+
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    asked = {"CPU": share["num_cpus"], "GPU": share["num_gpus"]}
+    asked = {name: amount for name, amount in asked.items() if amount}
+    places = sum(
+        int(min(node.get(name, 0) / amount + 1e-6 for name, amount in asked.items()))
+        for node in nodes
+    )
+    if places >= workers:
+        return None
+    have = " and ".join(f"{sum(n.get(name, 0) for n in nodes):g} {name}" for name in asked)
+    each = " and ".join(f"{amount:g} {name}" for name, amount in asked.items())
+    return (
+        f"the Ray cluster has {have} on {len(nodes)} machines, each worker needs {each} of one: "
+        f"there is room for {places}"
     )
 
 
+def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], None]) -> None:
+    """Wait until every worker has begun."""
+    import ray
+
+    workers = settings.workers
+    begun = [one.get_distant_attr.remote("worker_idx") for one in collector.remote_collectors]
+
+    def missing() -> str | None:
+        ready, waiting = ray.wait(begun, num_returns=workers, timeout=EVERY)
+        ray.get(ready)  # raises what has kept a worker from beginning
+        free = ray.available_resources().get("CPU", 0)
+        if not waiting:
+            return None
+        return f"{len(ready)} have begun, {free:g} CPU of the Ray cluster are free"
+
+    _wait(missing, workers, SECONDS_TO_START, check)
+
+
+def _wait(
+    reason: Callable[[], str | None], workers: int, limit: float, check: Callable[[], None]
+) -> None:
+    """Wait until there is no reason to any more, and say so where it takes long.
+
+    Raises:
+        WorkersError: with the reason, where there still is one after so many seconds.
+    """
+    began = said = time.monotonic()
+    while (why := reason()) is not None:
+        now = time.monotonic()
+        if now - began >= limit:
+            raise WorkersError(f"workers={workers}: {why}" + f", after {limit:g} s" * bool(limit))
+        if now - said >= SECONDS_TO_SAY:
+            said = now
+            warnings.warn(f"workers={workers} are waited for: {why}", RuntimeWarning, stacklevel=2)
+        check()
+        time.sleep(EVERY)
+
+
+def _elsewhere(function: Callable[[], Any], check: Callable[[], None]) -> None:
+    """Call a function in another thread.
+
+    Ray puts handlers of its own in the place of those that save before the process ends, but only
+    in the main thread; and it goes on asking for a cluster for minutes.
+
+    Raises:
+        TimeoutError: if it does not end in time.
+    """
+    came: Future[None] = Future()
+
+    def call() -> None:
+        try:
+            came.set_result(function())
+        except BaseException as error:
+            came.set_exception(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    until = time.monotonic() + SECONDS_TO_ANSWER
+    while True:
+        with suppress(TimeoutError):
+            came.result(timeout=EVERY)
+            return
+        check()
+        if time.monotonic() > until:
+            raise TimeoutError
+
+
 def _knock(address: str) -> None:
-    """Find out at once that nobody is there: Ray would go on asking for minutes."""
+    """Find out at once that nobody is there."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         return  # a name that Ray itself resolves, such as auto
     try:
-        socket.create_connection((host, int(port)), SECONDS_TO_ANSWER).close()
+        socket.create_connection((host, int(port)), SECONDS_TO_CLOSE).close()
     except (OSError, OverflowError) as error:
-        raise WorkersError(
-            f"compute.ray_address={address}: no cluster answers there: {error}"
-        ) from error
-
-
-@contextmanager
-def _kept() -> Iterator[None]:
-    """Puts back what the collectors change in this process.
-
-    TorchRL's change its threads when they start and when they end; Ray puts handlers of its own in
-    the place of those that save before the process ends.
-    """
-    threads = torch.get_num_threads()
-    handlers = {s: signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        if threading.current_thread() is threading.main_thread():
-            for signum, handler in handlers.items():
-                signal.signal(signum, handler)
+        raise WorkersError(f"ray_address={address}: no cluster answers there: {error}") from error

@@ -7,7 +7,7 @@ import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -16,12 +16,12 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.tasks.gymnasium.networks import checked_spaces
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
-from proposer_rl.tasks.gymnasium.settings import Flags, ParameterSettings, Steps
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step
+from proposer_rl.tasks.gymnasium.spaces import NUMBERS, Seen, boxes_of
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
@@ -33,14 +33,15 @@ class GymnasiumEnv(EnvBase):
     """A batch of environments of Gymnasium, stepped by its vector environments.
 
     An environment whose episode is over begins its level again, from the same seed. Observations
-    are ``observation`` and ``success``, bool [*B, 1]: whether the step ended an episode that counts
-    as one. ``reward`` is scaled.
+    are those of :func:`~proposer_rl.tasks.gymnasium.spaces.plain`, ``observation`` and perhaps
+    images; ``success``, bool [*B, 1], whether the step ended an episode that counts as one; and
+    ``is_init``, bool [*B, 1], whether the step begins one. ``reward`` is scaled.
 
     Args:
         levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B].
         make: makes one environment.
         parameters: what differs between levels, by name.
-        success: whether each step ended an episode that is one.
+        success: whether the last step of an episode says that it was one.
         reward_scale: rewards are multiplied with it.
         vectorization: one after another, or each in a process of its own.
         once: play one episode of each level, and then stand still, without reward.
@@ -52,18 +53,18 @@ class GymnasiumEnv(EnvBase):
         make: MakeEnvironment,
         parameters: Mapping[str, ParameterSettings],
         *,
-        success: Callable[[Steps], Flags],
+        success: Callable[[Step], bool],
         reward_scale: float = 1.0,
         vectorization: Vectorization = "sync",
         once: bool = False,
     ) -> None:
         super().__init__(batch_size=levels.batch_size)
-        self._succeeded = success
         self._reward_scale = reward_scale
         self._once = once
-        players = [partial(LevelPlayer, make, parameters, play) for play in plays(levels, once)]
+        players = [
+            partial(LevelPlayer, make, parameters, play, success) for play in plays(levels, once)
+        ]
         self._vector = _vectorized(players, vectorization)
-        self._returns = np.zeros(len(players))
         self._make_specs()
 
     def set_levels(self, levels: TensorDictBase) -> None:
@@ -77,55 +78,61 @@ class GymnasiumEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            self._returns[:] = 0
-            seen, _ = self._vector.reset()
-        else:
-            which = mask.reshape(-1).numpy()
-            self._returns[which] = 0
-            seen, _ = self._vector.reset(options={"reset_mask": which})
+        options = None if mask is None else {"reset_mask": mask.reshape(-1).numpy()}
+        seen, _ = self._vector.reset(options=options)
         # Of these TorchRL takes over only the entries of the environments that are reset.
-        return self._batched(observation=seen, success=np.zeros(len(self._returns), np.bool_))
+        none = np.zeros(self._vector.num_envs, np.bool_)
+        return self._batched(seen, success=none, is_init=~none)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         space = self._vector.single_action_space
         actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
         seen, rewards, terminated, truncated, info = self._vector.step(actions)
-        self._returns += rewards
+        none = np.zeros_like(terminated)
         return self._batched(
-            observation=seen,
-            success=self._succeeded(Steps(terminated, truncated, self._returns, info)),
+            seen,
+            success=info.get("success", none),
+            is_init=none,
             reward=(rewards * self._reward_scale).astype(np.float32),
             terminated=terminated,
             truncated=truncated,
             done=terminated | truncated,
         )
 
-    def _batched(self, **entries: NDArray[Any]) -> TensorDict:
+    def _batched(self, seen: Any, **entries: NDArray[Any]) -> TensorDict:
         """Entries [n, ...] of all environments, [*B, ...]; single numbers as [*B, 1]."""
+        observed = seen if isinstance(seen, dict) else {NUMBERS: seen}
         tensors = {
             key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
-            for key, entry in entries.items()
+            for key, entry in {**observed, **entries}.items()
         }
-        seen = tensors["observation"]
-        if seen.dtype != torch.uint8:
-            tensors["observation"] = seen.float()
+        for key in observed:
+            if tensors[key].dtype != torch.uint8:
+                tensors[key] = tensors[key].float()
         return TensorDict(tensors, self.batch_size)
 
     def _make_specs(self) -> None:
         batch = self.batch_size
-        seen, acts = checked_spaces(
-            self._vector.single_observation_space, self._vector.single_action_space
-        )
-        kind = torch.uint8 if seen.dtype == np.uint8 else torch.float32
+        acts = self._vector.single_action_space
+        boxes = boxes_of(cast(Seen, self._vector.single_observation_space))
         flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        observed = {
+            name: Unbounded(
+                (*batch, *box.shape),
+                dtype=torch.uint8 if box.dtype == np.uint8 else torch.float32,
+            )
+            for name, box in boxes.items()
+        }
         self.observation_spec = Composite(
-            observation=Unbounded((*batch, *seen.shape), dtype=kind), success=flag, shape=batch
+            **observed, success=flag, is_init=flag.clone(), shape=batch
         )
         if isinstance(acts, spaces.Discrete):
             self.action_spec = Categorical(int(acts.n), shape=batch)
+        elif isinstance(acts, spaces.MultiDiscrete):
+            options = torch.as_tensor(acts.nvec)
+            self.action_spec = MultiCategorical(options, (*batch, len(options)))
         else:
-            self.action_spec = Unbounded((*batch, *acts.shape))
+            self.action_spec = Unbounded((*batch, *(acts.shape or ())))
         self.reward_spec = Unbounded((*batch, 1))
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch)

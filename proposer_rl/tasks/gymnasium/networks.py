@@ -2,108 +2,184 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from proposer_rl.models import orthogonal_
+from proposer_rl.models import MemoryNetwork, orthogonal_
+from proposer_rl.models.stacked import StackedLinear
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
-
-Acts = spaces.Discrete | spaces.Box
+from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, channels_first
 
 SMALL_MAP = 8  # pixels along its shorter side at most: no more is halved
+LARGE_MAP = 36  # pixels along it, from which on the strides are those for screens
+# Kernel and stride of convolutions of screens (Mnih et al. 2015, "Human-level control through deep
+# reinforcement learning"); further ones are as the last.
+SCREEN = ((8, 4), (4, 2), (3, 1))
+WIDTHS, SCREEN_WIDTHS = (16, 32), (32, 64, 64)
 FIRST_LOG_SCALE = -0.5  # of the policy over continuous actions
 POLICY_GAIN = 0.01  # of the policy's last layer: the first policy is nearly uniform
+NEVER = -1e9  # logit of an action that there is not
 
 
 class SolverNetwork(nn.Module):
-    """Policy and critic: two MLPs, after convolutions that they share where images are seen.
+    """Policy and critic: two MLPs of numbers, and of images after convolutions that they share.
 
     Args:
-        seen: a box of numbers [D], or of images [H, W, C].
-        acts: one of n actions, or a box [D]: its policy is normal, with a scale that is learnt and
-            does not depend on what is seen.
+        seen: boxes of what is seen: numbers [D] or images of three axes.
+        acts: one of n actions, several of n each, or D numbers, whose policy is normal, with a
+            scale that is learnt and does not depend on what is seen.
         settings: widths, and the observations' scale.
     """
 
-    def __init__(self, seen: spaces.Box, acts: Acts, settings: NetworkSettings) -> None:
+    def __init__(self, seen: Seen, acts: Acts, settings: NetworkSettings) -> None:
         super().__init__()
-        self._scale = settings.scale or (1 / 255 if seen.dtype == np.uint8 else 1.0)
-        self._sides = len(seen.shape)
-        self.convolutions = nn.Sequential()
-        features = seen.shape
-        if self._sides == 3:
-            self.convolutions = _convolutions(seen.shape[2], min(seen.shape[:2]), settings.channels)
-            orthogonal_(self.convolutions)
-            features = self.convolutions(torch.zeros(1, seen.shape[2], *seen.shape[:2])).shape
-        outputs = actions(acts)
-        self.policy = _mlp(features[-1], outputs, settings.hidden, POLICY_GAIN)
-        self.critic = _mlp(features[-1], 1, settings.hidden, 1.0)
-        self.log_scale = None
-        if isinstance(acts, spaces.Box):
-            self.log_scale = nn.Parameter(torch.full((outputs,), FIRST_LOG_SCALE))
+        self.encoder = Encoder(seen, settings)
+        features = self.encoder.features
+        self.policy = _mlp(features, outputs(acts), settings.hidden, POLICY_GAIN)
+        self.critic = _mlp(features, 1, settings.hidden, 1.0)
+        self.actions = Actions(acts)
+        self.stackable = not self.encoder.convolutions
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Of observations [*B, ...] logits [*B, n], or [*B, D, 2], and values [*B, 1].
-
-        Those of continuous actions are locations and log-scales.
-        """
-        seen = observation.float() * self._scale
-        if self._sides == 3:
-            batch = seen.shape[:-3]
-            seen = self.convolutions(seen.flatten(0, -4).permute(0, 3, 1, 2)).unflatten(0, batch)
-        logits, value = self.policy(seen), self.critic(seen)
-        if self.log_scale is not None:
-            logits = torch.stack([logits, self.log_scale.expand_as(logits)], -1)
-        return logits, value
+    def forward(self, *observed: Tensor) -> tuple[Tensor, Tensor]:
+        """Of observations [*B, ...] logits as :class:`Actions` has them, and values [*B, 1]."""
+        features = self.encoder(*observed)
+        return self.actions(self.policy(features)), self.critic(features)
 
 
-def checked_spaces(seen: spaces.Space[Any], acts: spaces.Space[Any]) -> tuple[spaces.Box, Acts]:
-    """Spaces that there is a network for.
-
-    Raises:
-        ValueError: for others, saying what there is one for.
-    """
-    if not isinstance(seen, spaces.Box) or len(seen.shape) not in (1, 3):
-        raise ValueError(
-            f"observation space {seen}: there is a network for a Box of numbers [D] or of images "
-            "[H, W, C]; a wrapper can make it one, such as "
-            "task.wrappers=[gymnasium.wrappers.FlattenObservation]"
-        )
-    if isinstance(acts, spaces.Discrete):
-        return seen, acts
-    whole = not np.issubdtype(acts.dtype, np.floating)
-    if isinstance(acts, spaces.Box) and len(acts.shape) == 1 and not whole:
-        return seen, acts
-    raise ValueError(
-        f"action space {acts}: there is a policy for a Discrete one and for a Box [D] of floats; a "
-        "wrapper can make it one"
+def memory_network(seen: Seen, acts: Acts, settings: NetworkSettings) -> MemoryNetwork:
+    """The same with memory: numbers and images, then an LSTM, then one hidden layer each."""
+    assert settings.memory is not None
+    encoder = Encoder(seen, settings)
+    network = MemoryNetwork(
+        encoder,
+        encoder.features,
+        outputs(acts),
+        memory=settings.memory,
+        head=settings.hidden[-1],
     )
+    network.policy.append(Actions(acts))
+    return network
 
 
-def actions(acts: Acts) -> int:
-    """Number of actions to choose from, or of the parts of a continuous one."""
-    return int(acts.n) if isinstance(acts, spaces.Discrete) else acts.shape[0]
+class Encoder(nn.Module):
+    """Features of what is seen: numbers as they are, images through convolutions.
+
+    Args:
+        seen: as of :class:`SolverNetwork`.
+        settings: widths, and the observations' scale.
+
+    Attributes:
+        features: number F of features.
+    """
+
+    def __init__(self, seen: Seen, settings: NetworkSettings) -> None:
+        super().__init__()
+        boxes = boxes_of(seen).values()
+        self._scales = [
+            settings.scale or (1 / 255 if box.dtype == np.uint8 else 1.0) for box in boxes
+        ]
+        self.convolutions = nn.ModuleList()
+        self._first: list[bool | None] = []  # whether an image's channels are; None of numbers
+        self.features = 0
+        for box in boxes:
+            shape = box.shape
+            first = None
+            if len(shape) == 3:
+                first = settings.image == "CHW" if settings.image else channels_first(shape)
+                height, width, channels = (*shape[1:], shape[0]) if first else shape
+                layers = _convolutions(channels, min(height, width), settings.channels)
+                orthogonal_(layers)
+                self.convolutions.append(layers)
+                shape = tuple(layers(torch.zeros(1, channels, height, width)).shape[1:])
+            self._first.append(first)
+            self.features += shape[0]
+
+    def forward(self, *observed: Tensor) -> Tensor:
+        """Features [*B, F] of observations [*B, ...]."""
+        layers, parts = iter(self.convolutions), []
+        for seen, scale, first in zip(observed, self._scales, self._first, strict=True):
+            part = seen.float() * scale
+            if first is not None:
+                batch, images = part.shape[:-3], part.flatten(0, -4)
+                images = images if first else images.permute(0, 3, 1, 2)
+                part = next(layers)(images).unflatten(0, batch)
+            parts.append(part)
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
-def _convolutions(channels: int, side: int, widths: list[int]) -> nn.Sequential:
-    """3x3 convolutions; a large map is halved after each of them."""
+class Actions(nn.Module):
+    """A policy's numbers [*B, O] as logits.
+
+    Of one of n actions [*B, n]; of D choices among at most n each [*B, D, n]; of D numbers their
+    locations and log-scales [*B, D, 2].
+
+    Args:
+        acts: the actions.
+    """
+
+    def __init__(self, acts: Acts) -> None:
+        super().__init__()
+        self._choices = options(acts)
+        self._one = isinstance(acts, spaces.Discrete)
+        if self._choices is None:
+            self.log_scale = nn.Parameter(torch.full((outputs(acts),), FIRST_LOG_SCALE))
+
+    def forward(self, numbers: Tensor) -> Tensor:
+        """Logits of numbers."""
+        if self._choices is None:
+            between = [1] * (numbers.ndim - self.log_scale.ndim)
+            scale = self.log_scale.unflatten(-1, (*between, -1))  # [K, D] of stacked replicas
+            return torch.stack([numbers, scale.expand_as(numbers)], -1)
+        if self._one:
+            return numbers
+        most = max(self._choices)
+        parts = numbers.split(self._choices, -1)
+        return torch.stack([F.pad(p, (0, most - p.shape[-1]), value=NEVER) for p in parts], -2)
+
+
+def options(acts: Acts) -> list[int] | None:
+    """How many actions there are to choose from, of each choice; None of continuous ones."""
+    if isinstance(acts, spaces.Discrete):
+        return [int(acts.n)]
+    return acts.nvec.tolist() if isinstance(acts, spaces.MultiDiscrete) else None
+
+
+def outputs(acts: Acts) -> int:
+    """Numbers that a policy has to give."""
+    choices = options(acts)
+    return int(np.prod(acts.shape or ())) if choices is None else sum(choices)
+
+
+def _convolutions(channels: int, side: int, widths: Sequence[int] | None) -> nn.Sequential:
+    """Convolutions, as those of screens where a map is as large as one.
+
+    Else they are 3x3, with a stride of 2 as long as the map is not small.
+    """
+    screen = side >= LARGE_MAP
     layers: list[nn.Module] = []
-    for width in widths:
-        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
-        if side > SMALL_MAP:
-            layers.append(nn.MaxPool2d(2))
-            side //= 2
+    for index, width in enumerate(widths or (SCREEN_WIDTHS if screen else WIDTHS)):
+        if screen:
+            kernel, stride = SCREEN[min(index, len(SCREEN) - 1)]
+            layers.append(nn.Conv2d(channels, width, kernel, stride))
+        else:
+            stride = 2 if side > SMALL_MAP else 1
+            layers.append(nn.Conv2d(channels, width, 3, stride, padding=1))
+            side = -(-side // stride)
+        layers.append(nn.ReLU())
         channels = width
     return nn.Sequential(*layers, nn.Flatten())
 
 
 def _mlp(features: int, outputs: int, hidden: list[int], gain: float) -> MLP:
-    mlp = MLP(features, outputs, num_cells=hidden, activation_class=nn.Tanh)
+    mlp = MLP(
+        features, outputs, num_cells=hidden, activation_class=nn.Tanh, layer_class=StackedLinear
+    )
     orthogonal_(mlp)
     nn.init.orthogonal_(mlp[-1].weight, gain)
     return mlp

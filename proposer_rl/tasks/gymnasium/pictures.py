@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,15 +48,15 @@ class Camera:
     def __init__(
         self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
     ) -> None:
-        self._player = LevelPlayer(make, parameters, play)
-        self.works = MODE in self._player.metadata.get("render_modes", ())
-        if self.works:
+        try:
+            if MODE not in LevelPlayer(make, parameters, play).metadata["render_modes"]:
+                raise ValueError("it draws nothing")
             self._player = LevelPlayer(replace(make, render_mode=MODE), parameters, play)
             self._player.reset()
-            try:
-                self.works = self._player.render() is not None
-            except Exception:  # a package, a display, a driver: the numbers are shown instead
-                self.works = False
+            self._frame()
+            self.works = True
+        except Exception:  # a package, a display, a driver: the numbers are shown instead
+            self.works = False
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
@@ -67,8 +68,14 @@ class Camera:
         ]
 
     def _picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
-        if not self.works:
-            return written([f"{name} {value:.4g}" for name, value in play.values.items()])
+        if self.works:
+            try:
+                return self._drawn(play, actions)
+            except Exception:  # as above, of another level
+                self.works = False
+        return written([f"{name} {value:.4g}" for name, value in play.values.items()])
+
+    def _drawn(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
         self._player.play = play
         self._player.reset()
         frames = [self._frame()]
@@ -83,7 +90,10 @@ class Camera:
         return np.average(frames, 0, shares).astype(np.uint8)
 
     def _frame(self) -> NDArray[np.uint8]:
-        image = Image.fromarray(np.asarray(self._player.render(), np.uint8))
+        frame: Any = self._player.render()
+        if not (isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3):
+            raise TypeError("render must return bytes [H, W, 3]")
+        image = Image.fromarray(frame)
         image.thumbnail((LONGER_SIDE, LONGER_SIDE))
         return np.asarray(image)
 

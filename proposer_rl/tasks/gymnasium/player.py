@@ -4,22 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
-from numbers import Number
 from typing import Any, NamedTuple
 
 import gymnasium
-import numpy as np
-from gymnasium import spaces
-from gymnasium.wrappers import ClipAction, RescaleAction
+from gymnasium.wrappers import TimeLimit
 
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step, WrapperSettings
+from proposer_rl.tasks.gymnasium.spaces import plain
 
 
 class RefusedLevelError(ValueError):
     """The environment does not take a level; the message is one line."""
 
     exit_code = 2
+
+
+class WrapperError(ValueError):
+    """A wrapper cannot be put around an environment, or does not let it be what it is."""
+
+    exit_code = 2
+
+    def __init__(self, wrapper: WrapperSettings, error: Exception | str) -> None:
+        name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
+        super().__init__(f"wrappers: {name}: {error if isinstance(error, str) else told(error)}")
 
 
 @dataclass(frozen=True)
@@ -30,32 +41,49 @@ class MakeEnvironment:
         env_id: as :func:`gymnasium.make` takes it, ``module:name`` included.
         arguments: of its constructor.
         max_steps: after which an episode is truncated; None for the environment's own limit.
-        wrappers: dotted names of what is put around it, the innermost first.
+        wrappers: what is put around it, the innermost first: dotted names, or one with arguments.
         render_mode: None, or ``"rgb_array"``.
+        check: whether Gymnasium's own checker watches, and warns.
+        as_it_is: whether observations and actions are those of the environment; else those of
+            :func:`~proposer_rl.tasks.gymnasium.spaces.plain`.
     """
 
     env_id: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     max_steps: int | None = None
-    wrappers: Sequence[str] = ()
+    wrappers: Sequence[WrapperSettings] = ()
     render_mode: str | None = None
+    check: bool = False
+    as_it_is: bool = False
 
     def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """Make one with further arguments; actions of a bounded box go from -1 to 1."""
-        env = gymnasium.make(
-            self.env_id,
-            max_episode_steps=self.max_steps,
-            disable_env_checker=True,
-            render_mode=self.render_mode,
-            **{**self.arguments, **arguments},
+        """Make one with further arguments.
+
+        Raises:
+            WrapperError: if a wrapper cannot be put around it.
+        """
+        given = {**self.arguments, **arguments}
+        if self.render_mode is not None:  # which not every constructor takes
+            given["render_mode"] = self.render_mode
+        env: gymnasium.Env[Any, Any] = gymnasium.make(
+            self.env_id, max_episode_steps=-1, disable_env_checker=not self.check, **given
         )
+        limit = self.limit(env)
+        env = Answers(env, limit)
+        if limit is not None:
+            env = TimeLimit(env, limit)
         for wrapper in self.wrappers:
-            env = imported(wrapper)(env)
-        if isinstance(env.action_space, spaces.Box):
-            if env.action_space.is_bounded():
-                env = RescaleAction(env, np.float32(-1), np.float32(1))
-            env = ClipAction(env)
-        return env
+            try:
+                env = wrapper_of(wrapper)(env)
+            except Exception as error:
+                raise WrapperError(wrapper, error) from error
+        return env if self.as_it_is else plain(env)
+
+    def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
+        """Steps after which an episode is truncated; None for never."""
+        if self.max_steps is not None or env.unwrapped.spec is None:
+            return self.max_steps
+        return gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
 
 
 class Play(NamedTuple):
@@ -75,24 +103,35 @@ class Play(NamedTuple):
 class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment whose resets set up the level that it plays.
 
+    Of an info only ``success`` is handed on, where a step ended an episode that is one.
+
     Args:
         make: the environment.
         parameters: what differs between levels, by name.
         play: the first level.
+        success: whether a step ended an episode that is one; None where nobody asks.
+
+    Attributes:
+        told: the last info.
     """
 
     _seen: Any  # at last
 
     def __init__(
-        self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+        self,
+        make: MakeEnvironment,
+        parameters: Mapping[str, ParameterSettings],
+        play: Play,
+        success: Callable[[Step], bool] | None = None,
     ) -> None:
-        self._make = make
+        self._make, self._succeeded = make, success
         self._ways = {
             name: (settings.set, settings.name or name) for name, settings in parameters.items()
         }
         self._arguments = self._named("argument", play)
         super().__init__(self._built(play))
         self.play = play
+        self.told: Mapping[str, Any] = {}
 
     @property
     def play(self) -> Play:
@@ -110,21 +149,41 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._play.once and self._played:
             self._still = True
             return self._seen, {}
-        self._played = True
+        self._played, self._return = True, 0.0
         self._set_up()
-        options = self._named("option", self._play) or None
+        given = self._named("option", self._play)
         try:
-            self._seen, info = self.env.reset(seed=self._play.seed, options=options)
+            self._seen, self.told = self.env.reset(
+                seed=self._play.seed, **({"options": given} if given else {})
+            )
+        except UnfitEnvironmentError:
+            raise
         except Exception as error:
             raise self._refused(self._play, error) from error
-        return self._seen, info
+        return self._seen, {}
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step, unless it stands still."""
         if self._still:
             return self._seen, 0.0, False, False, {}
-        self._seen, *rest = self.env.step(action)
-        return self._seen, *rest
+        self._seen, reward, terminated, truncated, self.told = self.env.step(action)
+        self._return += float(reward)
+        succeeded = False
+        if self._succeeded is not None and (terminated or truncated):
+            in_time = self._answers.in_time
+            succeeded = self._succeeded(
+                Step(terminated, truncated, in_time, self._return, self.told)
+            )
+        info = {"success": True} if succeeded else {}
+        return self._seen, float(reward), terminated, truncated, info
+
+    def strays(self) -> str | None:
+        """What of the level is not in the environment any more, as a line; None where all is."""
+        for name, (how, path) in self._ways.items():
+            line = how == "attribute" and stray(self.unwrapped, path, self._play.values[name])
+            if line:
+                return f"parameters.{name}: {line}"
+        return None
 
     def _set_up(self) -> None:
         arguments = self._named("argument", self._play)
@@ -132,21 +191,28 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.env.close()
             self.env, self._arguments = self._built(self._play), arguments
         inner = self.env.unwrapped
-        for path, value in self._named("attribute", self._play).items():
-            set_attribute(inner, path, value)
-        for function, value in self._named("call", self._play).items():
-            try:
-                imported(function)(inner, value)
-            except Exception as error:
-                raise self._refused(self._play, error) from error
+        for name, (how, path) in self._ways.items():
+            value = self._play.values[name]
+            if how == "attribute":
+                try:
+                    write(inner, path, value)
+                except AttributeRefusedError as error:
+                    raise RefusedLevelError(f"parameters.{name}: {error}") from error
+            elif how == "call":
+                try:
+                    imported(path)(inner, value)
+                except Exception as error:
+                    raise self._refused(self._play, error) from error
 
     def _built(self, play: Play) -> gymnasium.Env[Any, Any]:
         try:
-            return self._make(**self._named("argument", play))
-        except (ImportError, gymnasium.error.Error):
+            env = self._make(**self._named("argument", play))
+        except (ImportError, gymnasium.error.Error, WrapperError):
             raise
         except Exception as error:
             raise self._refused(play, error) from error
+        self._answers = _answers(env)
+        return env
 
     def _named(self, way: str, play: Play) -> dict[str, float]:
         """The values that get into the environment in one way, by the names they have there."""
@@ -158,37 +224,26 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _refused(self, play: Play, error: Exception) -> RefusedLevelError:
         level = ", ".join(f"{name}={value:g}" for name, value in play.values.items())
-        reason = " ".join(str(error).split()) or "no reason given"
-        kind = type(error).__name__
-        return RefusedLevelError(f"{self._make.env_id} refuses {level}: {kind}: {reason}")
+        taken = f"refuses {level}" if level else "cannot be made or reset"
+        return RefusedLevelError(f"parameters: {self._make.env_id} {taken}: {told(error)}")
 
 
-def set_attribute(environment: Any, path: str, value: float) -> None:
-    """Set an attribute that an environment has.
+def _answers(env: Any) -> Answers:
+    while not isinstance(env, Answers):
+        env = env.env
+    return env
 
-    Args:
-        environment: without wrappers.
-        path: the attribute's name; dots lead to parts of the environment.
-        value: for it.
+
+def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
+    """What puts a wrapper around an environment.
 
     Raises:
-        RefusedLevelError: if there is no such attribute, listing the available ones.
+        ValueError: if there is no such thing.
     """
-    *parts, last = path.split(".")
-    place = environment
-    for part in parts:
-        place = getattr(place, part, None)
-    if not hasattr(place, last):
-        there = sorted(
-            name
-            for name, value in (*vars(type(environment)).items(), *vars(environment).items())
-            if isinstance(value, Number) and not isinstance(value, bool) and name[0] != "_"
-        )
-        raise RefusedLevelError(
-            f"{type(environment).__name__} has no attribute {path!r}; numbers that it has: "
-            f"{', '.join(there) or 'none'}"
-        )
-    setattr(place, last, value)
+    if isinstance(settings, str):
+        return imported(settings)
+    ((name, arguments),) = settings.items()
+    return partial(imported(name), **arguments)
 
 
 def imported(name: str | None) -> Callable[..., Any]:
@@ -207,3 +262,8 @@ def imported(name: str | None) -> Callable[..., Any]:
     if not callable(result):
         raise ValueError(f"{name!r}: must be something to call")
     return result
+
+
+def told(error: Exception) -> str:
+    """An exception of an environment's as part of a line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no reason given'}"

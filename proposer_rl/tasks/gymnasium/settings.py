@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
-import numpy as np
 import torch
-from annotated_types import Ge, Gt, Len
-from numpy.typing import NDArray
+from annotated_types import Ge, Gt, Le, Len
 
 from proposer_rl.settings import settings
-from proposer_rl.tasks.parameters import Bins, Number, intervals, points
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, flag
+from proposer_rl.tasks.parameters import MOST_BINS, Bins, Number, intervals, points
 
-Flags = NDArray[np.bool_]
+# The dotted name of a function or class, or that with its further arguments by name.
+WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
 Widths = list[Annotated[int, Ge(1)]]
 
 
@@ -28,8 +28,8 @@ class ParameterSettings:
         set: how it gets into the environment, before each reset: as an attribute, as an argument
             of the constructor (the environment is then built anew where it changes), as an option
             of the reset, or by a function that is called with the environment and the number.
-        name: of the attribute (dots lead to parts of the environment), argument, option or
-            function (which must be given); None for the parameter's own name.
+        name: of the attribute (dots lead to parts of the environment, numbers to elements),
+            argument, option or function (which must be given); None for the parameter's own name.
         values: rising; whole numbers, if all are.
         low, high, bins: of a range.
         target: what is to be mastered: a number; of ``values`` also several, equally likely; of a
@@ -38,10 +38,10 @@ class ParameterSettings:
 
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
     name: str | None = None
-    values: Annotated[list[Number], Len(1)] | None = None
+    values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
     low: float | None = None
     high: float | None = None
-    bins: Annotated[int, Ge(1)] | None = None
+    bins: Annotated[int, Ge(1), Le(MOST_BINS)] | None = None
     target: Number | Annotated[list[Number], Len(1)]
 
     def space_bins(self) -> Bins:
@@ -78,12 +78,21 @@ class ParameterSettings:
         return Bins(low.view(1), high.view(1))
 
 
-class Steps(NamedTuple):
-    """A step of n environments: how it ended, and the returns of the episodes so far, each [n]."""
+class Step(NamedTuple):
+    """The last step of an episode.
 
-    terminated: Flags
-    truncated: Flags
-    returns: NDArray[np.float64]
+    Attributes:
+        terminated: whether the environment ended it.
+        truncated: whether it was cut off.
+        in_time: whether the time limit had not been reached.
+        returns: the sum of its rewards.
+        info: what the environment told.
+    """
+
+    terminated: bool
+    truncated: bool
+    in_time: bool
+    returns: float
     info: Mapping[str, Any]
 
 
@@ -93,15 +102,17 @@ class SuccessSettings:
 
     Attributes:
         kind: ``return``: it has at least the return ``least``; ``survived``: the time limit ended
-            it; ``terminated``: the environment did, before; ``info``: an entry of the last step's
-            info is true.
+            it, and nothing else; ``terminated``: the environment did, before; ``info``: an entry of
+            the last step's info is true.
         least: the return.
-        key: the entry's name.
+        key: the entry's name; dots lead to entries of entries.
+        optional: whether the entry is told only where the episode is a success.
     """
 
     kind: Literal["return", "survived", "terminated", "info"]
     least: float | None = None
     key: str | None = None
+    optional: bool = False
 
     def check(self) -> None:
         """Refuse a kind that lacks what it needs, or has more.
@@ -115,19 +126,53 @@ class SuccessSettings:
             if given != (name == needed):
                 verb = "has no effect" if given else "missing"
                 raise ValueError(f"success.{name}: {verb} with success.kind={self.kind}")
+        if self.optional and self.kind != "info":
+            raise ValueError(f"success.optional: has no effect with success.kind={self.kind}")
 
-    def __call__(self, step: Steps) -> Flags:
-        """Whether a step ended an episode that is a success, [n]; an info's entry may be absent."""
-        over = step.terminated | step.truncated
+    def __call__(self, step: Step) -> bool:
+        """Whether an episode with this last step is a success.
+
+        Raises:
+            UnfitEnvironmentError: if its info says it in something else than a truth value.
+        """
         if self.kind == "return":
-            return over & (step.returns >= (self.least or 0.0))
+            return step.returns >= (self.least or 0.0)
         if self.kind == "survived":
-            return step.truncated & ~step.terminated
+            return not step.terminated and not step.in_time
         if self.kind == "terminated":
             return step.terminated
-        return over & np.asarray(step.info.get(self.key or "", np.zeros_like(over))).astype(
-            np.bool_
-        )
+        value = self._entry(step.info)
+        return value is not None and flag(value, f"success.key={self.key}: the entry of the info")
+
+    def check_told(self, info: Mapping[str, Any]) -> None:
+        """Refuse the last info of an episode that does not say whether that was a success.
+
+        Raises:
+            UnfitEnvironmentError: naming the key and the entries that there are.
+        """
+        if self.kind == "info" and not self.optional and self._entry(info) is None:
+            raise UnfitEnvironmentError(
+                f"success.key={self.key}: the last info of an episode has no such entry; it has: "
+                f"{', '.join(_entries(info)) or 'none'}; where only episodes that succeed have it, "
+                "set success.optional=true"
+            )
+
+    def _entry(self, info: Mapping[str, Any]) -> Any:
+        """The info's entry; None where it is absent."""
+        key, value = self.key or "", info
+        for part in [key] if key in info else key.split("."):
+            if not isinstance(value, Mapping) or part not in value:
+                return None
+            value = value[part]
+        return value
+
+
+def _entries(info: Mapping[str, Any], within: str = "") -> Iterator[str]:
+    """Names of an info's entries, also of those within others."""
+    for name, value in info.items():
+        yield f"{within}{name}"
+        if isinstance(value, Mapping):
+            yield from _entries(value, f"{within}{name}.")
 
 
 @settings
@@ -136,13 +181,18 @@ class NetworkSettings:
 
     Attributes:
         hidden: widths of the hidden layers, of the policy and of the critic.
-        channels: of the convolutions before them, for images [H, W, C].
+        channels: of the convolutions before them, for images; None for what their size asks for.
         scale: observations are multiplied with it; None for 1, and 1/255 of bytes.
+        image: order of an image's axes; None for what its shape tells.
+        memory: width of an LSTM between what is seen and the heads, which then have one hidden
+            layer, of the last width; None for no memory.
     """
 
-    hidden: Widths
-    channels: Widths
+    hidden: Annotated[Widths, Len(1)]
+    channels: Widths | None = None
     scale: Annotated[float, Gt(0)] | None = None
+    image: Literal["HWC", "CHW"] | None = None
+    memory: Annotated[int, Ge(1)] | None = None
 
 
 @settings

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from typing import Annotated, Any
@@ -13,31 +14,31 @@ import gymnasium
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
-from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from proposer_rl.extras import install_command
+from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import ComputeContext, Task
+from proposer_rl.task import ComputeContext, Task, distribution_of
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization, plays
-from proposer_rl.tasks.gymnasium.networks import Acts, SolverNetwork, checked_spaces
+from proposer_rl.tasks.gymnasium.networks import SolverNetwork, memory_network
 from proposer_rl.tasks.gymnasium.pictures import KEY, NO_FRAMES, Camera
-from proposer_rl.tasks.gymnasium.player import (
-    LevelPlayer,
-    MakeEnvironment,
-    Play,
-    RefusedLevelError,
-    imported,
-)
+from proposer_rl.tasks.gymnasium.player import MakeEnvironment, told
 from proposer_rl.tasks.gymnasium.settings import (
     EvaluationSettings,
     NetworkSettings,
     ParameterSettings,
     SuccessSettings,
+    WrapperSettings,
 )
+from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, spaces_of
+from proposer_rl.tasks.gymnasium.trial import tried
 from proposer_rl.tasks.parameters import SEED, ParameterSpace
 
 # Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
@@ -54,8 +55,8 @@ class GymnasiumTask(Task):
     Args:
         env_id: as :func:`gymnasium.make` takes it; ``module:name`` imports the module first.
         arguments: of the environment's constructor.
-        wrappers: dotted names of functions or classes that are put around each environment, the
-            innermost first.
+        wrappers: functions or classes that are put around each environment, the innermost first:
+            dotted names, or one with its further arguments.
         max_steps: after which an episode is truncated; None for the environment's own limit.
         parameters: what differs between levels, by name.
         success: when an episode is one.
@@ -67,6 +68,7 @@ class GymnasiumTask(Task):
         extra: of this package, that the environment needs; None for none.
         solver: the Solver's training.
         context: precision and cores.
+        transforms: TorchRL's, of the environments as one; of rewards, in training only.
 
     Raises:
         ValueError: naming the key, if there is no such environment or parameter, it refuses a value
@@ -80,7 +82,7 @@ class GymnasiumTask(Task):
         *,
         env_id: str,
         arguments: dict[str, Any],
-        wrappers: list[str],
+        wrappers: list[WrapperSettings],
         max_steps: Annotated[int, Ge(1)] | None,
         parameters: dict[str, ParameterSettings],
         success: SuccessSettings,
@@ -91,6 +93,7 @@ class GymnasiumTask(Task):
         extra: str | None,
         solver: SolverSettings,
         context: ComputeContext,
+        transforms: list[Any] | None = None,
     ) -> None:
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
@@ -100,7 +103,8 @@ class GymnasiumTask(Task):
         self._network = network
         self._evaluation = evaluation
         self._vectorization = vectorization
-        self._envs: dict[torch.Size, GymnasiumEnv] = {}
+        self._transforms = _checked_transforms(transforms or [])
+        self._envs: dict[torch.Size, EnvBase] = {}
         space, target = _spaces(parameters)
         super().__init__(
             distributions={"target": target, "all": space},
@@ -114,12 +118,15 @@ class GymnasiumTask(Task):
             greedy=evaluation.actions == "most_probable",
         )
         self.title = env_id
+        first = self.evaluated_on["target"][:1]
         with _named(env_id, extra):
-            self._seen, self._acts, self.max_steps = self._tried()
+            self.max_steps = tried(self._make, parameters, space.bins, plays(first)[0], success)
+        self._seen, self._acts = self._spaces(first)
         # MLPs as small as these are faster all at once.
-        self.batched = True if len(self._seen.shape) == 1 else None
+        small = all(len(box.shape) == 1 for box in boxes_of(self._seen).values())
+        self.batched = True if small and network.memory is None else None
         self._measured = {
-            "environment": [env_id, arguments, list(wrappers)],
+            "environment": [env_id, arguments, list(wrappers), [repr(t) for t in transforms or []]],
             "steps": self.max_steps,
             "parameters": {name: asdict(p) for name, p in parameters.items()},
             "success": asdict(success),
@@ -152,24 +159,35 @@ class GymnasiumTask(Task):
             f"{evaluation.actions.replace('_', ' ')} actions",
         }
 
-    def environment(self, levels: TensorDictBase) -> GymnasiumEnv:
+    def environment(self, levels: TensorDictBase) -> EnvBase:
         """Environments to be trained in."""
-        return self._env(levels, vectorization=self._vectorization)
+        return self._env(levels, self._transforms, vectorization=self._vectorization)
 
-    def evaluation_environment(self, levels: TensorDictBase) -> GymnasiumEnv:
+    def evaluation_environment(self, levels: TensorDictBase) -> EnvBase:
         """The same environments for the same number of levels, played once and one by one.
 
         Of the levels of evaluations a process each would be too many.
         """
         shape = levels.batch_size
         if shape not in self._envs:
-            self._envs[shape] = self._env(levels, once=True)
+            kept = [one for one in self._transforms if "reward" not in one.in_keys]
+            self._envs[shape] = self._env(levels, kept, once=True)
         self._envs[shape].set_levels(levels)
         return self._envs[shape]
 
-    def network(self) -> SolverNetwork:
+    def network(self) -> nn.Module:
         """The network of one Solver, by what the environment shows and takes."""
-        return SolverNetwork(self._seen, self._acts, self._network)
+        make = SolverNetwork if self._network.memory is None else memory_network
+        return make(self._seen, self._acts, self._network)
+
+    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
+        """K networks, with memory or without."""
+        seen, memory = list(boxes_of(self._seen)), self._network.memory
+        distribution = distribution_of(env.full_action_spec["action"])
+        if memory is not None:
+            return memory_actor_critic(population, seen, memory, distribution_class=distribution)
+        module = TensorDictModule(population, seen, ["logits", "state_value"])
+        return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def stream(self, use: str, name: str) -> torch.Generator:
         """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
@@ -196,8 +214,8 @@ class GymnasiumTask(Task):
         first = plays(self.evaluated_on["target"][:1])[0]
         return Camera(self._make, self._parameters, first)
 
-    def _env(self, levels: TensorDictBase, **how: Any) -> GymnasiumEnv:
-        return GymnasiumEnv(
+    def _env(self, levels: TensorDictBase, transforms: list[Transform], **how: Any) -> EnvBase:
+        env = GymnasiumEnv(
             levels,
             self._make,
             self._parameters,
@@ -205,42 +223,33 @@ class GymnasiumTask(Task):
             reward_scale=self.reward_scale,
             **how,
         )
+        return TransformedEnv(env, Compose(*map(deepcopy, transforms))) if transforms else env
 
-    def _tried(self) -> tuple[spaces.Box, Acts, int]:
-        """What the environment shows and takes, and its time limit.
+    def _spaces(self, level: TensorDictBase) -> tuple[Seen, Acts]:
+        """What Solvers see and do, after the transforms; the network is tried on them.
 
-        Each end of each parameter is tried, the others being as in the target.
+        Raises:
+            ValueError: naming the key, where there is no network for them.
         """
-        functions: list[tuple[str, str | None]] = [("wrappers", one) for one in self._make.wrappers]
-        for name, settings in self._parameters.items():
-            if settings.set == "call":
-                functions.append((f"parameters.{name}.name", settings.name))
-        for key, function in functions:
-            try:
-                imported(function)
-            except ValueError as error:
-                raise ValueError(f"{key}: {error}") from error
-        target = plays(self.evaluated_on["target"][:1])[0]
         try:
-            player = LevelPlayer(self._make, self._parameters, target)
-        except RefusedLevelError as error:
-            raise ValueError(f"arguments and parameters: {error}") from error
-        shown = player.observation_space, player.action_space
-        for name, bins in self.space.bins.items():
-            for value in (bins.low[0].item(), bins.high[-1].item()):
-                player.play = Play({**target.values, name: value}, target.seed)
-                player.reset()
-                now = player.observation_space, player.action_space
-                if now != shown:
-                    raise ValueError(
-                        f"parameters.{name}: all levels must show and take the same, but {value:g} "
-                        f"changes {shown} to {now}"
-                    )
-        limit = self._make.max_steps or (player.spec and player.spec.max_episode_steps)
-        if not limit:
-            raise ValueError("max_steps: missing: the environment has no time limit of its own")
-        player.close()
-        return *checked_spaces(player.observation_space, player.action_space), limit
+            env = self._env(level, self._transforms)
+            seen, acts = spaces_of(env.observation_spec[0], env.full_action_spec["action"][0])
+            env.close()
+            SolverNetwork(seen, acts, self._network)
+        except (RuntimeError, KeyError) as error:
+            kind = "transforms" if self._transforms else "network"
+            raise ValueError(f"{kind}: {told(error)}") from error
+        return seen, acts
+
+
+def _checked_transforms(transforms: list[Any]) -> list[Transform]:
+    for one in transforms:
+        if not isinstance(one, Transform):
+            raise ValueError(
+                f"transforms: must be transforms of TorchRL's, as {{_target_: "
+                f"torchrl.envs.StepCounter}}, not {one!r}"
+            )
+    return list(transforms)
 
 
 def _spaces(
@@ -270,11 +279,18 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
         how = f"install it with: {install_command(extra)}" if extra else "install it"
         reason = " ".join(str(error).split())
-        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason})") from error
+        module, colon, _ = env_id.partition(":")
+        own = ""
+        if colon and f"No module named {module!r}" in reason:
+            own = "; if it is your own module, name its folder, as in PYTHONPATH=. bin/train ..."
+        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason}){own}") from error
     except gymnasium.error.Error as error:
         raise ValueError(f"env_id={env_id}: {error}") from error
-    except RefusedLevelError as error:
-        raise ValueError(f"parameters: {error}") from error
+    except UnfitEnvironmentError as error:
+        line = str(error)
+        raise ValueError(
+            line if line.startswith("success.") else f"env_id={env_id}: {line}"
+        ) from error
 
 
 def _range(low: Tensor, high: Tensor) -> str:

@@ -20,7 +20,7 @@ from proposer_rl.settings import SolverSettings
 from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.edits import edit_levels
-from proposer_rl.tasks.mazes.level_files import shipped_levels, shipped_sets
+from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level
 from proposer_rl.tasks.mazes.rendering import level_records
 
@@ -260,6 +260,7 @@ class GridTask(Task):
                 levels = self.evaluation_levels(known)
             else:  # the same levels and names however it was spelt
                 size = [int(cells) for cells in asked.group(2, 3)]
+                check_size(f"--levels {name}", *size)
                 known = f"{known}@{size[0]}x{size[1]}"
                 grid = named(f"--levels {known}", self.make_distribution, kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))

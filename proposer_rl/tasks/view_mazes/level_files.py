@@ -17,6 +17,8 @@ from proposer_rl.runs.folder import read_bounded
 from proposer_rl.tasks.mazes.level_files import (
     LARGEST_FILE,
     RECORD,
+    check_count,
+    check_size,
     named_levels,
     read_levels,
 )
@@ -27,6 +29,7 @@ from proposer_rl.tasks.view_mazes.env import WALL as WALL_NUMBER
 from proposer_rl.tasks.view_mazes.levels import AGENTS, ViewLevel
 
 SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
+LARGEST_MODULE = 10**6  # bytes
 FLOOR, AGENT = 3, 10  # MiniGrid's numbers of further objects
 MARKS = {EMPTY: FREE, FLOOR: FREE, WALL_NUMBER: WALL, GOAL: GOAL_MARK}
 
@@ -71,6 +74,8 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
 def _assigned(content: bytes) -> dict[str, list[str]]:
     """Rows of the drawings that a module assigns to names."""
     try:
+        if len(content) > LARGEST_MODULE:
+            raise ValueError(f"is larger than {LARGEST_MODULE:,} bytes, for a module")
         body = ast.parse(content).body
     except (SyntaxError, RecursionError, MemoryError):
         raise ValueError("is no Python module") from None
@@ -107,6 +112,8 @@ def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
             "must be MiniGrid's encoding of grids, whole numbers [W, H, 3] or [n, W, H, 3], got "
             f"{array.dtype} {list(array.shape)}"
         )
+    check_count(array.shape[0] if array.ndim == 4 else 1)
+    check_size(path.stem, *array.shape[-3:-1])
     if array.ndim == 3:
         return {path.stem: list(_drawn(array, path.stem))}
     names = [f"{path.stem}_{number}" for number in range(len(array))]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Len
 
-from proposer_rl.settings import settings
+from proposer_rl.settings import BY_KIND, settings
 
 Walls = Annotated[int, Ge(0)]
 
@@ -53,7 +53,7 @@ class RoomsSettings:
     kind: Literal["four_rooms"] = "four_rooms"
 
 
-DistributionSettings = ScatteredSettings | PerfectSettings | RoomsSettings
+DistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
 
 
 @settings

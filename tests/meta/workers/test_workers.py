@@ -112,7 +112,9 @@ def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None
     solver = task.learner([Streams(0, "solver")])
     with (
         pytest.warns(RuntimeWarning, match="lost .it fell off.; it is replaced"),
-        pytest.raises(WorkersError, match="lost 3 times in one cycle, last: it fell off; the same"),
+        pytest.raises(
+            WorkersError, match="workers=2: were lost 3 times in one cycle, last: it fell off; the"
+        ),
     ):
         curriculum.improve(TaskStudent(task, solver), [Streams(0, "cycle", 0)])
     # Between two attempts a signal that has come with the loss is acted on.

@@ -15,7 +15,7 @@ from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.gymnasium.settings import Steps, SuccessSettings
+from proposer_rl.tasks.gymnasium.settings import Step, SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 
@@ -100,12 +100,12 @@ def test_a_level_becomes_what_a_player_plays() -> None:
     assert isinstance(play.values["begin"], int)
 
 
-STEPS = Steps(
-    terminated=np.array([True, False, True, False]),
-    truncated=np.array([False, True, True, False]),
-    returns=np.array([3.0, 5.0, 1.0, 9.0]),
-    info={"won": np.array([1, 0, 1, 1])},
-)
+STEPS = [  # ended by the environment, by the time limit, by both, cut off before
+    Step(True, False, True, 3.0, {"won": 1}),
+    Step(False, True, False, 5.0, {"won": 0}),
+    Step(True, True, False, 1.0, {"won": 1, "deep": {"er": True}}),
+    Step(False, True, True, 9.0, {}),
+]
 
 
 @pytest.mark.parametrize(
@@ -113,13 +113,13 @@ STEPS = Steps(
     [
         ({"kind": "terminated"}, [True, False, True, False]),
         ({"kind": "survived"}, [False, True, False, False]),
-        ({"kind": "return", "least": 3.0}, [True, True, False, False]),
+        ({"kind": "return", "least": 3.0}, [True, True, False, True]),
         ({"kind": "info", "key": "won"}, [True, False, True, False]),
-        ({"kind": "info", "key": "unheard of"}, [False, False, False, False]),
+        ({"kind": "info", "key": "deep.er"}, [False, False, True, False]),
     ],
 )
 def test_successes(settings: Any, expected: list[bool]) -> None:
-    assert SuccessSettings(**settings)(STEPS).tolist() == expected
+    assert [SuccessSettings(**settings)(step) for step in STEPS] == expected
 
 
 @pytest.mark.parametrize(
@@ -129,6 +129,7 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
         ({"kind": "info"}, "success.key: missing"),
         ({"kind": "survived", "least": 1.0}, "success.least: has no effect"),
         ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: has no effect"),
+        ({"kind": "survived", "optional": True}, "success.optional: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 
-from proposer_rl.models import Population, draw, normal
-from proposer_rl.tasks.gymnasium.networks import SolverNetwork, checked_spaces
+from proposer_rl.models import Population, draw, joint_categorical, normal
+from proposer_rl.tasks.gymnasium.networks import SolverNetwork
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
+from proposer_rl.tasks.gymnasium.spaces import boxes_of, plain
+from tests.tasks.gymnasium.odd import Mixed
 
 SETTINGS = NetworkSettings(hidden=[16, 8], channels=[4, 6])
 NUMBERS = spaces.Box(-1, 1, (5,))
@@ -75,16 +78,82 @@ def test_the_first_policies_are_wide() -> None:
     assert drawn.shape == (50, 2) and 0.4 < drawn.std() < 0.8
 
 
+def test_of_several_choices_none_is_drawn_that_there_is_not() -> None:
+    """Each has as many options as it has; together they are one action."""
+    acts = spaces.MultiDiscrete([2, 5, 3])
+    logits, _ = SolverNetwork(NUMBERS, acts, SETTINGS)(torch.rand(4000, 5))
+    distribution = joint_categorical(logits)
+    drawn = draw(distribution, torch.rand(4000, 3))
+    assert [set(column.tolist()) for column in drawn.T] == [{0, 1}, set(range(5)), {0, 1, 2}]
+    parts = [
+        torch.distributions.Categorical(logits=logits[:, i, :n]) for i, n in enumerate((2, 5, 3))
+    ]
+    torch.testing.assert_close(
+        distribution.log_prob(drawn), sum(p.log_prob(drawn[:, i]) for i, p in enumerate(parts))
+    )
+    torch.testing.assert_close(distribution.entropy(), sum(p.entropy() for p in parts))
+    distribution.entropy().sum().backward()
+
+
 @pytest.mark.parametrize(
-    ("seen", "acts", "message"),
+    ("shape", "setting", "channels"),
     [
-        (spaces.Discrete(16), FOUR, r"observation space Discrete\(16\): .*FlattenObservation"),
-        (spaces.Dict({"a": NUMBERS}), FOUR, "observation space Dict.*FlattenObservation"),
-        (spaces.Box(0, 1, (4, 4)), FOUR, "observation space Box"),
-        (NUMBERS, spaces.MultiBinary(3), "action space MultiBinary"),
-        (NUMBERS, spaces.Box(0, 1, (2, 2)), "action space Box"),
+        ((3, 20, 24), None, 3), ((20, 24, 3), None, 3), ((4, 84, 84), None, 4),
+        ((7, 7, 20), None, 20), ((84, 84, 1), None, 1), ((9, 9, 9), "CHW", 9),
+        ((5, 6, 7), "CHW", 5), ((5, 6, 7), "HWC", 7),
+    ],
+)  # fmt: skip
+def test_images_have_their_channels_where_they_are(shape: Any, setting: Any, channels: int) -> None:
+    """Where they are decides what a convolution reads: its numbers are those of the one beside."""
+    seen = spaces.Box(0, 255, shape, np.uint8)
+    settings = NetworkSettings(hidden=[8], channels=[4], image=setting)
+    network = SolverNetwork(seen, FOUR, settings)
+    first = network.encoder.convolutions[0][0]
+    assert first.in_channels == channels
+    image = torch.as_tensor(seen.sample())
+    moved = image if shape.index(channels) == 0 else image.movedim(-1, 0)
+    expected = network.encoder.convolutions[0](moved[None].float() / 255)
+    torch.testing.assert_close(network.encoder(image[None]), expected)
+
+
+def test_an_image_that_does_not_tell_its_channels_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"images \[9, 9, 9\].*network.image=HWC or CHW"):
+        SolverNetwork(spaces.Box(0, 255, (9, 9, 9), np.uint8), FOUR, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("space", "shapes"),
+    [
+        (spaces.Discrete(5, start=-2), {"observation": (5,)}),
+        (spaces.Box(0, 1, (3, 4)), {"observation": (12,)}),
+        (spaces.Box(0, 255, (20, 24), np.uint8), {"observation": (20, 24, 1)}),
+        (spaces.Box(0, 255, (4, 20, 24, 3), np.uint8), {"observation": (20, 24, 12)}),
+        (spaces.Box(0, 255, (4, 3, 20, 24), np.uint8), {"observation": (12, 20, 24)}),
+        (Mixed.observation_space, {"observation": (12,), "image camera": (3, 20, 24)}),
     ],
 )
-def test_other_spaces_are_refused(seen: Any, acts: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        checked_spaces(seen, acts)
+def test_what_is_seen_becomes_numbers_and_images(space: Any, shapes: Any) -> None:
+    """By Gymnasium's own flattening, and pixel by pixel."""
+    env: Any = gymnasium.make("Mixed-v0")
+    env.unwrapped.observation_space = space
+    made = plain(env)
+    boxes = boxes_of(cast(Any, made.observation_space))
+    assert {name: box.shape for name, box in boxes.items()} == shapes
+    seen = space.sample()
+    env.unwrapped.seen = lambda: seen
+    plainly = made.reset()[0]
+    assert made.observation_space.contains(plainly)
+    parts = plainly if isinstance(plainly, dict) else {"observation": plainly}
+    if "image camera" in parts:
+        rest = spaces.Dict({k: v for k, v in space.items() if k != "camera"})
+        flat = spaces.flatten(rest, {k: v for k, v in seen.items() if k != "camera"})
+        assert sorted(flat) == pytest.approx(sorted(parts["observation"]))
+        assert np.array_equal(parts["image camera"], seen["camera"])
+    elif space.dtype != np.uint8:
+        assert np.array_equal(parts["observation"], spaces.flatten(space, seen))
+    elif seen.ndim == 4 and seen.shape[1] == 3:
+        assert np.array_equal(parts["observation"][5], seen[1, 2])
+    elif seen.ndim == 4:
+        assert np.array_equal(parts["observation"][..., 5], seen[1, ..., 2])
+    else:
+        assert np.array_equal(parts["observation"][..., 0], seen)

@@ -154,7 +154,7 @@ def test_continuous_actions_go_from_minus_one_to_one() -> None:
         (
             {"lenght": ParameterSettings(values=[1], target=1)},
             {"lenght": 1},
-            "Walk has no attribute 'lenght'; numbers that it has: width, wind",
+            "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind",
         ),
         ({"width": argument()}, {"width": -1}, "refuses width=-1: ValueError: width must be"),
         ({"wdth": argument()}, {"wdth": 1}, "refuses wdth=1: TypeError: .* argument 'wdth'"),

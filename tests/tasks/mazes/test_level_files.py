@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -264,3 +265,44 @@ def test_a_line_that_is_no_record_is_named(line: str, tmp_path: Path) -> None:
     (tmp_path / "a.jsonl").write_text("")
     with pytest.raises(ValueError, match=r"a.jsonl: holds no levels"):
         read_levels(tmp_path / "a.jsonl")
+
+
+def serpentine(side: int) -> str:
+    """One way through all of it: every other row is a wall with a gap, at either end in turn."""
+    walls = ["#" * (side - 1) + ".", "." + "#" * (side - 1)]
+    rows = [walls[n // 2 % 2] if n % 2 else "." * side for n in range(side)]
+    return "\n".join(["S" + rows[0][1:], *rows[1:-1], rows[-1][:-1] + "G"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("S" + "." * 9_000_000 + "G", "level 'bad': 1x9,000,002 cells; at most 16,384 are read"),
+        ("S" + "." * 31_998 + "G", "level 'bad': 1x32,000 cells"),
+        (serpentine(400), "level 'bad': 400x400 cells"),
+        ("".join(f"[{i}]\nSG\n" for i in range(800_000)), "holds 800,000 levels; at most 10,000"),
+    ],
+    ids=["large", "long", "serpentine", "many"],
+)
+def test_what_would_take_minutes_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.txt").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_levels(tmp_path / "bad.txt")
+
+
+def test_ways_that_would_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(format_, "MOST_STEPS", 9 * 9 * 48)  # cells and moves of the first
+    first, both = f"[a]\n{serpentine(9)}\n", f"[a]\n{serpentine(9)}\n[b]\nSG\n"
+    assert list(levels_from_text(first)) == ["a"]
+    with pytest.raises(ValueError, match="level 'b': up to here, cells times moves of the"):
+        levels_from_text(both)
+    with pytest.raises(ValueError, match="holds 10,001 levels; at most 10,000 are read"):
+        levels_from_json(json.dumps({"levels": [{"name": "a"}] * 10_001}))
+
+
+def test_what_never_ends_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.txt")
+    (tmp_path / "zero.txt").symlink_to("/dev/zero")
+    for path in tmp_path.iterdir():
+        with pytest.raises(ValueError, match="is no plain file"):
+            read_levels(path)

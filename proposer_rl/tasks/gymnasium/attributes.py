@@ -1,0 +1,146 @@
+"""Numbers inside an environment, by dotted names: ``gravity``, ``model.opt.gravity.2``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from numbers import Number
+from typing import Any
+
+import numpy as np
+import torch
+
+
+class AttributeRefusedError(ValueError):
+    """An environment has no such number, or does not take it; the message is one line."""
+
+
+def read(environment: Any, path: str) -> Any:
+    """What stands at a path.
+
+    Args:
+        environment: without wrappers.
+        path: names of attributes, keys of mappings and indices, with dots in between.
+
+    Raises:
+        AttributeRefusedError: if there is nothing, listing the numbers that there are.
+    """
+    place = environment
+    for name in path.split("."):
+        try:
+            place = _part(place, name)
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise AttributeRefusedError(
+                f"{type(environment).__name__} has no attribute {path!r}; numbers that it has: "
+                f"{', '.join(_numbers(environment)) or 'none'}"
+            ) from error
+    return place
+
+
+def write(environment: Any, path: str, value: float) -> None:
+    """Put a number in the place of another, and see that it is there.
+
+    Args:
+        environment: without wrappers.
+        path: as of :func:`read`.
+        value: the number.
+
+    Raises:
+        AttributeRefusedError: if there is no number at the path, or it cannot be changed.
+    """
+    before = read(environment, path)
+    within, _, last = path.rpartition(".")
+    holder = read(environment, within) if within else environment
+    new = _alike(before, value, path)
+    try:
+        shadows = _shadows(holder, last)
+        _set_part(holder, last, new)
+    except Exception as error:  # a setter may raise anything
+        reason = " ".join(str(error).split())
+        raise AttributeRefusedError(
+            f"{path} of {type(environment).__name__} cannot be set to {value:g}: "
+            f"{type(error).__name__}: {reason}"
+        ) from error
+    if shadows and last in vars(holder):
+        delattr(holder, last)
+        raise AttributeRefusedError(
+            f"{type(holder).__name__} only passes {last!r} on from something inside it, which "
+            "would not see another value; name the path to it, as in name: env.gravity"
+        )
+    if (line := stray(environment, path, value)) is not None:
+        raise AttributeRefusedError(line)
+
+
+def stray(environment: Any, path: str, value: float) -> str | None:
+    """A line that says what stands at a path, where it is not this number; else None."""
+    now = read(environment, path)
+    try:
+        same = bool(np.isclose(float(now), value, rtol=1e-5))  # it may be kept in 32 bits
+    except (TypeError, ValueError):
+        same = False
+    return None if same else f"{path} of {type(environment).__name__} is {now}, not {value:g}"
+
+
+def _alike(before: Any, value: float, path: str) -> Any:
+    """A number as what it replaces: a truth value, a tensor without dimensions."""
+    shape = tuple(getattr(before, "shape", ()))
+    if isinstance(before, list | tuple):
+        shape = (len(before),)
+    if shape:
+        raise AttributeRefusedError(
+            f"{path} is no number but has the shape {list(shape)}; name one of its parts, as in "
+            f"name: {path}{'.0' * len(shape)}"
+        )
+    if isinstance(before, bool | np.bool_):
+        if value not in (0, 1):
+            raise AttributeRefusedError(f"{path} is true or false: 1 or 0, not {value:g}")
+        return bool(value)
+    if isinstance(before, torch.Tensor):
+        return torch.full_like(before, value)
+    if before is None or isinstance(before, Number | np.ndarray):
+        return value
+    raise AttributeRefusedError(f"{path} is no number but a {type(before).__name__}")
+
+
+def _part(holder: Any, name: str) -> Any:
+    if isinstance(holder, Mapping):
+        return holder[_key(holder, name)]
+    return holder[int(name)] if _is_index(name) else getattr(holder, name)
+
+
+def _set_part(holder: Any, name: str, value: Any) -> None:
+    if isinstance(holder, Mapping):
+        holder[_key(holder, name)] = value  # type: ignore[index]
+    elif _is_index(name):
+        holder[int(name)] = value
+    else:
+        setattr(holder, name, value)
+
+
+def _key(holder: Mapping[Any, Any], name: str) -> Any:
+    return int(name) if name not in holder and _is_index(name) else name
+
+
+def _is_index(name: str) -> bool:
+    return name.removeprefix("-").isdecimal()
+
+
+def _shadows(holder: Any, name: str) -> bool:
+    """Whether an attribute is none of the object's own: it looks it up elsewhere."""
+    if isinstance(holder, Mapping) or _is_index(name):
+        return False
+    try:
+        inspect.getattr_static(holder, name)
+    except AttributeError:
+        return hasattr(holder, "__dict__")
+    return False
+
+
+def _numbers(environment: Any) -> list[str]:
+    """Names of an environment's own numbers."""
+    found = {**vars(type(environment)), **getattr(environment, "__dict__", {})}
+    return sorted(
+        name
+        for name, value in found.items()
+        if isinstance(value, Number) and not isinstance(value, bool) and name[0] != "_"
+    )

@@ -1,0 +1,285 @@
+"""A trial of an environment before anything is trained: what it shows, takes, pays and tells."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
+
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
+    MakeEnvironment,
+    Play,
+    RefusedLevelError,
+    WrapperError,
+    imported,
+    told,
+    wrapper_of,
+)
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
+from proposer_rl.tasks.parameters import Bins
+
+SHORT = 64  # steps of an episode in which levels are compared
+RESETS = 3  # after which a level must still be there
+
+
+def tried(
+    make: MakeEnvironment,
+    parameters: Mapping[str, ParameterSettings],
+    bins: Mapping[str, Bins],
+    target: Play,
+    success: SuccessSettings,
+) -> int:
+    """Play a whole episode on a level of the target, and a short one at the ends of each parameter.
+
+    Args:
+        make: makes the environment.
+        parameters: what differs between levels, by name.
+        bins: of the parameters, whose ends are tried; the others are as in the target.
+        target: a level of the target.
+        success: when an episode is one.
+
+    Returns:
+        Steps of an episode at most.
+
+    Raises:
+        ValueError: in a line that names the key, for what cannot be imported, made, set or read, or
+            is not as the environment's spaces and Gymnasium's interface say.
+        ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
+    """
+    _check_functions(make, parameters)
+    _check_wrappers(make, parameters, target)
+    _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
+    player = LevelPlayer(make, parameters, target, success)
+    limit = make.limit(player)
+    if not limit:
+        raise ValueError("max_steps: missing: the environment has no time limit of its own")
+    _check_episode(player, success, limit)
+    for name, part in bins.items():
+        ends = [{**target.values, name: end} for end in (part.low[0].item(), part.high[-1].item())]
+        _check_ends(player, name, [Play(values, target.seed) for values in ends])
+    player.close()
+    return limit
+
+
+def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
+    functions: list[tuple[str, partial[Any]]] = [
+        ("wrappers", partial(wrapper_of, one)) for one in make.wrappers
+    ]
+    functions += [
+        (f"parameters.{name}.name", partial(imported, given.name))
+        for name, given in parameters.items()
+        if given.set == "call"
+    ]
+    for key, find in functions:
+        try:
+            find()
+        except ValueError as error:
+            raise ValueError(f"{key}: {error}") from error
+
+
+def _check_wrappers(
+    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+) -> None:
+    """Play the same twice, without wrappers and after each of them has been put around."""
+    for count in range(len(make.wrappers) + 1):
+        some = replace(make, wrappers=make.wrappers[:count], as_it_is=True)
+        try:
+            player = LevelPlayer(some, parameters, play)
+            _check_spaces(player)
+            first, second = (list(_played(player, SHORT)) for _ in range(2))
+            player.close()
+        except (ImportError, gymnasium.error.Error, WrapperError):
+            raise
+        except Exception as error:  # whatever an environment of somebody's may raise
+            if count:
+                raise WrapperError(make.wrappers[count - 1], error) from error
+            if isinstance(error, RefusedLevelError | UnfitEnvironmentError):
+                raise
+            raise UnfitEnvironmentError(f"it does not work: {told(error)}") from error
+        if _alike(first, second) and not hasattr(player.env, "update_running_mean"):
+            continue
+        if count:
+            raise WrapperError(
+                make.wrappers[count - 1],
+                "it keeps running statistics or the like, or draws numbers without the seed: the "
+                "same actions on the same level can end otherwise the second time",
+            )
+        warnings.warn(
+            f"{make.env_id}: the same actions on the same level end otherwise the second time: the "
+            "reset's seed does not decide all of it. No two measurements are quite comparable",
+            stacklevel=2,
+        )
+        return
+
+
+def _ask_gymnasium(
+    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+) -> None:
+    """Let Gymnasium's own checker see the beginning of an episode; it warns for the most part."""
+    try:
+        list(_played(LevelPlayer(make, parameters, play), 1))
+    except AssertionError as error:
+        raise UnfitEnvironmentError(told(error)) from error
+
+
+def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
+    """Play one episode to its end, which must tell whether it was a success."""
+    steps = list(_played(player, limit + 1))
+    success.check_told(player.told)
+    *_, last = steps
+    early = last.truncated and len(steps) < limit
+    if success.kind == "survived" and early:
+        warnings.warn(
+            f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
+            f"before the time limit of {limit}, which is no survival; if that is its own time "
+            "limit, set max_steps to it",
+            stacklevel=2,
+        )
+
+
+def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
+    """Set both ends of a parameter, see that they are there and stay, and that they matter."""
+    shown = player.observation_space, player.action_space
+    episodes: list[list[_Played]] = []
+    for play in ends:
+        for seed in range(RESETS):
+            player.play = play._replace(seed=play.seed + seed)
+            player.reset()
+            _refuse_strays(player, "after a reset")
+        player.play = play
+        episodes.append([])
+        for step in _played(player, SHORT):
+            if len(episodes[-1]) == 1:
+                _refuse_strays(player, "after a step")
+            episodes[-1].append(step)
+        now = player.observation_space, player.action_space
+        if now != shown:
+            raise ValueError(
+                f"parameters.{name}: all levels must show and take the same, but "
+                f"{play.values[name]:g} changes {shown} to {now}"
+            )
+    first, last = (play.values[name] for play in ends)
+    if first != last and _alike(*episodes):
+        warnings.warn(
+            f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
+            "same to the last digit; does it arrive?",
+            stacklevel=2,
+        )
+
+
+def _refuse_strays(player: LevelPlayer, when: str) -> None:
+    if (line := player.strays()) is not None:
+        raise ValueError(
+            f"{line}, {when}: the environment sets it by itself; set it in another way, such as "
+            "set: option or set: call"
+        )
+
+
+class _Played(NamedTuple):
+    seen: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
+    """The steps of an episode of random actions, the same ones every time, each one checked."""
+    numbers = np.random.default_rng(0)
+    player.action_space.seed(0)
+    seen, _ = player.reset()
+    _check_seen(player.observation_space, seen, "reset")
+    for _ in range(steps):
+        seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
+        _check_seen(player.observation_space, seen, "step")
+        if not np.isfinite(reward):
+            raise UnfitEnvironmentError(f"step pays a reward of {reward}: it must be finite")
+        yield _Played([np.array(part) for part in _arrays(seen)], reward, terminated, truncated)
+        if terminated or truncated:
+            return
+
+
+def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
+    """An action as a policy draws it at first; of a box that is no uniform one."""
+    if not isinstance(space, spaces.Box):
+        return space.sample()
+    drawn = numbers.normal(size=space.shape).clip(space.low, space.high)
+    return drawn.astype(space.dtype)
+
+
+def _check_spaces(player: LevelPlayer) -> None:
+    for space, check in (
+        (player.observation_space, check_observation_space),
+        (player.action_space, check_action_space),
+    ):
+        check(space)
+
+
+def _check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
+    """Refuse an observation that would be read as another than it is.
+
+    A number beyond its bounds is not: nothing here depends on them.
+    """
+    line = _unlike(space, seen)
+    if line is not None:
+        raise UnfitEnvironmentError(f"{by} shows {line}; its observation space is {space}")
+
+
+def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
+    if isinstance(space, spaces.Dict):
+        if not isinstance(seen, Mapping) or seen.keys() != space.spaces.keys():
+            return f"{_short(seen)} instead of the entries {', '.join(space.spaces)}"
+        return next(filter(None, (_unlike(s, seen[k]) for k, s in space.spaces.items())), None)
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(seen, tuple) or len(seen) != len(space.spaces):
+            return f"{_short(seen)} instead of a tuple of {len(space.spaces)}"
+        parts = zip(space.spaces, seen, strict=True)
+        return next(filter(None, (_unlike(s, one) for s, one in parts)), None)
+    if not isinstance(
+        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    ):
+        return None if space.contains(seen) else _short(seen)
+    try:
+        array = np.asarray(seen)
+    except ValueError:
+        return _short(seen)
+    if array.shape != space.shape:
+        return f"an observation of shape {list(array.shape)} instead of {list(space.shape or ())}"
+    if array.dtype.kind not in "biuf":
+        return f"{_short(seen)}, which are no numbers"
+    if not np.isfinite(array).all():
+        return "NaN or infinity"
+    if not np.array_equal(array.astype(space.dtype), array) and space.dtype.kind in "biu":
+        return f"{_short(array)} of {array.dtype}, which {space.dtype} cannot hold"
+    if isinstance(space, spaces.Box):
+        return None
+    one = array.item() if isinstance(space, spaces.Discrete) else array.astype(space.dtype)
+    return None if space.contains(one) else _short(seen)
+
+
+def _alike(one: list[_Played], other: list[_Played]) -> bool:
+    return len(one) == len(other) and all(
+        a[1:] == b[1:] and all(map(np.array_equal, a.seen, b.seen))
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def _arrays(seen: Any) -> Iterator[Any]:
+    if isinstance(seen, Mapping | tuple):
+        for part in seen.values() if isinstance(seen, Mapping) else seen:
+            yield from _arrays(part)
+    else:
+        yield seen
+
+
+def _short(seen: Any) -> str:
+    text = " ".join(str(seen).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,342 @@
+"""What an environment shows, takes, pays and tells is read as it is, or refused in a line."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.settings import (
+    NetworkSettings,
+    ParameterSettings,
+    SuccessSettings,
+)
+from tests.tasks.gymnasium.odd import (
+    LIMIT,
+    Line,
+    Robot,
+    odd,
+    rewarding,
+    showing,
+    telling,
+    with_parts,
+)
+from tests.tasks.gymnasium.toys import walk_task
+
+TOLD = SuccessSettings(kind="info", key="is_success")
+GOAL = {"goal": ParameterSettings(values=[1.0, 3.0], target=3.0)}
+ARRAY = np.array([True])
+
+
+def line_task(env_id: str, **changed: Any) -> Any:
+    return walk_task(**{"env_id": env_id, "parameters": GOAL, "success": TOLD, **changed})
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({"reset": lambda self, **o: Line.reset(self, **o)[0]}, "reset must return two values"),
+        ({"reset": lambda self, **o: (*Line.reset(self, **o), 1)}, "reset must return two values"),
+        ({"reset": lambda self: (None, {})}, "TypeError: .*unexpected keyword argument 'seed'"),
+        (
+            {"step": lambda self, a: (*Line.step(self, a)[:3], {})},
+            "step must return five values, .* a tuple of 4: ndarray, float, bool, dict",
+        ),
+        ({"step": rewarding(None)}, "the reward must be a number, not None"),
+        ({"step": rewarding("1.0")}, "the reward must be a number, not '1.0'"),
+        ({"step": rewarding(np.zeros(2))}, "the reward must be a number, not array"),
+        ({"step": rewarding(np.nan)}, "a reward of nan: it must be finite"),
+        ({"step": rewarding(-np.inf)}, "a reward of -inf: it must be finite"),
+        (
+            {"step": lambda self, a: (*Line.step(self, a)[:2], "no", False, {})},
+            "terminated must be true or false, not 'no'",
+        ),
+        (
+            {"seen": lambda self: np.zeros(3, np.float32)},
+            r"reset shows an observation of shape \[3\] instead of \[2\]",
+        ),
+        ({"seen": lambda self: np.array([np.nan, 0.0])}, "reset shows NaN or infinity"),
+        ({"seen": lambda self: ["a", "b"]}, "which are no numbers"),
+        ({"seen": lambda self: None}, "shape"),
+        (
+            showing(spaces.Box(0, 255, (2,), np.uint8), np.array([0.3, 0.7])),
+            r"\[0.3 0.7\] of float64, which uint8 cannot hold",
+        ),
+        (showing(spaces.Discrete(3), 3), "reset shows 3; its observation space is Discrete"),
+        (showing(spaces.Dict({"a": spaces.Discrete(3)}), {"b": 1}), "instead of the entries a"),
+        (
+            showing(spaces.Dict({"a": spaces.Text(3)}), {"a": "abc"}),
+            "no network for Text.*its part a; .*FilterObservation",
+        ),
+        ({"action_space": spaces.Text(3)}, "action space Text.*there is a policy for"),
+        (
+            {"action_space": spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,))))},
+            "action space Tuple.*there is a policy for",
+        ),
+        ({"step": telling(is_success="False")}, "success.key=is_success.*not 'False'"),
+        ({"step": telling(is_success=0.3)}, "success.key=is_success.*not 0.3"),
+        ({"step": telling(is_success=[True, False])}, "success.key=is_success.*not .True, False"),
+        ({"step": telling(is_sucess=True, a={"b": 1})}, "it has: is_sucess, a, a.b; "),
+        ({"metadata": None}, "env_id=Odd"),
+        ({"goal": property(lambda self: 3.0)}, "parameters.goal: goal of Odd cannot be set to"),
+        (
+            {"reset": lambda self, **o: (setattr(self, "goal", 2.0), Line.reset(self, **o))[1]},
+            "parameters.goal: goal of Odd is 2.0, not 1, after a reset",
+        ),
+        (
+            {"step": lambda self, a: (setattr(self, "goal", 2.0), Line.step(self, a))[1]},
+            "parameters.goal: goal of Odd is 2.0, not 1, after a step",
+        ),
+    ],
+)
+def test_what_would_be_misread_is_refused(members: dict[str, Any], message: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's own checker
+        with pytest.raises(ValueError, match=message) as caught:
+            line_task(odd(**members))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"step": rewarding(np.array([0.5], np.float32))},
+        {"step": rewarding(torch.tensor(0.5))},
+        {"step": telling(is_success=np.array([True]))},
+        {"step": telling(is_success=np.bool_(True))},
+        {"step": telling(is_success=1)},
+        {"step": telling(is_success=np.array(1.0))},
+        {"seen": lambda self: [self.x, 3]},
+        {"step": lambda self, a: (*Line.step(self, a)[:2], ARRAY, np.array(0), {"is_success": 1})},
+    ],
+)
+def test_one_number_in_another_dress_is_that_number(members: dict[str, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        task = line_task(odd(**members))
+    player = LevelPlayer(task._make, GOAL, Play({"goal": 3.0}, 0), TOLD)
+    player.reset()
+    steps = [player.step(1) for _ in range(LIMIT)]
+    reward, ended = steps[-1][1:3]
+    assert type(reward) is float and type(ended) is bool
+    assert any("success" in step[4] for step in steps)
+
+
+def test_a_nested_or_optional_entry_of_the_info_can_tell_success() -> None:
+    deep = line_task(odd(), success=SuccessSettings(kind="info", key="deep.won"))
+    assert deep.measure(deep.learner([Streams(0)]).agent)["target_success"] >= 0
+    only = {"step": lambda self, a: (*Line.step(self, a)[:4], {"won": 1} if self.x > 3 else {})}
+    with pytest.raises(ValueError, match="set success"):
+        line_task(odd(**only), success=SuccessSettings(kind="info", key="won"))
+    line_task(odd(**only), success=SuccessSettings(kind="info", key="won", optional=True))
+
+
+def test_survival_is_the_time_limit_and_nothing_else() -> None:
+    """An environment that cuts an episode off by itself has not let it survive."""
+    cut = odd(step=lambda self, a: (*Line.step(self, a)[:2], False, self.t >= 5, {}))
+    rule = SuccessSettings(kind="survived")
+    with pytest.warns(UserWarning, match="cut an episode off after 5 steps, before the time limit"):
+        task = line_task(cut, success=rule)
+    whole = line_task(odd(step=lambda self, a: (*Line.step(self, 0)[:4], {})), success=rule)
+    for made, survives in ((task, 0.0), (whole, 1.0)):
+        agent = made.learner([Streams(0)]).agent
+        assert made.measure(agent)["target_success"] == survives
+
+
+KINDS = odd(__init__=with_parts)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["gravity.2", "gravity.-1", "mass", "sizes.1", "config.wind.power", "on", "opt.gravity.2"],
+)
+def test_a_number_gets_to_where_its_path_leads(path: str) -> None:
+    environment = gymnasium.make(KINDS).unwrapped
+    kind = type(read(environment, path))
+    write(environment, path, 0.0)
+    assert float(read(environment, path)) == 0.0 and type(read(environment, path)) is kind
+    assert environment.gravity[:2].tolist() == [0.0, 0.0]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("gravity", r"has the shape \[3\]; name one of its parts, as in name: gravity.0"),
+        ("sizes", r"has the shape \[2\]"),
+        ("gravity.3", "has no attribute 'gravity.3'"),
+        ("config.wind.force", "has no attribute 'config.wind.force'; numbers that it has"),
+        ("config", "is no number but a dict"),
+        ("kind", "is no number but a str"),
+        ("step", "is no number but a method"),
+        ("on", "on is true or false: 1 or 0, not 0.5"),
+        ("counts.0", "is 0, not 0.5"),
+        ("pair.0", "cannot be set to 0.5: TypeError"),
+    ],
+)
+def test_what_cannot_hold_the_number_refuses_it(path: str, message: str) -> None:
+    with pytest.raises(AttributeRefusedError, match=message):
+        write(gymnasium.make(KINDS).unwrapped, path, 0.5)
+
+
+def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
+    environment: Any = gymnasium.make("PassesOn-v0").unwrapped
+    with pytest.raises(AttributeRefusedError, match="only passes 'drag' on"):
+        write(environment, "drag", 0.5)
+    write(environment, "inner.drag", 0.5)
+    assert environment.drag == 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrappers", "message"),
+    [
+        ([NormalizeObservation], "NormalizeObservation: it keeps running statistics"),
+        ([NormalizeReward], "NormalizeReward: it keeps running statistics"),
+        (["tests.tasks.gymnasium.odd.Unlike"], r"Unlike: .*shape \[3\] instead of \[2\]"),
+        ([gymnasium.wrappers.FilterObservation], "FilterObservation: TypeError: .*filter_keys"),
+    ],
+)
+def test_a_wrapper_that_spoils_it_is_blamed(wrappers: list[Any], message: str) -> None:
+    names = [
+        one if isinstance(one, str) else f"gymnasium.wrappers.{one.__name__}" for one in wrappers
+    ]
+    with pytest.raises(ValueError, match=f"wrappers: .*{message}"):
+        line_task(odd(), wrappers=["gymnasium.wrappers.RecordEpisodeStatistics", *names])
+
+
+def test_wrappers_that_begin_anew_with_each_episode_are_welcome() -> None:
+    stack: Any = {"gymnasium.wrappers.FrameStackObservation": {"stack_size": 3}}
+    named = ["TimeAwareObservation", "RecordEpisodeStatistics"]
+    task = line_task(odd(), wrappers=[*(f"gymnasium.wrappers.{name}" for name in named), stack])
+    env = task.learner([Streams(0)]).env
+    assert env.observation_spec["observation"].shape == (1, 4, 9)  # 3 times x, the goal, the time
+
+
+def test_a_parameter_that_changes_nothing_is_told() -> None:
+    ignored = ParameterSettings(set="option", values=[0, 1], target=0)
+    with pytest.warns(UserWarning, match="parameters.typo: .* does it arrive?"):
+        line_task(odd(), parameters={"typo": ignored})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        line_task(odd())
+
+
+def test_an_environment_that_the_seed_does_not_decide_is_told() -> None:
+    noisy = odd(seen=lambda self: np.array([np.random.normal(), self.goal], np.float32))
+    with pytest.warns(UserWarning, match="the reset's seed does not decide all of it"):
+        line_task(noisy)
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {
+            "metadata": {"render_modes": ["rgb_array"]},
+            "__init__": lambda self: Line.__init__(self),
+        },
+        {
+            "metadata": {"render_modes": ["rgb_array"]},
+            "render": lambda self: np.zeros((4, 4, 3)),
+        },
+        {"metadata": {"render_modes": ["rgb_array"]}, "render": lambda self: None},
+        {"metadata": {}},
+    ],
+)
+def test_without_pictures_it_trains_all_the_same(members: dict[str, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        task = line_task(odd(**members))
+    assert "no frames" in task.key and task.record(task.target.sample(1, torch.Generator()), None)
+
+
+def test_pictures_that_fail_later_become_numbers() -> None:
+    def render(self: Any) -> Any:
+        if self.goal == 1.0:
+            raise RuntimeError("no display any more")
+        return np.zeros((4, 4, 3), np.uint8)
+
+    task = line_task(odd(metadata={"render_modes": ["rgb_array"]}, render=render))
+    levels = task.space.generate(torch.tensor([[1, 0, 1]]), [Streams(0).generator()])[0]
+    first, failed, _ = task.record(levels, None)
+    assert first["picture"] != failed["picture"]
+
+
+def test_actions_arrive_as_they_were_meant() -> None:
+    """Bounded parts are scaled, half bounded ones clipped, unbounded ones stay as they are."""
+    player = LevelPlayer(MakeEnvironment("Robot-v0"), GOAL, Play({"goal": 3.0}, 0))
+    inner: Any = player.unwrapped
+    assert isinstance(inner, Robot) and isinstance(player.action_space, spaces.Box)
+    assert player.action_space.low.tolist() == [-1.0, -np.inf, -np.inf, -np.inf]
+    player.reset()
+    for action, taken in (
+        ([0.5, 0.5, 0.5, -3.0], [2.5, 0.5, 0.5, -3.0]),
+        ([2.0, -0.5, 0.0, 7.0], [4.0, 0.0, 0.0, 7.0]),
+    ):
+        player.step(np.array(action, np.float32))
+        assert np.concatenate([inner.taken[0], inner.taken[1][0]]).tolist() == taken
+        assert inner.action_space.contains(inner.taken)
+
+
+@pytest.mark.parametrize("memory", [None, 8])
+@pytest.mark.parametrize("env_id", ["Grey-v0", "Mixed-v0", "Robot-v0"])
+def test_of_all_spaces_it_learns_with_memory_and_without(env_id: str, memory: int | None) -> None:
+    network = NetworkSettings(hidden=[8], channels=[4], memory=memory)
+    task = line_task(f"tests.tasks.gymnasium.odd:{env_id}", network=network)
+    learner = task.learner([Streams(0), Streams(1)])
+    before = learner.snapshot()
+    levels = task.target.sample(8, Streams(0).generator()).reshape(2, 4)
+    learner.env.set_levels(levels)
+    learner.update([Streams(copy).generator() for copy in range(2)])
+    learner.check()
+    after = learner.snapshot()
+    assert not any((after[key] == before[key]).all() for key in ("parameters",) if key in after)
+    measured = task.measure(learner.agent)
+    assert measured.batch_size == (2,) and task.probe(learner.agent, levels[0]).shape[:2] == (2, 4)
+    alone = task.learner([Streams(0)])
+    assert alone.agent.distribution_class is learner.agent.distribution_class
+
+
+def test_memory_is_that_of_one_episode() -> None:
+    """What a Solver does at the beginning of an episode does not depend on the one before."""
+    network = NetworkSettings(hidden=[8], memory=8)
+    short = odd(step=lambda self, a: (*Line.step(self, a)[:2], self.t >= 3, False, {}))
+    task = line_task(short, network=network, success=SuccessSettings(kind="terminated"))
+    learner = task.learner([Streams(0)])
+    learner.env.set_levels(task.target.sample(4, Streams(0).generator()).unsqueeze(0))
+    rollout = learner.collect([Streams(1).generator()])
+    begins = rollout["is_init"].squeeze(-1)
+    assert begins[0, 0].tolist() == [True, False, False, True, False, False, True, False]
+    values = rollout["state_value"].squeeze(-1)
+    torch.testing.assert_close(values[..., 0], values[..., 3])
+    assert not torch.allclose(values[..., 0], values[..., 1])
+
+
+def test_transforms_change_what_is_seen_and_leave_measured_returns_alone() -> None:
+    from torchrl.envs import ObservationNorm, RewardScaling
+
+    norm = ObservationNorm(loc=1.0, scale=2.0, in_keys=["observation"])
+    paid = RewardScaling(loc=0.0, scale=100.0)
+    plainly, changed = line_task(odd()), line_task(odd(), transforms=[norm, paid])
+    levels = plainly.target.sample(4, Streams(0).generator()).unsqueeze(0)
+    first, second = (task.environment(levels).reset()["observation"] for task in (plainly, changed))
+    torch.testing.assert_close(second, 2 * first + 1)
+    action = torch.ones(1, 4, dtype=torch.int64)
+    for evaluated, factor in ((False, 100.0), (True, 1.0)):
+        paid_out = []
+        for task in (plainly, changed):
+            env = task.evaluation_environment(levels) if evaluated else task.environment(levels)
+            state = env.reset()
+            for _ in range(3):
+                state = env.step(state.set("action", action))["next"]
+                paid_out.append(state["reward"])
+        torch.testing.assert_close(sum(paid_out[3:]), factor * sum(paid_out[:3]))
+    with pytest.raises(ValueError, match="transforms: must be transforms of TorchRL"):
+        line_task(odd(), transforms=["torchrl.envs.RewardScaling"])
