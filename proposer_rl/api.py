@@ -44,7 +44,15 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
-from proposer_rl.teaching import Items, LevelGenerator, Parameters, Teacher
+from proposer_rl.teaching import (
+    Items,
+    LevelGenerator,
+    LevelTransform,
+    Parameters,
+    TaughtEnv,
+    Teacher,
+    TeacherSampler,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,6 +73,7 @@ __all__ = [
     "Level",
     "LevelGenerator",
     "LevelSpec",
+    "LevelTransform",
     "MapEncoder",
     "MazeEnv",
     "Mixed",
@@ -90,7 +99,9 @@ __all__ = [
     "Student",
     "Task",
     "TaskStudent",
+    "TaughtEnv",
     "Teacher",
+    "TeacherSampler",
     "UNet",
     "curricula",
     "generate_levels",

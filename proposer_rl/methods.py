@@ -22,6 +22,7 @@ from proposer_rl.curricula import (
     FirstOrderProposer,
     LearningProgressCurriculum,
     MixtureCurriculum,
+    Modelled,
     PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
@@ -53,6 +54,7 @@ from proposer_rl.settings import (
     ArgumentError,
     Count,
     FilterSettings,
+    ModelSettings,
     NotNegative,
     Positive,
     PPOSettings,
@@ -112,6 +114,23 @@ def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculu
         return curriculum
     scorer = Scorer(config.score, config.source, config.rollouts)
     return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
+
+
+def modelled(curriculum: Curriculum, task: Any, config: ModelSettings | None) -> Curriculum:
+    """A curriculum that asks a model of outcomes wherever it would ask about performance.
+
+    Args:
+        curriculum: any.
+        task: whose levels have the features, or a space of levels alone.
+        config: of the model; None to leave the curriculum as it is.
+
+    Raises:
+        ArgumentError: if the task's levels have no features.
+    """
+    if config is None:
+        return curriculum
+    task.features(task.space.sample(1, Streams(0).generator())[None])
+    return Modelled(curriculum, task.features, **asdict(config))
 
 
 def _takes_numbers_of(*makers: Any, given: str = "") -> Callable[[F], F]:

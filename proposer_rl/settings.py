@@ -449,6 +449,18 @@ class FilterSettings:
 
 
 @settings
+class ModelSettings:
+    """A model of outcomes that answers what curricula ask about performance.
+
+    The numbers are those of :class:`~proposer_rl.curricula.outcome_model.OutcomeModel`.
+    """
+
+    labels: Literal["success", "above_worst"] = "above_worst"
+    ridge: Annotated[float, Gt(0)] = 0.3
+    half_life: Annotated[float, Ge(1)] = 12.0
+
+
+@settings
 class LoggerSettings:
     """Where rows of metrics go besides the run's folder.
 

@@ -38,13 +38,14 @@ from proposer_rl.models import (
     normal,
 )
 from proposer_rl.runs.pictures import pixels, png, written
-from proposer_rl.settings import SolverSettings
+from proposer_rl.settings import ArgumentError, SolverSettings
 from proposer_rl.streams import Streams, each_from
 
 Levels = Any
 """A tensordict or tensorclass of levels."""
 
 SAMPLES = 6  # levels of each distribution that a reader is shown
+MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
 NAMED = 128  # levels of a distribution that are evaluated one by one
 
 
@@ -296,6 +297,14 @@ class Task(ABC):
         """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
         return nn.Linear(self._actions, features)
 
+    def features(self, levels: Levels) -> Tensor:
+        """What a model of outcomes knows of levels [K, n]: float [K, n, F], each about -1 to 1.
+
+        Here by where they lie in the space, which then needs ``locate(levels)``; a task may add
+        others.
+        """
+        return space_features(self.space, levels)
+
     @property
     def metrics(self) -> list[str]:
         """The names of what :meth:`measure` gives."""
@@ -531,6 +540,36 @@ class EditableTask(Protocol):
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
         """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+
+
+def space_features(space: Any, levels: Levels) -> Tensor:
+    """Features of levels by where they lie in a space, among the bins or beside them.
+
+    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
+    unless there are more than :data:`MANY_BINS`.
+
+    Args:
+        space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
+            coordinates of levels [*B]: float [*B, D].
+        levels: [*B].
+
+    Returns:
+        float64 [*B, 1 + 2 D + N] on the CPU.
+
+    Raises:
+        ArgumentError: if the space cannot locate levels.
+    """
+    if not hasattr(space, "locate"):
+        raise ArgumentError(
+            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
+            "from which a model of outcomes tells them apart"
+        )
+    c, places = space.locate(levels).double().cpu(), space.coordinates.double()
+    parts = [torch.ones_like(c[..., :1]), c, c.square()]
+    if len(places) <= MANY_BINS:
+        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
+        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
+    return torch.cat(parts, -1)
 
 
 def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:

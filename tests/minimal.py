@@ -92,11 +92,11 @@ RUN = "runs"
 SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
 GYMNASIUM = [
     *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
-    "proposer.validation_levels=2", "proposer.probe_levels=2",
+    "solver.ppo.minibatches=2", "proposer.validation_levels=2", "proposer.probe_levels=2",
 ]  # fmt: skip
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
-FEW = [*SMOKE, "schedule.evaluate_every=6"]
+FEW = [*SMOKE, "schedule.evaluate_every=6", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
 
 
 def _trained(name: str, *arguments: str) -> list[str]:

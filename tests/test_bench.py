@@ -17,6 +17,7 @@ from research.benchmarks.__main__ import main
 from research.benchmarks.ceiling import convolutions
 from research.benchmarks.curricula import Training
 from research.benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
+from research.benchmarks.gymnasium import Trained, read_rows, write_rows
 from research.benchmarks.plain import PlainPPO, PlainUNet
 from research.benchmarks.plain_env import PlainMaze
 from research.benchmarks.profiling import kind_of
@@ -29,7 +30,7 @@ from research.timing import read_timing
 from tests.commands import call
 from tests.report.folders import write_run
 
-TRIED = Options(repeats=2, precision="fp32", size="tiny")
+TRIED = Options(repeats=1, precision="fp32", size="tiny")
 
 
 @pytest.fixture
@@ -40,7 +41,9 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
-def test_every_benchmark_measures_something(name: str) -> None:
+def test_every_benchmark_measures_something(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Real workers are started in tests/meta/workers; here the replicas stay in this process.
+    monkeypatch.setattr("research.benchmarks.placement._workers", lambda *_: [])
     result = measure(name, TRIED)
     for row in result.rows:
         assert row.what and row.against
@@ -96,6 +99,7 @@ def test_lists_the_benchmarks(bench, capsys) -> None:
         (["level"], "error: unknown benchmark 'level'; choose among: levels, "),
         (["levels", "--output", "nowhere/b.json"], "there is no folder nowhere"),
         (["levels", "--device", "abacus"], "error: --device abacus: "),
+        (["gymnasium", "--environments", "Pong-v5"], "Pong-v5: must be among CartPole-v1, Lunar"),
         (["levels", "--repeats", "0"], "must be a whole number of at least 1, got '0'"),
     ],
 )
@@ -106,8 +110,9 @@ def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> Non
 
 def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path) -> None:
     for method in ("domain_randomization", "perf_gain"):
-        assert train(f"+method={method}", "+scale=smoke", f"hydra.run.dir=runs/{method}") == 0
-    assert bench("curricula", "--runs", "runs", "--repeats", "3", "--threads", "1") == 0
+        few = ["+scale=smoke", "schedule.updates=1"]
+        assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0
+    assert bench("curricula", "--runs", "runs", "--repeats", "1", "--threads", "1") == 0
     assert "a Solver update of perf_gain, Smoke scale" in capsys.readouterr().out
     timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}
@@ -140,10 +145,26 @@ def test_runs_that_cannot_be_timed_get_one_line(bench, capsys, tmp_path: Path) -
         assert line.startswith("error: --runs: ") and message in line
 
 
+def test_what_was_trained_before_is_not_trained_again(tmp_path: Path) -> None:
+    file = tmp_path / "gymnasium.csv"
+    options = Options(size="tiny", seeds=[7, 8], rows=str(file))
+    rows = [
+        Trained(code, "CartPole-v1", seed, 500, cost, 400.0 + seed, 300.0)
+        for code, cost in (("proposer_rl", 2.0), ("stable_baselines3", 4.0))
+        for seed in (7, 8)
+    ]
+    write_rows(file, rows[:3])
+    result = measure("gymnasium", options)
+    assert read_rows(file)[:3] == rows[:3] and len(read_rows(file)) == 4
+    assert result.tables[0].lines[0][:6] == ["CartPole-v1", "proposer_rl", "2", "500", "407.5 ± 0.7", "407.0"]  # fmt: skip  # noqa: E501
+    write_rows(file, rows)
+    assert measure("gymnasium", options).rows[0].value.median == 0.5
+
+
 def test_long_benchmarks_run_on_request() -> None:
     assert "learning" not in selected([], full=True)
     assert "memory" in selected([], full=True)
-    assert not {"memory", "learning"} & set(selected([], full=False))
+    assert not {"memory", "learning", "gymnasium"} & set(selected([], full=False))
     assert selected(["learning"], full=False) == ["learning"]
     assert "gpu" in selected([], full=False, cuda=True)
     assert "gpu" not in selected([], full=True)

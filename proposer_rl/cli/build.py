@@ -18,7 +18,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
 from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Components, Workers, filtered
+from proposer_rl.methods import Components, Workers, filtered, modelled
 from proposer_rl.models import available_cores
 from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.folder import RunFolder
@@ -153,7 +153,8 @@ def _curriculum(
     if config.proposer.advance != "train":
         _check_cycle(config)
     with key("filter"):
-        return filtered(curriculum, config.filter)
+        curriculum = filtered(curriculum, config.filter)
+    return modelled(curriculum, task, config.model)
 
 
 def _check_cycle(config: RunConfig) -> None:

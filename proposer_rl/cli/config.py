@@ -28,6 +28,7 @@ from proposer_rl.settings import (
     FilterSettings,
     HandDesignedSettings,
     LoggerSettings,
+    ModelSettings,
     PoolSettings,
     ProposerSettings,
     ScheduleSettings,
@@ -92,6 +93,7 @@ class RunConfig:
     ablation: str
     curriculum: dict[str, Any]
     filter: FilterSettings | None
+    model: ModelSettings | None
     task: dict[str, Any]
     checkpoint: str | None
     seed: Annotated[int, Ge(0)]

@@ -15,6 +15,7 @@ GROUPS = {
     "+as=": "the numbers of another library, for methods that keep levels",
     "+score=": "where the scores of levels come from",
     "+filter=": "which of more levels are trained on",
+    "+source=": "what knows the Solver's performance",
     "+ablation=": "what is changed of a method",
     "+sweep=": "many runs",
 }

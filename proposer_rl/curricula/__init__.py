@@ -34,6 +34,7 @@ from proposer_rl.curricula.contract import (
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
 from proposer_rl.curricula.gaussians import MixtureCurriculum
 from proposer_rl.curricula.keys import level_keys
+from proposer_rl.curricula.modelled import Modelled
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer
 from proposer_rl.curricula.progress import LearningProgressCurriculum
@@ -60,6 +61,7 @@ __all__ = [
     "LearningProgressCurriculum",
     "Mixed",
     "MixtureCurriculum",
+    "Modelled",
     "PairedProposer",
     "ProblemProposer",
     "ProposerCurriculum",

@@ -18,7 +18,7 @@ from proposer_rl.settings import ArgumentError, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 
 
-class _Combinator(LearnedCurriculum):
+class Combinator(LearnedCurriculum):
     """What all of them do alike: everything is passed on to the parts.
 
     Args:
@@ -65,7 +65,7 @@ class _Combinator(LearnedCurriculum):
         return (part for part in self.parts if isinstance(part, LearnedCurriculum))
 
 
-class Filtered(_Combinator):
+class Filtered(Combinator):
     """Draws several times as many levels from a curriculum, and keeps some by their scores.
 
     The n levels that are kept are drawn one after another, none of them twice, each in proportion
@@ -117,7 +117,7 @@ class Filtered(_Combinator):
         self.parts[0].observe(student, batch, outcome)
 
 
-class Schedule(_Combinator):
+class Schedule(Combinator):
     """One curriculum after another, such as a hand-designed one.
 
     Its clock are its own batches, so that it needs no count of the student's updates.
@@ -170,7 +170,7 @@ class Schedule(_Combinator):
         return bisect_right(self._until, self._proposed)
 
 
-class Mixed(_Combinator):
+class Mixed(Combinator):
     """Batches of which every curriculum has its share.
 
     Args:
@@ -232,7 +232,7 @@ class Mixed(_Combinator):
 
 
 def _mixes(curriculum: Curriculum) -> bool:
-    parts = curriculum.parts if isinstance(curriculum, _Combinator) else []
+    parts = curriculum.parts if isinstance(curriculum, Combinator) else []
     return isinstance(curriculum, Mixed) or any(map(_mixes, parts))
 
 

@@ -84,6 +84,19 @@ def gradient_norm(student: Student, levels: Levels, episodes: int) -> Tensor:
     return student.gradient_norms(levels)
 
 
+def spread(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """Variance of the return as a model tells it, in units in which the largest is a coin's, 1/4.
+
+    Raises:
+        NoSuccessError: if no model answers.
+    """
+    performance = student.exact_performance(levels)
+    if "spread" not in performance.keys():
+        raise NoSuccessError("spread: only a model tells it, as with +source=model")
+    variance = performance["spread"]
+    return variance / (4 * variance.amax(-1, keepdim=True)).clamp(min=torch.finfo().tiny)
+
+
 def _by_law(
     score: Callable[[EpisodeLaw, float, int], Tensor],
     student: Student,
@@ -96,6 +109,7 @@ def _by_law(
 EXACT = {
     "learnability": ExactScore(("exact_performance",), learnability),
     "regret": ExactScore(("optimal_return", "exact_performance"), regret),
+    "spread": ExactScore(("exact_performance",), spread),
     "gradient_norm": ExactScore(("gradient_norms",), gradient_norm),
     **{
         score.__name__: ExactScore(("episode_law",), partial(_by_law, score))

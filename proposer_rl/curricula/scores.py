@@ -21,6 +21,7 @@ max_mc                   mean of R - V(s_t)             its expectation
 learnability             p (1 - p) of the share p       p (1 - p)
 return_variance          that of the returns            that of the return
 regret                   R - mean return                J* - J
+spread                                                  return_variance by a model, scaled
 gradient_norm            the same of a policy gradient  squared norm of the gradient of J
 =======================  =============================  ====================================
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.probes import Measure, Probes
 from proposer_rl.curricula.student import Student
-from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.settings import ArgumentError, Count, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
@@ -44,6 +44,7 @@ class TransportCurriculum(BinCurriculum):
         every: batches between two scoring passes.
         probes: levels of each bin.
         measure: of performance, ``"success"`` or ``"return"``.
+        exploration: part of each batch that is drawn uniformly.
 
     Raises:
         ArgumentError: if there is not one share for each bin.
@@ -64,8 +65,10 @@ class TransportCurriculum(BinCurriculum):
         every: Count = 5,
         probes: Count = 16,
         measure: Measure = "success",
+        exploration: Share = 0.0,
     ) -> None:
         super().__init__(space, every=every)
+        self._exploration = exploration
         if target_shares.shape != (space.size,):
             raise ArgumentError(
                 f"target_shares={list(target_shares.shape)}: must be one for each of {space.size} "
@@ -103,7 +106,8 @@ class TransportCurriculum(BinCurriculum):
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
-        return self.scores["share"]
+        share = self.scores["share"]
+        return (1 - self._exploration) * share + self._exploration / share.shape[-1]
 
     def log(self) -> dict[str, Any]:
         """Besides, how many bins are allowed, and how far off the target is, in W2."""

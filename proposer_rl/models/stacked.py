@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
+from torch.nn.functional import linear
 
 
 class Call(NamedTuple):
@@ -34,6 +35,22 @@ class Call(NamedTuple):
         return tuple(output.float() for output in outputs)
 
 
+class StackedLinear(nn.Linear):
+    """A linear layer whose parameters may be stacked, [K, ...], for inputs [K, *B, features].
+
+    Networks of nothing but such layers say so by a true ``stackable``: all replicas are then
+    computed without ``vmap``, which costs as much as the arithmetic of a small network.
+    """
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """The layer's outputs, [*B, features] or [K, *B, features]."""
+        if self.weight.ndim == 2:
+            return linear(inputs, self.weight, self.bias)
+        rows = inputs.flatten(1, -2)
+        outputs = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
+        return outputs.unflatten(1, inputs.shape[1:-1])
+
+
 def apply_alone(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
@@ -46,6 +63,8 @@ def apply_batched(
     call: Call, stacked: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """All replicas in each kernel (convolutions become grouped ones): few launches, for a GPU."""
+    if getattr(call.network, "stackable", False):
+        return call(stacked, inputs)
     return vmap(lambda *member: call(*member))(tuple(stacked), tuple(inputs))
 
 

@@ -7,7 +7,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 Number = int | float
@@ -120,6 +120,11 @@ class ParameterSpace:
         lines = [_scaled(values) for values in self.axes.values()]
         return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
 
+    def locate(self, levels: TensorDictBase) -> Tensor:
+        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, D] on the CPU."""
+        lines = [_scaled(values, levels[name].cpu()) for name, values in self.axes.items()]
+        return torch.stack(lines, -1).float()
+
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""
         copies = [self._draw(own, g) for own, g in zip(choices, generators, strict=True)]
@@ -145,7 +150,8 @@ class ParameterSpace:
         return TensorDict(level, choices.shape)
 
 
-def _scaled(values: Sequence[Number]) -> Tensor:
-    points = torch.tensor(values, dtype=torch.float64)
-    reach = points[-1] - points[0]
-    return 2 * (points - points[0]) / reach - 1 if reach > 0 else 0 * points
+def _scaled(values: Sequence[Number], points: Tensor | None = None) -> Tensor:
+    """Points of an axis, by default its values, which go from -1 to 1."""
+    known = torch.tensor(values, dtype=torch.float64)
+    points, reach = known if points is None else points.double(), known[-1] - known[0]
+    return 2 * (points - known[0]) / reach - 1 if reach > 0 else 0 * points

@@ -10,11 +10,18 @@ from importlib import import_module
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
-from proposer_rl.methods import Components, filtered
+from proposer_rl.methods import Components, filtered, modelled
 from proposer_rl.recipes import Recipe, available, file_settings, recipe_function, yaml_file
-from proposer_rl.settings import ArgumentError, FilterSettings, ProposerSettings, arguments
+from proposer_rl.settings import (
+    ArgumentError,
+    FilterSettings,
+    ModelSettings,
+    ProposerSettings,
+    arguments,
+)
 
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # to another setting, as the files have them
+MODEL = "/source/model@_global_"  # likewise, a filter's file
 FILTER = re.compile(r"/filter/(\w+)@_global_")  # that a method's file asks for
 
 
@@ -45,13 +52,16 @@ def make_curriculum(
             f"curriculum={type(curriculum).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
+    on_model = False
     if isinstance(filter, str):
         if filter not in available("filter"):
             raise ArgumentError(f"filter={filter!r}: must be one of {available('filter')}")
+        on_model = MODEL in yaml_file(f"filter/{filter}").get("defaults", ())
         filter = file_settings("filter", filter) or None
     if filter is not None:
         arguments(FilterSettings, filter)
-    return filtered(curriculum, None if filter is None else FilterSettings(**filter))
+    curriculum = filtered(curriculum, None if filter is None else FilterSettings(**filter))
+    return modelled(curriculum, space, ModelSettings() if on_model else None)
 
 
 def _made(recipe: Recipe, space: Any, seeds: Sequence[int]) -> Curriculum:

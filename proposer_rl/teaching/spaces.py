@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import Distribution, Levels
+from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import Bins, ParameterSpace, intervals, points
 
 STEP = 0.1  # standard deviation of an edit, as a share of a range
@@ -47,6 +47,10 @@ class LevelSpace:
         if "target" not in self.distributions:
             raise ArgumentError("target: missing: this curriculum needs a target of the space")
         return self.distributions["target"]
+
+    def features(self, levels: Levels) -> Tensor:
+        """What a model of outcomes knows of levels: float [*B, F]."""
+        return space_features(self, levels)
 
     def given(self, levels: Levels) -> Any:
         """Levels [*B] as a loop gets them."""
@@ -235,6 +239,10 @@ class Items(LevelSpace):
         """The target as shares of the items, float [N]."""
         places: Any = self.target
         return places.places.bincount(minlength=self.size) / len(places.places)
+
+    def locate(self, levels: TensorDictBase) -> Tensor:
+        """Where items lie, float32 [*B, D]."""
+        return self.coordinates[levels["item"]]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """The items themselves."""

@@ -20,6 +20,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.making import make_curriculum
+from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import Segments
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tickets import OUT, RESULTS, TOLD, Block, Tickets, as_array
@@ -111,6 +112,7 @@ class Teacher:
         self._use(None, 0)
         self._segments = Segments()
         self._lock, self._process = RLock(), os.getpid()
+        self._server: TeacherServer | None = None
 
     @property
     def students(self) -> int:
@@ -275,6 +277,15 @@ class Teacher:
             blocks = {block.start: block for block in self._tickets.blocks}
             self._use(blocks.get(state["block"]), self._at)
             self._segments.load_state_dict(state["rollout"])
+
+    def client(self) -> TeacherClient:
+        """This teacher for another process, such as a worker of a collector.
+
+        It asks and tells as the teacher does, and can be sent there.
+        """
+        with self._here():
+            self._server = self._server or TeacherServer(self)
+            return self._server.client()
 
     def __reduce__(self) -> Any:
         raise TypeError(

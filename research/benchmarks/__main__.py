@@ -55,6 +55,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="with runs in them: curricula times their methods in whole cycles and their precision",
     )
+    parser.add_argument(
+        "--seeds",
+        type=number(int, 0),
+        nargs="+",
+        default=[100, 101, 102, 103, 104],
+        metavar="SEED",
+        help="of gymnasium; what is in gymnasium.csv beside the output is not trained again",
+    )
+    parser.add_argument(
+        "--environments", nargs="+", default=[], metavar="NAME", help="of gymnasium; default: all"
+    )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the paper's values throughout (longer)")
     size.add_argument("--tiny", action="store_true", help="only see that everything runs")

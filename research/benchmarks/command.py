@@ -18,6 +18,7 @@ from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.errors import SIGNALLED
 from proposer_rl.runs.folder import write_atomically
 from research.benchmarks.curricula import read_methods
+from research.benchmarks.gymnasium import ENVIRONMENTS
 from research.benchmarks.peer import require_jaxued
 from research.benchmarks.registry import BENCHMARKS, selected
 from research.benchmarks.report import describe, machine, summary, versions
@@ -111,8 +112,20 @@ def _options(arguments: argparse.Namespace) -> Options:
         _check_jaxued(arguments.jaxued, arguments.names, device)
     if arguments.runs:
         _check_runs(arguments.runs, arguments.names)
-    peers = (arguments.jaxued, arguments.runs)
-    return Options(arguments.repeats, arguments.precision, device, size, *peers)
+    unknown = [name for name in arguments.environments if name not in ENVIRONMENTS]
+    if unknown:
+        raise ConfigError(f"--environments {unknown[0]}: must be among {', '.join(ENVIRONMENTS)}")
+    return Options(
+        arguments.repeats,
+        arguments.precision,
+        device,
+        size,
+        arguments.jaxued,
+        arguments.runs,
+        arguments.seeds,
+        arguments.environments,
+        str(arguments.output.with_name("gymnasium.csv").absolute()),
+    )
 
 
 def _check_jaxued(python: str, names: list[str], device: str) -> None:

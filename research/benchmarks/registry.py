@@ -11,6 +11,7 @@ from research.benchmarks.curricula import update_seconds
 from research.benchmarks.environment import environment_steps
 from research.benchmarks.evaluation import exact_evaluation
 from research.benchmarks.gpu import gpu_targets
+from research.benchmarks.gymnasium import against_sb3
 from research.benchmarks.learning import learning_curves
 from research.benchmarks.levels import generation, shortest_paths
 from research.benchmarks.meta import memory, meta_step
@@ -54,6 +55,7 @@ BENCHMARKS = {
     "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
     "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),
     "learning": Benchmark("learning curves in bf16 and fp32 (minutes)", learning_curves, "request"),
+    "gymnasium": Benchmark("PPO against Stable-Baselines3's (an hour)", against_sb3, "request"),
 }
 
 

@@ -25,6 +25,9 @@ class Options:
         size: ``tiny`` to see that everything runs, ``full`` for the paper's values throughout.
         jaxued: an interpreter that has jaxued, to be measured beside our view maze; None for none.
         runs: folders of runs, whose methods are measured in place of those that one knows.
+        seeds: of what is trained in Gymnasium's environments.
+        environments: of these, by name; none for all.
+        rows: the table of what was trained there before; empty for none.
     """
 
     repeats: int = 5
@@ -33,6 +36,9 @@ class Options:
     size: Size = "normal"
     jaxued: str | None = None
     runs: Sequence[str] = ()
+    seeds: Sequence[int] = (100, 101, 102, 103, 104)
+    environments: Sequence[str] = ()
+    rows: str = ""
 
     @property
     def few(self) -> int:

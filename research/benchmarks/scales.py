@@ -41,7 +41,7 @@ class Scale:
     @property
     def config(self) -> RunConfig:
         """The settings, checked."""
-        return _composed(f"+method={self.method}", f"+scale={self.name}", *self.overrides)
+        return composed(f"+method={self.method}", f"+scale={self.name}", *self.overrides)
 
     @property
     def threads(self) -> int | None:
@@ -128,7 +128,8 @@ class Solvers:
 
 
 @cache
-def _composed(*overrides: str) -> RunConfig:
+def composed(*overrides: str) -> RunConfig:
+    """The settings of a command line, checked."""
     GlobalHydra.instance().clear()  # a command in the same process may have left its own
     with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
         return read_config(compose("train", list(overrides)))

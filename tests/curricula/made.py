@@ -15,6 +15,7 @@ from proposer_rl.curricula import (
     LearningProgressCurriculum,
     Mixed,
     MixtureCurriculum,
+    Modelled,
     PairedProposer,
     ProposerCurriculum,
     ReplayCurriculum,
@@ -112,6 +113,10 @@ def filtered(curriculum: Curriculum, source: Any = "exact", times: int = 3) -> F
     return Filtered(curriculum, Scorer("learnability", source, 2), times=times, temperature=0.05)
 
 
+def modelled(curriculum: Curriculum) -> Modelled:
+    return Modelled(curriculum, TASK.features, half_life=2.0)
+
+
 MADE: dict[str, Make] = {
     "uniform": lambda: SamplingCurriculum(SPACE),
     "filtered": lambda: filtered(SamplingCurriculum(SPACE)),
@@ -151,6 +156,14 @@ MADE: dict[str, Make] = {
     "filtered replay": lambda: filtered(replay(train_on_new=True)),
     "filtered alp_gmm": lambda: filtered(
         MixtureCurriculum(SPACE, warmup=8, refit=6, components=3), times=2
+    ),
+    "transport on a model": lambda: modelled(
+        filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2, exploration=0.1))
+    ),
+    "progress on a model": lambda: modelled(LearningProgressCurriculum(SPACE, probes=2)),
+    "edits on a model": lambda: modelled(replay("learnability", "exact", edits=3)),
+    "spread": lambda: modelled(
+        Filtered(SamplingCurriculum(SPACE), Scorer("spread", "exact"), times=3)
     ),
     "schedule": lambda: Schedule([SamplingCurriculum(SPACE), replay(train_on_new=True)], [2]),
     "filtered schedule": lambda: filtered(

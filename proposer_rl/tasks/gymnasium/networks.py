@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from torchrl.modules import MLP
 
 from proposer_rl.models import MemoryNetwork, orthogonal_
+from proposer_rl.models.stacked import StackedLinear
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
 from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, channels_first
 
@@ -43,6 +44,7 @@ class SolverNetwork(nn.Module):
         self.policy = _mlp(features, outputs(acts), settings.hidden, POLICY_GAIN)
         self.critic = _mlp(features, 1, settings.hidden, 1.0)
         self.actions = Actions(acts)
+        self.stackable = not self.encoder.convolutions
 
     def forward(self, *observed: Tensor) -> tuple[Tensor, Tensor]:
         """Of observations [*B, ...] logits as :class:`Actions` has them, and values [*B, 1]."""
@@ -131,7 +133,9 @@ class Actions(nn.Module):
     def forward(self, numbers: Tensor) -> Tensor:
         """Logits of numbers."""
         if self._choices is None:
-            return torch.stack([numbers, self.log_scale.expand_as(numbers)], -1)
+            between = [1] * (numbers.ndim - self.log_scale.ndim)
+            scale = self.log_scale.unflatten(-1, (*between, -1))  # [K, D] of stacked replicas
+            return torch.stack([numbers, scale.expand_as(numbers)], -1)
         if self._one:
             return numbers
         most = max(self._choices)
@@ -173,7 +177,9 @@ def _convolutions(channels: int, side: int, widths: Sequence[int] | None) -> nn.
 
 
 def _mlp(features: int, outputs: int, hidden: list[int], gain: float) -> MLP:
-    mlp = MLP(features, outputs, num_cells=hidden, activation_class=nn.Tanh)
+    mlp = MLP(
+        features, outputs, num_cells=hidden, activation_class=nn.Tanh, layer_class=StackedLinear
+    )
     orthogonal_(mlp)
     nn.init.orthogonal_(mlp[-1].weight, gain)
     return mlp

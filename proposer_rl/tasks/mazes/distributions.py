@@ -8,6 +8,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.generation import generate_levels
 from proposer_rl.tasks.mazes.levels import Level, LevelSpec
 from proposer_rl.tasks.mazes.randomness import Generators
@@ -147,6 +148,21 @@ class SpecificationSpace(LevelDistribution):
             *(self._scaled(torch.tensor(values), axis) for axis, values in self.axes.items())
         )
 
+    def locate(self, levels: Level) -> Tensor:
+        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, 2] on the CPU.
+
+        A goal that cannot be reached counts as far away as there are cells.
+        """
+        length = shortest_path_length(levels)
+        values = [
+            levels.walls.float().mean((-2, -1)),
+            length.where(length >= 0, self.height * self.width).float(),
+        ]
+        scaled = [
+            self._scaled(value.cpu(), axis) for value, axis in zip(values, self.axes, strict=True)
+        ]
+        return torch.stack(scaled, -1)
+
     def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
         """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
 
@@ -164,4 +180,4 @@ class SpecificationSpace(LevelDistribution):
         """Values along an axis, which goes from -1 to 1; 0 where it has a single value."""
         known = torch.tensor(self.axes[axis], dtype=torch.float32)
         middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        return (values - middle) / reach if reach > 0 else torch.zeros(len(values))
+        return (values - middle) / reach if reach > 0 else torch.zeros_like(values)

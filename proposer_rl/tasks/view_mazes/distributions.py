@@ -103,6 +103,17 @@ class ViewSpace:
         levels = [self._generate(self._values[index], draw) for index, draw in pairs]
         return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
 
+    def locate(self, levels: ViewLevel) -> Tensor:
+        """Where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
+
+        A goal that cannot be reached counts as far away as there are cells.
+        """
+        values = [levels.walls.flatten(-2).sum(-1)]
+        if "path length" in self.axes:
+            length = shortest_path_length(levels)
+            values.append(length.where(length >= 0, self._height * self._width))
+        return self._scaled(torch.stack(values, -1).cpu())
+
     def shares(self, levels: ViewLevel) -> Tensor:
         """Shares of the bins that are nearest to levels [n], float32 [N]; unsolvable ones are none.
 

@@ -24,7 +24,8 @@ LIMIT = 6
 TINY = [
     "compute.progress=false", "task.max_steps=12", "task.evaluation.levels=4",
     "solver.batch_size=4", "solver.ppo.horizon=12", "solver.ppo.epochs=2", "schedule.updates=4",
-    "proposer.rollouts=2", "proposer.meta_episode_length=2", "proposer.action_repeat=2",
+    "solver.ppo.minibatches=2", "proposer.rollouts=2", "proposer.meta_episode_length=2",
+    "proposer.action_repeat=2",
     "proposer.validation_levels=4", "proposer.probe_levels=2", "schedule.evaluate_every=2",
     "hand_designed.until=[2]", "pool.capacity=8", "pool.candidates=8", "pool.keep=4",
 ]  # fmt: skip

@@ -1,0 +1,158 @@
+"""Curricula without an oracle: a model of outcomes answers what they ask about performance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.combinators import Combinator
+from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, Inbox
+from proposer_rl.curricula.outcome_model import Labels, OutcomeModel
+from proposer_rl.curricula.student import ABILITIES, Student
+from proposer_rl.settings import Positive, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
+
+Features = Callable[[Levels], Tensor]
+"""What a model knows of levels [K, n] by themselves: float [K, n, F], each about -1 to 1."""
+
+ANSWERED = ("performance", "exact_performance")
+PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
+
+
+class Modelled(Combinator):
+    """A curriculum that asks a model of outcomes instead of the student how well it does.
+
+    Whatever the curriculum asks as ``performance`` or ``exact_performance``, by a scoring pass or a
+    filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
+    to what came of the levels that the student was trained on. That costs no frames, no
+    evaluations and no oracle. Beside the features of a level it knows what the student's critic
+    says of its first state, where there is a critic, which costs a reset.
+
+    Args:
+        curriculum: any.
+        features: of levels, such as ``task.features`` or a space's alone, see
+            :func:`~proposer_rl.task.space_features`.
+        labels, ridge, half_life: see the model.
+    """
+
+    remembers = ("_model", "_inbox", "_told")
+
+    @checked
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        features: Features,
+        *,
+        labels: Labels = "above_worst",
+        ridge: Positive = 0.3,
+        half_life: Positive = 12.0,
+    ) -> None:
+        super().__init__([curriculum])
+        self.needs = tuple(need for need in self.needs if need not in ANSWERED)
+        self._features, self._labels = features, labels
+        self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life, scaled=1)
+        self._inbox = Inbox()
+        self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """What the curriculum proposes to a student of whom the model speaks."""
+        self._take_in()
+        batch = self.parts[0].propose(_Answering(student, self._predict), count, streams)
+        phi = self._phi(student, batch.levels)
+        predicted = self._model.predict(phi)["success"]
+        return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Put the outcome aside for the model, and pass it on.
+
+        Raises:
+            ValueError: if the outcome tells no success and success is what is labelled.
+        """
+        self._inbox.check(batch, outcome)
+        if self._labels == "success" and "success" not in outcome.keys():
+            raise ValueError("labels=success: the outcome has no success; above_worst needs none")
+        reached = {
+            name: outcome[name].double() for name in ("return", "success") if name in outcome.keys()
+        }
+        self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
+        self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Improve the curriculum, by what the model says of the student."""
+        return super().improve(_Answering(student, self._predict), streams)
+
+    def log(self) -> dict[str, Any]:
+        """Besides, how right the model was about the levels that came back, before it saw them.
+
+        ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``,
+        that of one number for all; ``reliability``, for each tenth of the probabilities how many
+        were predicted there, their mean, and the mean of what it was; of each student.
+        """
+        self._take_in()
+        log = super().log()
+        if not self._told:
+            return log
+        predicted, label = (
+            torch.cat([told[name] for told in self._told], 1) for name in ("predicted", "label")
+        )
+        self._told = []
+        part = (predicted * PARTS).long().clamp(max=PARTS - 1)
+        sums = [
+            torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
+            for values in (torch.ones_like(label), predicted, label)
+        ]
+        means = [(total / sums[0].clamp(min=1)).tolist() for total in sums[1:]]
+        constant = (label - label.mean(1, keepdim=True)).square().mean(1)
+        return log | {
+            "brier": (predicted - label).square().mean(1).tolist(),
+            "brier_constant": constant.tolist(),
+            "reliability": {
+                "levels": sums[0].long().tolist(),
+                "predicted": means[0],
+                "reached": means[1],
+            },
+        }
+
+    def _take_in(self) -> None:
+        for evidence in self._inbox.take():
+            outcome = {name: evidence[name] for name in evidence.keys()}
+            label = self._model.labels(outcome)
+            self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
+            self._model.add(evidence["features"], outcome)
+
+    def _predict(self, student: Student, levels: Levels) -> TensorDict:
+        return self._model.predict(self._phi(student, levels))
+
+    def _phi(self, student: Student, levels: Levels) -> Tensor:
+        """Features of levels [K, n], and what the critic says of their first states, last."""
+        phi = self._features(levels).double().cpu()
+        value = torch.zeros(phi.shape[:2], dtype=phi.dtype)
+        if student.lacks("values") is None:
+            size = student.batch_size or levels.shape[1]
+            value = torch.cat([student.values(some) for some in levels.split(size, 1)], 1)
+        phi = torch.cat([phi, value.to(phi).unsqueeze(-1)], -1)
+        wrong = (~phi.isfinite()).sum()
+        if wrong:
+            raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
+        return phi
+
+
+class _Answering(Student):
+    """A student whose performance a model tells; all else it does itself."""
+
+    def __init__(self, student: Student, predict: Callable[[Student, Levels], TensorDict]) -> None:
+        own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
+        super().__init__(
+            gamma=student.gamma,
+            lmbda=student.lmbda,
+            batch_size=student.batch_size,
+            **{name: getattr(student, name) for name in own},
+            performance=lambda levels, generator: predict(student, levels),
+            exact_performance=lambda levels: predict(student, levels),
+        )
+        self.spend = student.spend  # type: ignore[method-assign]

@@ -1,0 +1,248 @@
+"""What students would reach on any level: regressions on what came of those they trained on.
+
+Every update ends with labelled data, levels and what came of them, that cost nothing more. Of the
+last batches' rows phi_i with outcomes y_i, where what is ``age`` batches old has the weight
+
+    w_i = 2 ** (-age_i / half_life),
+
+a logistic regression gives the probability of success. Since students get better, one of the
+features is -age_i / half_life, and 0 is what it is on the levels that are asked about: what was
+true on average a half-life ago is carried forward to the present. The regression minimises
+
+    sum_i w_i (log(1 + exp(z_i)) - y_i z_i) + ridge / 2 |beta|^2,    z_i = beta . phi_i.
+
+With H = sum_i w_i p_i (1 - p_i) phi_i phi_i' + ridge I, the curvature at the minimum, beta is about
+normal with the covariance H^-1 (Laplace's approximation), z of a level with s^2 = phi' H^-1 phi,
+and the expectation of 1 / (1 + exp(-z)) about
+
+    p = 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8)))
+
+(MacKay 1992, "The evidence framework applied to classification networks", Neural Computation 4):
+near one half where there are no data, whatever beta says.
+
+Mean and spread of the return come from linear regressions. With r_i the returns, brought to mean 0
+and deviation 1 by their weights,
+
+    minimise  sum_i w_i (r_i - a . phi_i)^2 + ridge |a|^2,
+    minimise  sum_i w_i ((r_i - a . phi_i)^2 - b . phi_i)^2 + ridge |b|^2,
+
+and the variance of a level's return is max(b . phi, 0), in units of the returns again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+Labels = Literal["success", "above_worst"]
+
+KEPT = 4  # half-lives, after which a batch is forgotten
+STEPS = 50  # of Newton's method, at most
+HALVINGS = 8  # of a step, at most, until it makes the loss no larger
+CLOSE = 1e-10  # coefficients that change no more than this are found
+EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
+
+
+class Logistic(NamedTuple):
+    """K logistic regressions, and how sure they are.
+
+    Attributes:
+        beta: coefficients, float64 [K, F].
+        covariance: of these, float64 [K, F, F].
+    """
+
+    beta: Tensor
+    covariance: Tensor
+
+
+def logistic_ridge(features: Tensor, labels: Tensor, weights: Tensor, ridge: float) -> Logistic:
+    """Fit K logistic regressions by Newton's method; all coefficients are penalised.
+
+    Args:
+        features: float64 [K, m, F].
+        labels: in [0, 1], float64 [K, m].
+        weights: of the rows, not negative, float64 [K, m].
+        ridge: above 0.
+    """
+    prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
+
+    def loss(beta: Tensor) -> Tensor:
+        z = _times(features, beta)
+        misfit = torch.nn.functional.softplus(z) - labels * z
+        return (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
+
+    def curvature(p: Tensor) -> Tensor:
+        return features.mT @ (features * (weights * p * (1 - p)).unsqueeze(-1)) + prior
+
+    beta = features.new_zeros(len(features), features.shape[-1])
+    for _ in range(STEPS):
+        p = _times(features, beta).sigmoid()
+        slope = _times(features.mT, weights * (p - labels)) + ridge * beta
+        step, now = torch.linalg.solve(curvature(p), slope), loss(beta)
+        for _ in range(HALVINGS):
+            step = torch.where((loss(beta - step) > now).unsqueeze(-1), step / 2, step)
+        beta = beta - step
+        if bool((step.abs() < CLOSE).all()):
+            break
+    return Logistic(beta, torch.linalg.inv(curvature(_times(features, beta).sigmoid())))
+
+
+def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
+    """Fit K linear regressions; all coefficients, float64 [K, F], are penalised.
+
+    Args:
+        features: float64 [K, m, F].
+        values: float64 [K, m].
+        weights: of the rows, not negative, float64 [K, m].
+        ridge: above 0.
+    """
+    weighted = features.mT * weights.unsqueeze(1)
+    prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
+    return torch.linalg.solve(weighted @ features + prior, _times(weighted, values))
+
+
+class OutcomeModel:
+    """What K students would reach on levels, by what came of the last batches.
+
+    Args:
+        labels: what the probability is of: ``"success"``, as outcomes tell it; or
+            ``"above_worst"``, a return above the lowest that there ever was. Where failures all
+            have the same return, the two are one. Where every step is rewarded, nearly every
+            episode is above the worst: no level is silent, and each teaches something.
+        ridge: on the coefficients.
+        half_life: batches after which a row counts half.
+        scaled: the last of the features, whose units nobody knows. They are brought to mean 0 and
+            deviation 1 over the rows; one that is constant there has no effect.
+    """
+
+    def __init__(
+        self,
+        *,
+        labels: Labels = "success",
+        ridge: float = 0.3,
+        half_life: float = 12.0,
+        scaled: int = 0,
+    ) -> None:
+        self._labels, self._ridge = labels, ridge
+        self._half_life, self._scaled = half_life, scaled
+        self._batches: list[dict[str, Tensor]] = []
+        self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
+        self._fitted: _Fitted | None = None
+
+    def add(self, features: Tensor, outcome: Mapping[str, Tensor]) -> None:
+        """Take in a batch.
+
+        Args:
+            features: float64 [K, m, F].
+            outcome: ``return`` and, where that is what is labelled, ``success``: float64 [K, m].
+        """
+        kept = {name: outcome[name] for name in ("return", "success") if name in outcome}
+        self._batches = [*self._batches, {"features": features, **kept}]
+        self._batches = self._batches[-round(KEPT * self._half_life) :]
+        self._worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
+        self._fitted = None
+
+    def predict(self, features: Tensor) -> TensorDict:
+        """What to expect on levels with features float64 [K, n, F]: a tensordict [K, n].
+
+        ``success``, ``return`` and ``spread``, the variance of the return, each float64. Before
+        there is any row they are 0.5, 0 and 0 everywhere.
+        """
+        shape = features.shape[:2]
+        if not self._batches:
+            same = {"success": 0.5, "return": 0.0, "spread": 0.0}
+            return TensorDict({k: features.new_full(shape, v) for k, v in same.items()}, shape)
+        self._fitted = fitted = self._fitted or self._fit()
+        phi = fitted.standard(features)
+        z = _times(phi, fitted.success.beta)
+        variance = ((phi @ fitted.success.covariance) * phi).sum(-1)
+        return TensorDict(
+            {
+                "success": (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid(),
+                "return": fitted.middle + fitted.unit * _times(phi, fitted.mean),
+                "spread": fitted.unit**2 * _times(phi, fitted.spread).clamp(min=0),
+            },
+            shape,
+        )
+
+    def labels(self, outcome: Mapping[str, Tensor]) -> Tensor:
+        """What an outcome [K, m] is to the model, in [0, 1]: float64 [K, m]."""
+        if self._labels == "success":
+            return outcome["success"]
+        worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
+        return (outcome["return"] > worst + EQUAL * (1 + worst.abs())).double()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rows, and the worst return."""
+        return {"batches": [dict(batch) for batch in self._batches], "worst": self._worst}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with them."""
+        self._batches = [dict(batch) for batch in state["batches"]]
+        self._worst, self._fitted = state["worst"], None
+
+    def _fit(self) -> _Fitted:
+        entries = {
+            name: torch.cat([batch[name] for batch in self._batches], 1)
+            for name in self._batches[0]
+        }
+        ages = torch.cat(
+            [
+                torch.full_like(batch["return"], age / self._half_life)
+                for age, batch in enumerate(reversed(self._batches))
+            ],
+            1,
+        ).flip(1)
+        weights = 0.5**ages
+        shift, scale = _moments(entries["features"], weights.unsqueeze(-1))
+        scale[scale == 0] = torch.inf
+        plain = slice(scale.shape[-1] - self._scaled)
+        shift[..., plain], scale[..., plain] = 0, 1
+        middle, unit = _moments(entries["return"], weights)
+        unit[unit == 0] = 1
+        phi = torch.cat([-ages.unsqueeze(-1), (entries["features"] - shift) / scale], -1)
+        returns = (entries["return"] - middle) / unit
+        mean = linear_ridge(phi, returns, weights, self._ridge)
+        residuals = (returns - _times(phi, mean)).square()
+        return _Fitted(
+            shift,
+            scale,
+            logistic_ridge(phi, self.labels(entries), weights, self._ridge),
+            middle,
+            unit,
+            mean,
+            linear_ridge(phi, residuals, weights, self._ridge),
+        )
+
+
+class _Fitted(NamedTuple):
+    """Regressions on standardised features and returns: [K, 1, F], [K, 1] and [K, F]."""
+
+    shift: Tensor
+    scale: Tensor
+    success: Logistic
+    middle: Tensor
+    unit: Tensor
+    mean: Tensor
+    spread: Tensor
+
+    def standard(self, features: Tensor) -> Tensor:
+        now = torch.zeros_like(features[..., :1])
+        return torch.cat([now, (features - self.shift) / self.scale], -1)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean and deviation, 0 where all is constant, along dimension 1, which stays."""
+    share = weights / weights.sum(1, keepdim=True)
+    mean = (share * values).sum(1, keepdim=True)
+    deviation = (share * (values - mean).square()).sum(1, keepdim=True).sqrt()
+    return mean, deviation.where(deviation > EQUAL * (1 + mean.abs()), 0.0)

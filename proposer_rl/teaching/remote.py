@@ -1,0 +1,96 @@
+"""One teacher, many processes: a thread beside it answers the clients that these have."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from contextlib import suppress
+from multiprocessing.connection import Client, Connection, Listener
+from threading import Lock, Thread
+from typing import Any
+
+CALLS = ("ask", "tell", "drop", "log")
+
+
+class TeacherClient:
+    """A teacher as another process has it; made by :meth:`Teacher.client`, and sent there.
+
+    In which order processes come is for them to say, so that runs with several of them do not
+    repeat each other.
+
+    Args:
+        address, key: of the thread that answers.
+        students: as of the teacher.
+        reads: the same.
+    """
+
+    def __init__(self, address: Any, key: bytes, students: int, reads: tuple[str, ...]) -> None:
+        self._address, self._key = address, key
+        self.students, self.reads = students, reads
+        self._connection: Connection | None = None
+        self._process = 0
+        self._lock = Lock()
+
+    def ask(self, n: int | None = None) -> tuple[Any, Any]:
+        """As :meth:`Teacher.ask`."""
+        return self._call("ask", n)
+
+    def tell(self, ids: Any, return_: Any, success: Any = None, **more: Any) -> None:
+        """As :meth:`Teacher.tell`."""
+        self._call("tell", ids, return_, success, **more)
+
+    def drop(self, ids: Any) -> None:
+        """As :meth:`Teacher.drop`."""
+        self._call("drop", ids)
+
+    def __reduce__(self) -> Any:
+        return TeacherClient, (self._address, self._key, self.students, self.reads)
+
+    def _call(self, name: str, *arguments: Any, **more: Any) -> Any:
+        with self._lock:
+            if self._connection is None or self._process != os.getpid():
+                self._connection = Client(self._address, authkey=self._key)
+                self._process = os.getpid()
+            try:
+                self._connection.send_bytes(pickle.dumps((name, arguments, more)))
+                result, error = pickle.loads(self._connection.recv_bytes())
+            except (EOFError, OSError) as lost:
+                raise RuntimeError("the process of the teacher has ended") from lost
+        if error is not None:
+            raise error
+        return result
+
+
+class TeacherServer:
+    """Answers clients from threads of this process.
+
+    Args:
+        teacher: that is asked and told.
+    """
+
+    def __init__(self, teacher: Any) -> None:
+        self._teacher, self._key = teacher, os.urandom(32)
+        self._listener = Listener(authkey=self._key)
+        Thread(target=self._accept, daemon=True).start()
+
+    def client(self) -> TeacherClient:
+        """Another client."""
+        teacher = self._teacher
+        return TeacherClient(self._listener.address, self._key, teacher.students, teacher.reads)
+
+    def _accept(self) -> None:
+        while True:
+            with suppress(EOFError, OSError):  # whoever knocks may be gone, or not know the key
+                connection = self._listener.accept()
+                Thread(target=self._answer, args=(connection,), daemon=True).start()
+
+    def _answer(self, connection: Connection) -> None:
+        with suppress(EOFError, OSError), connection:
+            while True:
+                name, arguments, more = pickle.loads(connection.recv_bytes())
+                answer: tuple[Any, Exception | None]
+                try:
+                    answer = getattr(self._teacher, name)(*arguments, **more), None
+                except Exception as error:
+                    answer = None, error
+                connection.send_bytes(pickle.dumps(answer))

@@ -1,0 +1,43 @@
+"""Stable-Baselines3: what a teacher has to tell, in the learner's own log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from numbers import Real
+from typing import Any
+
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+
+from proposer_rl.teaching.teacher import Teacher
+
+
+class TeacherCallback(BaseCallback):
+    """Records the curriculum's log after each rollout, as ``teacher/NAME``.
+
+    Of what it has of each student or bin the mean is recorded.
+
+    Args:
+        teacher: of the environments that the learner trains in.
+    """
+
+    def __init__(self, teacher: Teacher) -> None:
+        super().__init__()
+        self._teacher = teacher
+
+    def _on_rollout_end(self) -> None:
+        for name, value in self._teacher.log().items():
+            numbers = list(_numbers(value))
+            if numbers:
+                self.logger.record(f"teacher/{name}", float(torch.tensor(numbers).mean()))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, Real):
+        yield float(value)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _numbers(entry)

@@ -1,0 +1,204 @@
+"""Regressions on outcomes, against scikit-learn's, numbers that are known, and exact success."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from scipy.stats import spearmanr
+from sklearn.linear_model import LogisticRegression, Ridge
+from torch import Tensor
+
+from proposer_rl.curricula import outcome_of
+from proposer_rl.curricula.outcome_model import OutcomeModel, linear_ridge, logistic_ridge
+from proposer_rl.streams import Streams
+from tests.curricula.living import student
+from tests.tiny import TASK
+
+K, M, F = 3, 40, 5
+
+
+def rows(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Features [K, M, F], labels and weights [K, M]."""
+    g = torch.Generator().manual_seed(seed)
+    features = torch.randn(K, M, F, generator=g, dtype=torch.float64)
+    features[..., 0] = 1
+    chance = (features @ torch.linspace(-2, 2, F).double()).sigmoid()
+    labels = (torch.rand(K, M, generator=g) < chance).double()
+    return features, labels, torch.rand(K, M, generator=g, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("ridge", [0.01, 1.0, 30.0])
+def test_logistic_regressions_are_those_of_scikit_learn(ridge: float) -> None:
+    """With labels between 0 and 1, too: there a row is two rows."""
+    features, labels, weights = rows()
+    labels[0] = labels[0] * 0.8 + 0.1
+    found = logistic_ridge(features, labels, weights, ridge).beta
+    for k in range(K):
+        theirs = LogisticRegression(C=1 / ridge, fit_intercept=False, tol=1e-10, max_iter=10_000)
+        theirs.fit(
+            torch.cat([features[k], features[k]]).numpy(),
+            [1] * M + [0] * M,
+            sample_weight=torch.cat([weights[k] * labels[k], weights[k] * (1 - labels[k])]).numpy(),
+        )
+        torch.testing.assert_close(
+            found[k], torch.from_numpy(theirs.coef_[0]), atol=1e-5, rtol=1e-5
+        )
+
+
+def test_it_is_found_where_labels_are_all_alike_or_features_are_large() -> None:
+    """Newton's method by itself goes astray there: the slope must vanish all the same."""
+    features, labels, weights = rows()
+    labels[0], features[1] = 1, features[1] * 100
+    beta = logistic_ridge(features, labels, weights, 1e-3).beta
+    misses = weights * ((features @ beta.unsqueeze(-1)).squeeze(-1).sigmoid() - labels)
+    slope = (features.mT @ misses.unsqueeze(-1)).squeeze(-1) + 1e-3 * beta
+    assert slope.abs().max() < 1e-6
+
+
+def test_the_covariance_is_the_inverse_of_the_loss_curvature() -> None:
+    features, labels, weights = (entry[:1] for entry in rows())
+    fit = logistic_ridge(features, labels, weights, 0.5)
+
+    def loss(beta: Tensor) -> Tensor:
+        p = (features[0] @ beta).sigmoid()
+        entropy = labels[0] * p.log() + (1 - labels[0]) * (1 - p).log()
+        return -(weights[0] * entropy).sum() + 0.25 * beta.square().sum()
+
+    hessian = torch.autograd.functional.hessian(loss, fit.beta[0])
+    torch.testing.assert_close(fit.covariance[0] @ hessian, torch.eye(F).double())
+
+
+def test_linear_regressions_are_those_of_scikit_learn() -> None:
+    features, _, weights = rows()
+    values = (features.square() @ torch.ones(F).double()) + 3
+    found = linear_ridge(features, values, weights, 2.0)
+    for k in range(K):
+        theirs = Ridge(alpha=2.0, fit_intercept=False)
+        theirs.fit(features[k].numpy(), values[k].numpy(), sample_weight=weights[k].numpy())
+        torch.testing.assert_close(found[k], torch.from_numpy(theirs.coef_))
+
+
+def model_of(features: Tensor, labels: Tensor, **numbers: Any) -> OutcomeModel:
+    """With a batch for each row of labels [m]; a success is a return of 1."""
+    model = OutcomeModel(labels="success", **numbers)
+    for phi, label in zip(features, labels, strict=True):
+        model.add(phi.view(1, 1, -1), {"return": label.view(1, 1), "success": label.view(1, 1)})
+    return model
+
+
+def test_older_batches_count_less_and_the_oldest_are_forgotten() -> None:
+    """The regression of the last four half-lives, with the age; its expectation, by adding up."""
+    features, labels, _ = (entry[0] for entry in rows())
+    model = model_of(features, labels, half_life=6.0, ridge=1.0)
+    ages = torch.arange(23, -1, -1).double() / 6
+    phi = torch.cat([-ages.unsqueeze(-1), features[-24:]], -1)
+    fit = logistic_ridge(phi[None], labels[-24:][None], 0.5 ** ages[None], 1.0)
+    asked = torch.cat([torch.zeros(M, 1), features], -1)
+    z, deviation = asked @ fit.beta[0], ((asked @ fit.covariance[0]) * asked).sum(-1).sqrt()
+    noise = torch.linspace(-8, 8, 2001).double()
+    density = torch.exp(-noise.square() / 2) / math.sqrt(2 * math.pi) * 16 / 2000
+    draws = z.unsqueeze(-1) + deviation.unsqueeze(-1) * noise
+    found = model.predict(features[None])["success"][0]
+    torch.testing.assert_close(found, (draws.sigmoid() * density).sum(-1), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_few_outcomes_say_little(count: int) -> None:
+    """Fewer than features: success is near one half where nobody has been."""
+    phi = torch.eye(F).double()
+    model = model_of(phi[:count], torch.zeros(count).double())
+    told = model.predict(phi[None])
+    assert all(bool(entry.isfinite().all()) for entry in told.values())
+    torch.testing.assert_close(told["success"][0, count:], torch.full((F - count,), 0.5).double())
+    assert (told["success"][0, :count] < 0.5).all()
+
+
+def test_units_of_the_last_features_and_constant_ones_have_no_effect() -> None:
+    features, labels, _ = (entry[0] for entry in rows())
+    told = []
+    for scale, shift in ((1.0, 0.0), (1e4, -7.0)):
+        phi = torch.cat([features, (features[:, :1] * shift)], -1)
+        phi[:, 1:5] = phi[:, 1:5] * scale + shift
+        told.append(model_of(phi, labels, scaled=5).predict(phi[None]))
+    torch.testing.assert_close(told[0]["success"], told[1]["success"])
+
+
+def test_mean_and_spread_of_returns_are_found() -> None:
+    """A return of 40 + 10 x, give or take 5 (1 + x): the more rows, the nearer."""
+    g = torch.Generator().manual_seed(0)
+    off = []
+    for count in (20, 4000):
+        x = torch.rand(1, count, generator=g, dtype=torch.float64)
+        phi = torch.stack([torch.ones_like(x), x, x.square()], -1)
+        noise = torch.randn(x.shape, generator=g, dtype=torch.float64)
+        model = OutcomeModel(labels="above_worst")
+        model.add(phi, {"return": 40 + 10 * x + 5 * (1 + x) * noise})
+        at = torch.linspace(0.1, 0.9, 5).double()
+        told = model.predict(torch.stack([torch.ones_like(at), at, at.square()], -1)[None])
+        mean_off = (told["return"][0] - 40 - 10 * at).abs().max()
+        spread_off = (told["spread"][0] / (5 * (1 + at)) ** 2 - 1).abs().max()
+        off.append((float(mean_off), float(spread_off)))
+    assert off[1][0] < 0.7 and off[1][1] < 0.2
+    assert off[0] > off[1]
+
+
+def test_a_return_above_the_worst_is_a_success_where_all_failures_are_alike() -> None:
+    failed, solved = -0.15, torch.tensor([0.95, 0.9, 0.85])
+    returns = torch.cat([torch.full((2,), failed), solved]).double()[None]
+    success = (returns > 0).double()
+    model = OutcomeModel(labels="above_worst")
+    assert (model.labels({"return": returns}) == success).all()
+    model.add(torch.ones(1, 5, 1).double(), {"return": returns})
+    assert (model.labels({"return": returns[:, 2:]}) == 1).all()  # of all that is remembered
+
+
+def phi_of(x: Tensor) -> Tensor:
+    return torch.stack([torch.ones_like(x), x, x.square()], -1)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.08])
+def test_it_follows_a_learner_whose_success_moves(speed: float) -> None:
+    """A skill that grows, and levels of difficulties x in [-1, 1] that take it.
+
+    As near to the law as one logistic regression of the present law would be on ten batches, and
+    much nearer than one on the same rows that knows of no age.
+    """
+    g, at = torch.Generator().manual_seed(1), torch.linspace(-1, 1, 41).double()
+    model, seen, off, off_without_age, count = OutcomeModel(labels="success"), [], 0.0, 0.0, 0
+    for skill in torch.arange(-1, 1, speed).double():
+        law = lambda x, skill=skill: (6 * (skill - x)).sigmoid()  # noqa: E731
+        x = 2 * torch.rand(1, 32, generator=g, dtype=torch.float64) - 1
+        solved = (torch.rand(x.shape, generator=g) < law(x)).double()
+        model.add(phi_of(x), {"return": solved, "success": solved})
+        seen = [*seen, (phi_of(x), solved)][-48:]
+        phi, labels = (torch.cat(entries, 1) for entries in zip(*seen, strict=True))
+        age = torch.arange(len(seen) - 1, -1, -1).repeat_interleave(32).double() / 12
+        plain = logistic_ridge(phi, labels, 0.5 ** age[None], 0.3).beta[0]
+        off += float((model.predict(phi_of(at)[None])["success"][0] - law(at)).abs().mean())
+        off_without_age += float(((phi_of(at) @ plain).sigmoid() - law(at)).abs().mean())
+        count += 1
+    assert off / count < 0.05
+    assert off < off_without_age / 2
+
+
+def test_on_mazes_it_ranks_levels_by_their_exact_success_the_better_the_more_it_has_seen() -> None:
+    """A Solver that has not learnt, one episode on each level."""
+    solver, p = student(0), TASK.batch_size
+    asked = TASK.space.sample(256, Streams(0, "asked").generator())
+    exact = solver.exact_performance(asked)["success"][0].double()
+    model, ranks, squares = OutcomeModel(half_life=1e3), [], []
+    for batch in range(80):
+        levels = TASK.space.sample(p, Streams(0, batch).generator())[None]
+        rollout = solver.play(levels, [Streams(1, batch).generator()])
+        reached = outcome_of(rollout).select("return", "success").double()
+        model.add(TASK.features(levels), dict(reached.items()))
+        if batch in (0, 79):
+            told = model.predict(TASK.features(asked[None]))["success"][0]
+            ranks.append(spearmanr(told, exact).statistic)
+            squares.append(float((told - exact).square().mean()))
+    assert ranks[1] > max(ranks[0], 0.6)
+    assert squares[1] < 0.5 * squares[0]
+    assert squares[1] < float(exact.var())  # better than one number for all

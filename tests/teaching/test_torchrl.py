@@ -1,0 +1,160 @@
+"""Levels in TorchRL's collectors: each episode is one on the level that it began on."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import Compose, ParallelEnv, RewardScaling, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import RandomPolicy, check_env_specs
+
+import proposer_rl as prl
+from proposer_rl.settings import ArgumentError
+from tests.teaching.counting import ITEMS, Counting, LevelsEnv, check, length, set_level
+
+LEVELS = 4
+
+
+def taught(teacher: Any, count: int | None = LEVELS, **how: Any) -> TransformedEnv:
+    return TransformedEnv(LevelsEnv(count), prl.LevelTransform(teacher, set_level, **how))
+
+
+def collected(env: Any, steps: int, batches: int, **how: Any) -> list[Any]:
+    collector = Collector(
+        env,
+        RandomPolicy(LevelsEnv().action_spec),
+        frames_per_batch=LEVELS * steps,
+        total_frames=-1,
+        **how,
+    )
+    rollouts = [collector.rollout().clone() for _ in range(batches)]
+    collector.shutdown()
+    return rollouts
+
+
+@pytest.mark.parametrize("count", [LEVELS, None])
+def test_it_keeps_what_torchrl_asks_of_environments(count: int | None) -> None:
+    check_env_specs(taught(prl.Teacher(Counting(), ITEMS), count), break_when_any_done="both")
+
+
+@pytest.mark.parametrize("afresh", [True, False])
+@pytest.mark.parametrize("steps", [3, 8])
+def test_an_episode_goes_to_the_level_that_it_began_on(afresh: bool, steps: int) -> None:
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    rollouts = collected(taught(teacher), steps, 5, reset_at_each_iter=afresh)
+    teacher.log()
+    check(curriculum.seen)
+    ended = sum(int(rollout["next", "done"].sum()) for rollout in rollouts)
+    assert len(curriculum.seen) == ended > 4
+    for rollout in rollouts:  # the reward of a step is the number of its level
+        ids = rollout["level_id"].squeeze(-1)
+        assert (rollout["next", "reward"].squeeze(-1) == ids).all()
+        assert (rollout["next", "level_id"] == rollout["level_id"]).all()
+
+
+def test_levels_that_are_set_beside_a_collector_would_be_credited_wrongly() -> None:
+    """What the transform is for: by default a collector begins before the levels are set."""
+    env, wrong = LevelsEnv(), 0
+    collector = Collector(env, RandomPolicy(env.action_spec), frames_per_batch=24, total_frames=-1)
+    for update in range(1, 5):
+        levels = torch.arange(LEVELS) + LEVELS * update
+        env.set_levels(levels)
+        first = collector.rollout()["next", "reward"][:, 0, 0]
+        wrong += int((first != levels).sum())
+    collector.shutdown()
+    assert wrong > 8
+
+
+@pytest.mark.parametrize("afresh", [True, False])
+def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
+    """Whole episodes, also those that began in an earlier rollout."""
+    curriculum = Counting("rollout", "success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    env = taught(teacher, tell=False)
+    for rollout in collected(env, 3, 6, reset_at_each_iter=afresh):
+        teacher.observe(rollout)
+    check(curriculum.seen)
+    assert len(curriculum.rollouts) == len(curriculum.seen) > 4
+    for number, rollout in curriculum.rollouts.items():
+        steps = int(length(number))
+        assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
+        assert rollout["next", "done"].flatten().tolist() == [
+            step == steps - 1 for step in range(len(rollout))
+        ]
+
+
+def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    transforms = prl.LevelTransform(teacher, set_level), StepCounter(2), RewardScaling(0.0, 0.1)
+    rollouts = collected(TransformedEnv(LevelsEnv(), Compose(*transforms)), 4, 3)
+    teacher.log()
+    assert len(curriculum.seen) >= 8
+    for number, (total, _) in curriculum.seen.items():
+        assert total == 2 * number
+    assert rollouts[0]["level_id"].unique().numel() > LEVELS
+
+
+def test_environments_in_other_processes_have_one_teacher() -> None:
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    make = partial(taught, teacher.client(), None)
+    with pytest.raises(TypeError, match=r"give that process teacher\.client"):
+        ParallelEnv(2, partial(taught, teacher, None)).rollout(2)
+    env = ParallelEnv(2, make)
+    rollout = env.rollout(12, break_when_any_done=False)
+    env.close()
+    collector = MultiSyncCollector(
+        [partial(SerialEnv, 2, make)] * 2,
+        RandomPolicy(SerialEnv(2, make).action_spec),
+        frames_per_batch=48,
+        total_frames=48,
+    )
+    rollouts = [rollout, *(each.clone() for each in collector)]
+    collector.shutdown()
+    teacher.log()
+    check(curriculum.seen)
+    begun = [set(each["level_id"].unique().tolist()) for each in rollouts]
+    assert len(curriculum.seen) > 6 and not begun[0] & begun[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: taught(prl.Teacher("domain_randomization", ITEMS, students=2)), "teacher: of 2"),
+        (lambda: taught(prl.Teacher(Counting("rollout"), ITEMS)), "tell=True: this curriculum"),
+    ],
+)
+def test_what_cannot_be_taught_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        make()
+
+
+def test_success_is_asked_for() -> None:
+    class Silent(LevelsEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            del self.observation_spec["success"]
+
+        def _reset(self, *arguments: Any, **more: Any) -> Any:
+            return super()._reset(*arguments, **more).exclude("success")
+
+        def _step(self, tensordict: Any) -> Any:
+            return super()._step(tensordict).exclude("success")
+
+    def env(**how: Any) -> Any:
+        curriculum = Counting("success")
+        teacher = prl.Teacher(curriculum, ITEMS)
+        made = TransformedEnv(Silent(), prl.LevelTransform(teacher, set_level, **how))
+        made.rollout(8, break_when_any_done=False)
+        teacher.log()
+        return curriculum.seen
+
+    with pytest.raises(ArgumentError, match="success: missing: this curriculum reads it, and"):
+        env()
+    assert {success for _, success in env(success="terminated").values()} == {1.0}
+    assert {s for _, s in env(success=lambda after: ~after["terminated"]).values()} == {0.0}
