@@ -187,7 +187,19 @@ def saved_config(folder: Path) -> RunConfig:
     file = folder / "config.json"
     if not file.is_file():
         raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
-    values = stored_config(file)
+    return checked_config(stored_config(file), file)
+
+
+def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
+    """Settings as a run stored them; where it is computed is left to choice.
+
+    Args:
+        values: as read, such as those of a run of a study.
+        file: where they stand, for the error.
+
+    Raises:
+        ConfigError: if they are of another version.
+    """
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return _checked({**values, **free})
