@@ -7,7 +7,6 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -265,10 +264,9 @@ def check_packages(config: DictConfig) -> None:
     Raises:
         ConfigError: naming the file.
     """
-    top = {field.name for field in fields(RunConfig)}
     for group, name in HydraConfig.get().runtime.choices.items():
         below = config.get(group)
-        if not isinstance(below, DictConfig) or not top & {*below}:
+        if not isinstance(below, DictConfig) or group not in below:
             continue
         folders = (Path(source.path) for source in HydraConfig.get().runtime.config_sources)
         files = [folder / group / f"{name}.yaml" for folder in folders]
@@ -277,7 +275,7 @@ def check_packages(config: DictConfig) -> None:
         hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
         raise ConfigError(
             f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
-            f"become {group}.{next(map(str, below))} and so on{hidden if marked else ''}"
+            f"become {group}.{group} and so on{hidden if marked else ''}"
         )
 
 
