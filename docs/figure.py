@@ -8,7 +8,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pandas as pd
 from PIL import Image
-from scipy.stats import t
+
+from proposer_rl.report.statistics import median_of
 
 RESULTS = Path(__file__).parents[1] / "results" / "medium"
 # Method and label of its variant, text, colour.
@@ -24,7 +25,7 @@ SHOWN = [
 
 
 def main(results: Path = RESULTS) -> None:
-    """Draw success on the target, as mean and 95 % interval over seeds, to learning_curves.png."""
+    """Draw success on the target, as median and its interval over seeds, to learning_curves.png."""
     runs = pd.read_csv(results / "runs.csv.gz")[["run", "method", "ablation"]]
     metrics = pd.read_csv(results / "metrics.csv.gz").merge(runs, on="run")
     figure, axes = plt.subplots(figsize=(8, 3.6), layout="constrained")
@@ -32,11 +33,10 @@ def main(results: Path = RESULTS) -> None:
     for method, ablation, text, colour in SHOWN:
         own = metrics[(metrics["method"] == method) & (metrics["ablation"] == ablation)]
         seeds = own.pivot_table(index="updates", columns="seed", values="id_success")
-        mean, count = seeds.mean(axis=1), seeds.shape[1]
-        half = t.ppf(0.975, count - 1) * seeds.sem(axis=1)
-        axes.plot(mean.index, mean, color=colour, lw=2)
-        axes.fill_between(mean.index, mean - half, mean + half, color=colour, alpha=0.2, lw=0)
-        ends.append((mean.iloc[-1], text, colour))
+        median, low, high = median_of(seeds.T)
+        axes.plot(seeds.index, median, color=colour, lw=2)
+        axes.fill_between(seeds.index, low, high, color=colour, alpha=0.2, lw=0)
+        ends.append((median[-1], text, colour))
     place = 1.03
     for end, text, colour in sorted(ends, reverse=True):  # labels at the ends, without overlap
         place = min(end, place - 0.06)

@@ -9,6 +9,7 @@ NAMES = {
     "snr": "the signal-to-noise ratio of a Proposer's reward",
     "foresight": "how far ahead first-order gain predicts gains",
     "conditioning": "whether a Proposer conditions on the Solver",
+    "intervals": "how often intervals over few seeds hold what they are of",
     "pages": "the pages of a study: which curriculum to use, and which claims hold",
 }
 

@@ -28,7 +28,7 @@ from proposer_rl.report.comparisons import (
 )
 from proposer_rl.report.records import Record, numbers, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_interval, mean_of
+from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
 from proposer_rl.runs.columns import is_rate
@@ -259,7 +259,7 @@ def _gains(study: Study) -> Evidence | None:
         return None
     positive = [copies.max() > 0 for run in gains for copies in run]
     late = [np.mean([copies.mean() for copies in run[-max(len(run) // 4, 1) :]]) for run in gains]
-    interval, share = mean_interval(late), float(np.mean(positive))
+    interval, share = mean_of(late).interval(), float(np.mean(positive))
     text = (
         f"the maximum gain in return is positive in {sum(positive)} of {len(positive)} cycles; the "
         f"mean of the last quarter is {write(interval, 3)}"

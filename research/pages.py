@@ -18,7 +18,7 @@ from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
 from proposer_rl.report.records import words
 from proposer_rl.report.scores import check_names, generalisation_table, read_scores
-from proposer_rl.report.statistics import FEWEST
+from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
@@ -130,7 +130,8 @@ def _choice(
     parts = [
         f"# Which curriculum should I use? {_where(study)}",
         f"From {_runs(study)}. By what is available, and by what is scarce: the method with the "
-        f"highest mean of {words(study.headline)} along training, over a budget of it.",
+        f"highest mean over seeds of {words(study.headline)} along training, over a "
+        "budget of it; its median is shown.",
         _picture(curves.cost_curves(shown)._replace(name="recommended"), files),
         _decision_table(found),
         _budgets(study),
@@ -185,7 +186,7 @@ def _budgets(study: Study) -> str:
         "corrected for all pairs of methods on this page by Holm's method, each column for "
         "itself, at 5 %; and the better one must have learnt. A method without a significant "
         "difference to the "
-        f"best may be as good. Brackets: 95 % intervals, from {FEWEST} seeds on. *No target*: the "
+        f"best may be as good. {INTERVALS} *No target*: the "
         "method is target-free; what is measured is success on the target all the same. *Exact "
         "evaluation*: the task can compute the Solver's success on a level without episodes, with "
         "gradients. Some methods that need it here run on episodes, too, with `+score=sampled`, "

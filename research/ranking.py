@@ -19,7 +19,7 @@ from proposer_rl.report.comparisons import (
 from proposer_rl.report.measures import COSTS
 from proposer_rl.report.records import words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.statistics import FEWEST, INTERVALS, median_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
 
@@ -43,7 +43,7 @@ class Choice(NamedTuple):
 
     Attributes:
         best: has the greatest mean.
-        value: its mean, with the interval.
+        value: its median over seeds, with the interval.
         level: labels of those to which there is no significant difference, from the best on.
         others: how many it was compared with.
         doubt: why nothing is chosen, in words; empty where something is.
@@ -155,7 +155,7 @@ def choose(
         doubt = "it is not shown to have learnt"
     elif unsteady > STEADY:
         doubt = f"what runs of one method took differs by up to {unsteady:.1f} times"
-    return Choice(best, write(mean_interval(means[best.label])), level, len(others), doubt)
+    return Choice(best, write(median_interval(means[best.label])), level, len(others), doubt)
 
 
 def choices(
@@ -203,14 +203,14 @@ def ranking(study: Study, needs: Needs) -> Table:
         row["seeds"] = len(group.runs)
         for outcome in ranked.values():
             values = outcome.values(group)
-            row[outcome.name] = mean_interval(values) if values else None
+            row[outcome.name] = median_interval(values) if values else None
         last = [run.metrics["evaluations"][-1] for run in group.runs]
         row["frames (M)"] = float(np.mean([run.total_frames[-1] for run in group.runs]) / 1e6)
         row["evaluations"] = int(np.mean(last))
         row["seconds"] = float(np.mean([run.own_seconds[-1] for run in group.runs]))
         rows.append(row)
     note = (
-        "Brackets: 95 % interval of the mean over seeds, not corrected. Frames, evaluations of "
+        f"{INTERVALS} Frames, evaluations of "
         "levels that the curriculum asked for, and seconds: means of whole runs."
     )
     return Table("ranking", "The methods", note, rows)

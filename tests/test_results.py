@@ -23,7 +23,7 @@ FRAMES = "with the curriculum's (M)"
 # rows. A page has no two tables of runs of the same length.
 TABLES = [
     ("README.md", 400, "medium", "ID success", 5),
-    ("docs/explanation/replay.md", 240, "sampled", "ID success", 11),
+    ("docs/explanation/replay.md", 240, "sampled", "ID success", 5),
 ]
 
 
@@ -115,8 +115,8 @@ PROSE = {
     "docs/explanation/filtering.md": 5,
     "docs/explanation/first_order.md#Results": 4,
     "docs/explanation/proposer.md#Results": 3,
-    "docs/explanation/replay.md": 20,
-    "docs/explanation/results.md": 4,
+    "docs/explanation/replay.md": 12,
+    "docs/explanation/results.md": 2,
     "docs/how_to/reuse_a_proposer.md": 2,
 }
 NUMBER = r"[−]?\d*\.\d+"

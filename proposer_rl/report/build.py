@@ -21,7 +21,7 @@ from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.records import words
-from proposer_rl.report.statistics import FEWEST
+from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
 from proposer_rl.runs.columns import can_reach, is_rate
@@ -171,6 +171,7 @@ def _section(
         "answer": answer(study),
         "rate": is_rate(study.headline),
         "few": FEWEST,
+        "held": f"{HELD:.0%}",
         "facts": page.facts(study),
         "origin": page.origin(study),
         "incomplete": page.incomplete(study),

@@ -29,7 +29,7 @@ from proposer_rl.report.measures import (
 )
 from proposer_rl.report.records import LevelRecord, number, picture
 from proposer_rl.report.runs import Run, share_map
-from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.statistics import median_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
 
@@ -48,8 +48,8 @@ def charts(study: Study) -> dict[str, Json]:
 
     Returns:
         ``methods``: each with its look and seeds. ``axes``: what can be on the abscissa.
-        ``measures``: each by axis with mean and interval of every method, and with ``rows`` of its
-        runs and their ``seeds``; null where there is none.
+        ``measures``: each by axis with median and interval of every method, ``rows`` of its runs,
+        and their ``seeds``; null where there is none.
         ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
         that two methods have for single levels what each reaches there, null without records.
         ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
@@ -122,7 +122,7 @@ def _series(series: Series | None) -> Json:
     found = band(series.rows)
     return {
         "x": plain(series.x),
-        "mean": plain(found.mean),
+        "median": plain(found.median),
         "whole": found.whole.tolist(),
         "low": plain(found.low),
         "high": plain(found.high),
@@ -156,7 +156,7 @@ def _estimate(study: Study, group: Group | None, outcome: Outcome) -> Sequence[f
     if outcome.name == waiting_outcome(study).name:
         return updates_needed(study, group) or ()
     values = outcome.values(group)
-    return mean_interval(values) if values else ()
+    return median_interval(values) if values else ()
 
 
 def _stages(study: Study) -> dict[str, Json] | None:

@@ -20,8 +20,8 @@ from proposer_rl.report.statistics import (
     balanced,
     difference_of,
     holm,
-    mean_interval,
     mean_of,
+    median_interval,
     seeds_needed,
 )
 from proposer_rl.report.studies import Group, Study
@@ -107,13 +107,9 @@ def outcomes(study: Study) -> list[Outcome]:
 
 
 def updates_needed(study: Study, group: Group) -> Interval | None:
-    """A group's mean of updates to the threshold, cut at the horizon; None without a whole run."""
+    """A group's median of updates to the threshold, cut at the horizon; None without a run."""
     values = waiting_outcome(study).values(group)
-    if not values:
-        return None
-    found = mean_interval(values)
-    low, high = np.clip(found[1:], 0, study.horizon)
-    return Interval(found.estimate, float(low), float(high))
+    return median_interval(values) if values else None
 
 
 def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:

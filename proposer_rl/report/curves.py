@@ -27,7 +27,7 @@ from proposer_rl.report.measures import (
     worst_tenths,
 )
 from proposer_rl.report.records import words
-from proposer_rl.report.statistics import FEWEST
+from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import PANEL, Drawing, Look, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
@@ -54,9 +54,9 @@ def learning_curves(study: Study) -> Drawing:
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
-        "Lines: mean over seeds. Bands: 95 % interval of the mean (Student's t), from "
-        f"{FEWEST} seeds on; with fewer every seed has a thin line of its own. Thin, too: not all "
-        "runs of the method are that long. Bars: mean number of "
+        f"Lines: median over seeds. Bands: {HELD:.0%} interval of the median, from {FEWEST} "
+        "seeds on; with fewer every seed has a thin line of its own. Thin, too: not all "
+        "runs of the method are that long. Bars: median number of "
         "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
         "runs, which never got there.",
         [*panels, partial(_draw_bars, study=study)],
@@ -117,20 +117,20 @@ def level_by_level(study: Study) -> Drawing | None:
 
 
 def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
-    """Mean and interval of runs, or all of them where they are too few for an interval.
+    """Median and interval of runs, or all of them where they are too few for an interval.
 
     Returns:
-        The mean, float [n].
+        The median, float [n].
     """
     seen = ~np.isnan(series.rows).all(0)
     x, rows = series.x[seen], series.rows[:, seen]
-    mean, whole, low, high = band(rows)
+    median, whole, low, high = band(rows)
     if len(rows) < FEWEST:
         axes.plot(x, rows.T, alpha=0.5, linewidth=0.6, color=look.colour, linestyle=look.dash)
-    axes.plot(x, mean, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
-    axes.plot(x, np.where(whole, mean, np.nan), **style(look, len(x)))
+    axes.plot(x, median, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
+    axes.plot(x, np.where(whole, median, np.nan), **style(look, len(x)))
     axes.fill_between(x, low, high, color=look.colour, alpha=0.15, linewidth=0)
-    return mean
+    return median
 
 
 def _panel(study: Study, measure: Measure, axis: str = "") -> Callable[[FigureBase], None]:
@@ -239,8 +239,8 @@ worst_curves = _of_measures(
     "worst_share",
     "The worst share of the {levels} at the end (CVaR)",
     "Mean over the share of the {levels} where a Solver is worst, after {horizon} updates: at "
-    "100 % the mean over all. Each seed has worst levels of its own. Lines: mean over seeds, with "
-    "bands as above. {selection}",
+    "100 % the mean over all. Each seed has worst levels of its own. Lines: median over seeds, "
+    "with bands as above. {selection}",
     worst,
     2,
 )
@@ -262,7 +262,7 @@ gains_of_replicas = _of_measures(
 diagnostics = _of_measures(
     "diagnostics",
     "The curricula's own numbers",
-    "Per cycle, mean and 95 % interval over seeds; of a list of numbers its mean. Total gain, mean "
+    "Per cycle, median and interval over seeds; of a list of numbers its mean. Total gain, mean "
     "over standard deviation between the replicas: where it is large, all replicas gain alike "
     "whatever they are proposed, and there is little to learn from.",
     own_numbers,

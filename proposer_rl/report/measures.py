@@ -22,7 +22,7 @@ from proposer_rl.report.records import (
     words,
 )
 from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.statistics import mean_interval
+from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
 
@@ -65,15 +65,15 @@ class Series(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Mean and interval of the runs at each place, [n]; NaN where there is none.
+    """Median and interval of the runs at each place, [n]; NaN where there is none.
 
     Attributes:
-        mean: over the runs that have a value.
+        median: over the runs that have a value.
         whole: whether all runs have one, bool [n].
-        low, high: ends of the 95 % interval, where all runs have a value.
+        low, high: ends of the interval, where all runs have a value.
     """
 
-    mean: Column
+    median: Column
     whole: NDArray[np.bool_]
     low: Column
     high: Column
@@ -234,17 +234,13 @@ def _aligned(columns: Sequence[tuple[Iterable[float], Iterable[float]]], runs: l
 
 
 def band(rows: Column) -> Band:
-    """Mean and interval over runs.
+    """Median and interval over runs.
 
     Args:
         rows: [runs, n], NaN where a run has no value.
     """
-    mean = np.ma.masked_invalid(rows).mean(0).filled(np.nan)
-    whole = np.all(~np.isnan(rows), axis=0)
-    low, high = np.full_like(mean, np.nan), np.full_like(mean, np.nan)
-    if len(rows) > 1 and whole.any():
-        _, low[whole], high[whole] = np.array([mean_interval(v) for v in rows.T[whole]]).T
-    return Band(mean, whole, low, high)
+    median, low, high = median_of(rows)
+    return Band(median, np.all(np.isfinite(rows), axis=0), low, high)
 
 
 def worst_means(scores: Column, shares: Column) -> Column:

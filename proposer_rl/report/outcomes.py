@@ -22,10 +22,11 @@ from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
+    INTERVALS,
     Interval,
     interquartile_mean,
     jackknife,
-    mean_interval,
+    median_interval,
     probability_of_improvement,
 )
 from proposer_rl.report.studies import Group, Study
@@ -60,11 +61,11 @@ def comparison_table(study: Study) -> Table:
             )
     note = (
         f"Only the primary outcome, {primary(study).name}, has verdicts; their p-values are "
-        "corrected together for the number of pairs (Holm). Difference: first minus second, with "
-        "a 95 % interval, not corrected: Student's over pairs of runs where both have the same "
-        "seeds, else Welch's. P(first better): over all pairs of runs, ties count half; with "
-        "Clopper's and Pearson's interval. Seeds needed: per method, about, for a power of 80 % if "
-        "the true difference is the one seen. With fewer than "
+        "corrected together for the number of pairs (Holm). Difference of means: first minus "
+        "second, with a 95 % interval, not corrected: Student's over pairs of runs where both have "
+        "the same seeds, else Welch's. P(first better): over all pairs of runs, ties count half; "
+        "with Clopper's and Pearson's interval. Seeds needed: per method, about, for a power of "
+        "80 % if the true difference is the one seen. With fewer than "
         f"{FEWEST} seeds no interval and no verdict."
     )
     return Table("comparisons", "Pairwise comparisons", note, rows)
@@ -86,7 +87,8 @@ def against_baseline(study: Study) -> Table:
                 }
             )
     note = (
-        f"{outcome.name}: method minus {baseline.label}, with a 95 % interval, not corrected; "
+        f"{outcome.name}: difference of means, method minus {baseline.label}, with a 95 % "
+        "interval, not corrected; "
         "p-values are corrected for all pairs of methods (Holm)."
     )
     return Table("baseline", f"Against {baseline.label}", note, rows)
@@ -106,13 +108,13 @@ def group_table(study: Study) -> Table:
             "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
             waiting: updates_needed(study, group),
-            primary(study).name: _mean(primary(study).values(group)),
+            primary(study).name: _median(primary(study).values(group)),
         }
         for name in study.measurements:
-            row[f"{words(name)} after {horizon} updates"] = _mean(_known(runs, name, horizon))
+            row[f"{words(name)} after {horizon} updates"] = _median(_known(runs, name, horizon))
         row |= _over_levels(study, group)
         if any(worst in run.metrics for run in study.runs):
-            row[f"{words(headline)}, worst 10 %"] = _mean(_known(runs, worst, horizon))
+            row[f"{words(headline)}, worst 10 %"] = _median(_known(runs, worst, horizon))
         cost: dict[str, Callable[[Run], float]] = {
             "frames (M)": lambda run: run.metrics["frames"][-1] / MILLION,
             "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
@@ -125,13 +127,12 @@ def group_table(study: Study) -> Table:
         }
         rows.append(row)
     note = (
-        f"Updates: mean of min(updates, {horizon}) over the runs of full length; measured every "
+        f"Updates: min(updates, {horizon}) of the runs of full length; measured every "
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
         "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
         "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
         "success; both where the runs have single levels. P(better): that a run of the method "
-        f"has the higher {primary(study).name}. Brackets: 95 % interval, from {FEWEST} seeds on, "
-        "where they differ."
+        f"has the higher {primary(study).name}. {INTERVALS}"
     )
     return Table("methods", "Methods", note, rows)
 
@@ -145,7 +146,7 @@ def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
         iqm = None if scores is None else jackknife(interquartile_mean, scores)
         row[f"IQM of {words(name)}"] = iqm
         if is_rate(name):
-            gap = None if scores is None else mean_interval(1 - scores.mean(1))
+            gap = None if scores is None else median_interval(1 - scores.mean(1))
             row[f"optimality gap of {words(name)}"] = gap
     values = [outcome.values(each) for each in (group, baseline)]
     compared = group.label != baseline.label and all(values)
@@ -189,5 +190,5 @@ def _known(runs: Sequence[Run], name: str, updates: float) -> list[float]:
     return [value for value in found if not math.isnan(value)]
 
 
-def _mean(values: Sequence[float]) -> Interval | None:
-    return mean_interval(values) if values else None
+def _median(values: Sequence[float]) -> Interval | None:
+    return median_interval(values) if values else None

@@ -50,13 +50,13 @@
       const line = { color: method.colour, dash: method.dash, width: 2.2 };
       bands.push({ ...look, ...bandOf(series), mode: "lines", fill: "toself", fillcolor: method.colour,
         line: { width: 0 }, opacity: 0.13, hoverinfo: "skip", meta: "band" });
-      const text = series.mean.map((mean, i) => (series.low[i] === null ? short(mean)
-        : `${short(mean)} [${short(series.low[i])}, ${short(series.high[i])}]`));
+      const text = series.median.map((median, i) => (series.low[i] === null ? short(median)
+        : `${short(median)} [${short(series.low[i])}, ${short(series.high[i])}]`));
       const hover = { text, hovertemplate: `<b>${name}</b><br>%{text}<br>at %{x:,.4~g}<extra></extra>` };
-      const whole = (mean, i) => (series.whole[i] ? mean : null);
+      const whole = (median, i) => (series.whole[i] ? median : null);
       if (!series.whole.every(Boolean))
-        lines.push({ ...look, x: series.x, y: series.mean, line: { ...line, width: 0.8 }, ...hover });
-      lines.push({ ...look, x: series.x, y: series.mean.map(whole), line, ...hover, meta: "mean" });
+        lines.push({ ...look, x: series.x, y: series.median, line: { ...line, width: 0.8 }, ...hover });
+      lines.push({ ...look, x: series.x, y: series.median.map(whole), line, ...hover, meta: "median" });
       series.rows.forEach((row, r) => {
         if (!seeds.has(series.seeds[r])) return;
         single.push({ ...look, x: series.x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
@@ -83,12 +83,12 @@
       traces.push({ type: "scatter", mode: "markers", x: values, y: spread, text: seeds.map((s) => `seed ${s}`),
         marker: { color: colour, size: 6, opacity: 0.35 }, hovertemplate: `<b>${name}</b>, %{text}<br>%{x:.4~g}<extra></extra>` });
       if (!estimate.length) return;
-      const [mean, low, high] = estimate, known = low !== null;
-      traces.push({ type: "scatter", mode: "markers", x: [mean], y: [y], name, meta: "estimate",
+      const [median, low, high] = estimate, known = low !== null;
+      traces.push({ type: "scatter", mode: "markers", x: [median], y: [y], name, meta: "estimate",
         marker: { color: colour, size: 11, symbol: "diamond" },
-        error_x: { type: "data", symmetric: false, array: [known ? high - mean : 0], arrayminus: [known ? mean - low : 0],
+        error_x: { type: "data", symmetric: false, array: [known ? high - median : 0], arrayminus: [known ? median - low : 0],
           color: colour, thickness: 2.5, width: 5, visible: known },
-        hovertemplate: `<b>${name}</b><br>${short(mean)}${known ? ` [${short(low)}, ${short(high)}]` : ""}<extra></extra>` });
+        hovertemplate: `<b>${name}</b><br>${short(median)}${known ? ` [${short(low)}, ${short(high)}]` : ""}<extra></extra>` });
     });
     const labels = order.map((m) => plain(data.methods[m].label));
     return draw(place, traces, { height: 90 + 27 * order.length, xaxis: axis(outcome.name),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.records import number, printable, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import FEWEST, mean_interval
+from proposer_rl.report.statistics import INTERVALS, median_interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
 from proposer_rl.runs.columns import is_rate
@@ -122,8 +122,7 @@ def generalisation_table(study: Study, scores: Sequence[Score]) -> Table:
     measure = "Success" if is_rate(study.headline) else "Return"
     note = (
         f"{measure} after {study.horizon} updates, mean over the {study.example.task.levels} of "
-        f"each set. Brackets: 95 % interval of the mean over seeds, from {FEWEST} seeds on; not "
-        "corrected for their number."
+        f"each set. {INTERVALS}"
     )
     return Table("generalisation", "Other levels", note, rows)
 
@@ -137,7 +136,7 @@ def _result(run: Run, scores: Sequence[Score], levels: str, study: Study) -> flo
 
 def _row(name: str, values: Sequence[float]) -> dict[str, Cell]:
     known = [value for value in values if not math.isnan(value)]
-    return {name: mean_interval(known) if known else None}
+    return {name: median_interval(known) if known else None}
 
 
 def whole(groups: Iterable[Group]) -> list[Run]:

@@ -95,7 +95,8 @@ def write(cell: Cell, digits: int | None = None) -> str:
         if digits is None:
             digits = 1 if max(map(abs, cell)) >= 2 else 3
         estimate, low, high = (write(value, digits) for value in cell)
-        return estimate if math.isnan(cell.low) else f"{estimate} [{low}, {high}]"
+        alone = math.isnan(cell.low) or cell.low == cell.high  # too few seeds, or all alike
+        return estimate if alone else f"{estimate} [{low}, {high}]"
     if cell is None or cell == "" or cell != cell:
         return "–"
     if isinstance(cell, str):

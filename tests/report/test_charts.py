@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import math
 import statistics
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +22,6 @@ from proposer_rl.report.style import render
 from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run
 
 SEEDS = 6
-STUDENT = 2.570582  # the 97.5 % point of Student's distribution with 5 degrees of freedom
 UPDATES, FRAMES, SECONDS = (
     "Solver updates",
     "environment frames, millions (all)",
@@ -36,10 +34,9 @@ def rows_of(folder: Path) -> list[dict[str, float]]:
         return [{name: float(text) for name, text in row.items()} for row in csv.DictReader(file)]
 
 
-def mean_and_interval(values: list[float]) -> list[float]:
-    mean = statistics.fmean(values)
-    half = STUDENT * statistics.stdev(values) / math.sqrt(len(values))
-    return [mean, mean - half, mean + half]
+def median_and_interval(values: list[float]) -> list[float]:
+    """Of six runs: the lowest and the highest."""
+    return [statistics.median(values), min(values), max(values)]
 
 
 def between(x: float, xs: list[float], ys: list[float]) -> float:
@@ -73,7 +70,7 @@ def data(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]
     return found
 
 
-def test_lines_and_bands_are_mean_and_interval_of_the_files(
+def test_lines_and_bands_are_median_and_interval_of_the_files(
     runs: Path, data: dict[str, Any]
 ) -> None:
     measure = by_name(data["measures"], "ID success rate")
@@ -83,9 +80,9 @@ def test_lines_and_bands_are_mean_and_interval_of_the_files(
         series = measure["axes"][UPDATES][place]
         assert series["x"] == [row["updates"] for row in folders[0]]
         expected = [
-            mean_and_interval([r["id_success"] for r in at]) for at in zip(*folders, strict=True)
+            median_and_interval([r["id_success"] for r in at]) for at in zip(*folders, strict=True)
         ]
-        found = np.transpose([series["mean"], series["low"], series["high"]])
+        found = np.transpose([series["median"], series["low"], series["high"]])
         assert found == pytest.approx(np.array(expected), abs=2e-5)
         assert series["rows"] == [[r["id_success"] for r in rows] for rows in folders]
         assert series["seeds"] == list(range(SEEDS))
@@ -108,8 +105,8 @@ def test_against_a_cost_runs_stand_between_their_measurements(
                 for rows in folders
             ]
             assert [row[i] for row in series["rows"]] == pytest.approx(values, abs=1e-4)
-            found = [series["mean"][i], series["low"][i], series["high"][i]]
-            assert found == pytest.approx(mean_and_interval(values), abs=1e-4)
+            found = [series["median"][i], series["low"][i], series["high"][i]]
+            assert found == pytest.approx(median_and_interval(values), abs=1e-4)
 
 
 def test_outcomes_are_those_that_decide(runs: Path, data: dict[str, Any]) -> None:
@@ -120,11 +117,11 @@ def test_outcomes_are_those_that_decide(runs: Path, data: dict[str, Any]) -> Non
         y = [row["id_success"] for row in rows_of(runs / f"mine{seed}")]
         values.append(sum((a + b) / 2 for a, b in pairwise(y)) / 4)
     assert outcome["methods"][0]["values"] == pytest.approx(values, abs=2e-5)
-    assert outcome["methods"][0]["estimate"] == pytest.approx(mean_and_interval(values), abs=2e-5)
+    assert outcome["methods"][0]["estimate"] == pytest.approx(median_and_interval(values), abs=2e-5)
 
 
 def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A short run leaves a mean that is not of all, and few seeds have no interval."""
+    """A short run leaves a median that is not of all, and few seeds have no interval."""
     monkeypatch.setattr(build, "DRAWINGS", [])
     write_run(tmp_path / "a", seeds=[0])
     write_run(tmp_path / "b", seeds=[1], curve=[0.0, 0.1], finished=False)
@@ -132,7 +129,7 @@ def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (series,) = by_name(data["measures"], "ID success rate")["axes"][UPDATES]
     assert series == {
         "x": [0, 10, 20],
-        "mean": [0, 0.3, 0.9],
+        "median": [0, 0.3, 0.9],
         "whole": [True, True, False],
         "low": [None] * 3,
         "high": [None] * 3,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import statistics
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy import stats
 
 from proposer_rl.report.statistics import (
     FEWEST,
+    HELD,
     Estimate,
     balanced,
     difference_of,
@@ -20,8 +22,9 @@ from proposer_rl.report.statistics import (
     interquartile_mean,
     jackknife,
     majority,
-    mean_interval,
     mean_of,
+    median_interval,
+    median_of,
     probability_of_improvement,
     seeds_needed,
 )
@@ -32,7 +35,25 @@ values = st.lists(st.floats(-1, 1, width=16), min_size=FEWEST, max_size=8)
 def test_intervals_of_means_are_students() -> None:
     # Variance 12.5, n = 5; tables of Student's t have 2.776445 for 4 degrees of freedom at 97.5 %.
     half = 2.776445 * math.sqrt(12.5 / 5)
-    assert mean_interval([1, 2, 3, 4, 10]) == pytest.approx((4, 4 - half, 4 + half), abs=1e-5)
+    found = mean_of([1, 2, 3, 4, 10]).interval()
+    assert found == pytest.approx((4, 4 - half, 4 + half), abs=1e-5)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=5, max_size=40))
+def test_intervals_of_medians_are_scipys(found: list[float]) -> None:
+    """Of its test of a quantile; and no narrower one of two values holds the median as often."""
+    one = median_interval(found)
+    assert one.estimate == statistics.median(found)
+    known = stats.quantile_test(found, p=0.5).confidence_interval(HELD)
+    assert one[1:] == (known.low, known.high)
+
+
+def test_what_is_missing_leaves_a_median_without_an_interval() -> None:
+    rows = np.array([[3.0, 1.0, 2.0, 5.0, 4.0], [1.0, math.nan, 3.0, 5.0, 7.0], [math.nan] * 5]).T
+    median, low, high = median_of(rows)
+    assert median == pytest.approx([3, 4, math.nan], nan_ok=True)
+    assert low == pytest.approx([1, math.nan, math.nan], nan_ok=True)
+    assert high == pytest.approx([5, math.nan, math.nan], nan_ok=True)
 
 
 def test_runs_that_were_cut_off_tell_nothing_of_the_spread() -> None:
@@ -59,7 +80,8 @@ def test_pairs_are_compared_by_their_differences() -> None:
 
 def test_too_few_runs_and_runs_without_spread_have_no_interval() -> None:
     for few in ([1.0], [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [2.0] * 9):
-        assert math.isnan(mean_interval(few).low) and math.isnan(mean_of(few).p)
+        assert math.isnan(mean_of(few).interval().low) and math.isnan(mean_of(few).p)
+        assert math.isnan(median_interval(few).low) == (len(few) < FEWEST)
         assert not mean_of(few).within(100)
     many = [1.0, 2.0, 3.0, 4.0, 5.0]
     assert math.isnan(difference_of([1.0, 3.0], many).p)
@@ -104,7 +126,7 @@ def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
 @given(values)
 def test_the_jackknife_of_a_mean_is_students(found: list[float]) -> None:
     rows = np.array(found)[:, None] + np.array([-1.0, 0.0, 1.0])
-    one, known = jackknife(np.mean, rows), mean_interval(found)
+    one, known = jackknife(np.mean, rows), mean_of(found).interval()
     assert one.estimate == pytest.approx(known.estimate)
     if len({round(value, 3) for value in found}) == len(found):  # what is rounded ties no more
         assert one[1:] == pytest.approx(known[1:], abs=1e-6)

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
+from proposer_rl.models import available_cores
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.processes import ProcessVectorEnv
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step
 from proposer_rl.tasks.gymnasium.spaces import NUMBERS, Seen, boxes_of
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
-# A forked process need not import torch again, of which it has no use: TorchRL's choice is spawn.
-CONTEXT = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
 
 
 class GymnasiumEnv(EnvBase):
@@ -43,7 +40,7 @@ class GymnasiumEnv(EnvBase):
         parameters: what differs between levels, by name.
         success: whether the last step of an episode says that it was one.
         reward_scale: rewards are multiplied with it.
-        vectorization: one after another, or each in a process of its own.
+        vectorization: one after another, or in as many processes as there are cores.
         once: play one episode of each level, and then stand still, without reward.
     """
 
@@ -64,7 +61,11 @@ class GymnasiumEnv(EnvBase):
         players = [
             partial(LevelPlayer, make, parameters, play, success) for play in plays(levels, once)
         ]
-        self._vector = _vectorized(players, vectorization)
+        self._vector: SyncVectorEnv | ProcessVectorEnv
+        if vectorization == "sync":
+            self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
+        else:
+            self._vector = ProcessVectorEnv(players, available_cores())
         self._make_specs()
 
     def set_levels(self, levels: TensorDictBase) -> None:
@@ -139,27 +140,6 @@ class GymnasiumEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: what is random belongs to the levels."""
-
-
-def _vectorized(
-    players: Sequence[Callable[[], LevelPlayer]], vectorization: Vectorization
-) -> SyncVectorEnv | AsyncVectorEnv:
-    mode = AutoresetMode.DISABLED
-    if vectorization == "sync":
-        return SyncVectorEnv(players, autoreset_mode=mode)
-    alone = [partial(_in_own_process, player, os.getpid()) for player in players]
-    return AsyncVectorEnv(alone, autoreset_mode=mode, context=CONTEXT)
-
-
-def _in_own_process(make: Callable[[], LevelPlayer], parent: int) -> LevelPlayer:
-    """Make a player; in a process of its own, one that ends at once when its parent does.
-
-    A forked process would otherwise answer signals as its parent, which saves its work first.
-    """
-    if os.getpid() != parent:  # Gymnasium makes one in the parent, too
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return make()
 
 
 def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:

@@ -63,8 +63,8 @@ class GymnasiumTask(Task):
         reward_scale: what rewards are multiplied with in training; returns are given without it.
         network: of the Solver.
         evaluation: how the Solver is measured.
-        vectorization: of the environments that Solvers train in: ``"sync"``, or ``"async"`` for a
-            process each.
+        vectorization: of the environments: ``"sync"``, or ``"async"`` for as many processes as
+            there are cores.
         extra: of this package, that the environment needs; None for none.
         solver: the Solver's training.
         context: precision and cores.
@@ -164,14 +164,13 @@ class GymnasiumTask(Task):
         return self._env(levels, self._transforms, vectorization=self._vectorization)
 
     def evaluation_environment(self, levels: TensorDictBase) -> EnvBase:
-        """The same environments for the same number of levels, played once and one by one.
-
-        Of the levels of evaluations a process each would be too many.
-        """
+        """The same environments for the same number of levels, played once."""
         shape = levels.batch_size
         if shape not in self._envs:
             kept = [one for one in self._transforms if "reward" not in one.in_keys]
-            self._envs[shape] = self._env(levels, kept, once=True)
+            self._envs[shape] = self._env(
+                levels, kept, vectorization=self._vectorization, once=True
+            )
         self._envs[shape].set_levels(levels)
         return self._envs[shape]
 

@@ -21,7 +21,7 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium import pictures
+from proposer_rl.tasks.gymnasium import env, pictures
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
 from tests.tasks.gymnasium.toys import PARAMETERS, TINY, Walk, walk_task
 from tests.test_readme import ROOT, commands, write_files
@@ -146,12 +146,17 @@ def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) 
     assert line in str(caught.value) and "Box2D is not installed" in str(caught.value)
 
 
-def test_evaluations_take_no_process_for_each_level() -> None:
-    task = walk_task(vectorization="async")
-    levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
-    made = (task.evaluation_environment(levels), task.environment(levels))
-    kinds = [type(env._vector) for env in made]
-    assert kinds == [gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv]
+def test_processes_change_no_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(env, "available_cores", lambda: 3)
+    measured = []
+    for vectorization in ("sync", "async"):
+        task = walk_task(vectorization=vectorization)
+        learner = task.learner([Streams(0)])
+        learner.env.set_levels(task.target.sample(4, Streams(0).generator()).unsqueeze(0))
+        learner.update([Streams(1).generator()])
+        measured.append(task.measure(learner.agent))
+        learner.env.close()
+    assert (measured[0] == measured[1]).all()
 
 
 def test_what_the_environment_needs_can_be_put_around_it() -> None:
