@@ -7,9 +7,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # And before PyTorch, as commands do: how threads wait beside other processes.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
+import pickle
 import signal
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,19 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
-from omegaconf import OmegaConf
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra.core.default_element import ResultDefault
+from omegaconf import DictConfig, OmegaConf
 
 from proposer_rl.cli import run
+from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.train import main
 from tests.commands import call
 from tests.processes import Processes
 
 # A busy machine makes an example slow, not wrong.
-hypothesis.settings.register_profile("proposer_rl", deadline=None)
+hypothesis.settings.register_profile("proposer_rl", deadline=None, max_examples=40)
 hypothesis.settings.load_profile("proposer_rl")
 
 
@@ -38,7 +42,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 os.fsync = lambda file: None
 
 load_file = OmegaConf.load
-read: dict[tuple[str, int, int], Any] = {}
+read: dict[tuple[str, int, int], bytes] = {}
 
 
 def load_once(file: Any) -> Any:
@@ -49,11 +53,39 @@ def load_once(file: Any) -> Any:
     state = os.stat(name)
     key = (name, state.st_mtime_ns, state.st_size)
     if key not in read:
-        read[key] = load_file(file)
-    return deepcopy(read[key])
+        read[key] = pickle.dumps(load_file(file))
+    return pickle.loads(read[key])  # a copy, at a third of what deepcopy takes
 
 
 OmegaConf.load = staticmethod(load_once)  # type: ignore[method-assign,assignment]
+
+compose = ConfigLoaderImpl._compose_config_from_defaults_list
+composed: dict[str, bytes] = {}
+
+
+def compose_once(self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: Any) -> DictConfig:
+    """The same files, one merged into the other, are the same; but those that tests write."""
+    sources = [source.path for source in repo.get_sources() if source.path]
+    if not all(path in (str(CONFIG_FOLDER), "hydra.conf") for path in sources):
+        return compose(self, defaults, repo)
+    key = repr([(default, default.override_key) for default in defaults])
+    if key not in composed:
+        composed[key] = pickle.dumps(compose(self, defaults, repo))
+    return pickle.loads(composed[key])
+
+
+ConfigLoaderImpl._compose_config_from_defaults_list = compose_once  # type: ignore[method-assign]
+
+get_mode = Hydra.get_mode
+
+
+def mode_at_once(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+    """Hydra composes all twice, the first time to see whether it is a sweep by its settings."""
+    swept = any("sweep" in override or "hydra.mode" in override for override in overrides)
+    return get_mode(self, config_name, overrides) if swept else None
+
+
+Hydra.get_mode = mode_at_once  # type: ignore[method-assign]
 
 # Tensors in tests are too small for threads to pay, and tests share the machine.
 torch.set_num_threads(1)

@@ -96,7 +96,7 @@ GYMNASIUM = [
 ]  # fmt: skip
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
-FEW = [*SMOKE, "schedule.evaluate_every=6"]
+FEW = [*SMOKE, "schedule.evaluate_every=6", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
 
 
 def _trained(name: str, *arguments: str) -> list[str]:

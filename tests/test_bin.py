@@ -68,7 +68,7 @@ case "$1 $2 $3" in
   -E*) echo a-hash ;;
   "-m venv "*) mkdir -p "$3/bin" && cp "$0" "$3/bin/python" ;;
   "-m pip --version") [ "$(basename "$0")" = python ] ;;
-  "-m pip install") for last; do :; done; echo "$last" >> "$PIP_LOG" ;;
+  "-m pip install") for last; do :; done; [ "$last" = 'pip>=25' ] || echo "$last" >> "$PIP_LOG" ;;
   "-m proposer_rl"*) echo "${PYTHONDONTWRITEBYTECODE-none} ${PYTHONPYCACHEPREFIX-none}" ;;
 esac
 """

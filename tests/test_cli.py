@@ -19,7 +19,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from proposer_rl.cli.config import methods
 from proposer_rl.cli.outcome import quoted
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.experiment import Experiment
@@ -32,16 +31,12 @@ pytestmark = pytest.mark.usefixtures("own_folder")
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 FEW = [*SMOKE, "schedule.updates=2"]
-LEARN_FROM_COPIES = ("perf_gain", "task_difficulty")
 
 
-@pytest.mark.parametrize("method", methods())
-def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsys) -> None:
-    arguments = [f"+method={method}", *SMOKE]
-    if method == "frozen_proposer":
-        assert train("+method=perf_gain", *SMOKE, "seed=1", "hydra.run.dir=learnt") == 0
-        arguments.append("checkpoint=learnt")
-    assert train(*arguments, "hydra.run.dir=run") == 0
+@pytest.mark.parametrize("method", ["perf_gain", "task_difficulty"])
+def test_a_run_leaves_its_measurements(method: str, train, capsys) -> None:
+    """Of every other method ``tests/test_needs.py`` makes a run."""
+    assert train(f"+method={method}", *SMOKE, "hydra.run.dir=run") == 0
     folder = Path("run")
     metrics = read_csv(folder / "metrics.csv")
     assert [row["updates"] for row in metrics] == [0, 2, 4, 6]
@@ -53,14 +48,13 @@ def test_every_method_runs_and_leaves_its_measurements(method: str, train, capsy
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["method"] == method and summary["updates_to_threshold"] == [None]
     assert summary["versions"]["torchrl"] and summary["versions"]["torch"] == torch.__version__
-    if method in LEARN_FROM_COPIES:
-        cycles = read_jsonl(folder / "cycles.jsonl")
-        assert [row["cycle"] for row in cycles] == [0, 1]
-        assert all(len(row["return_gain"]) == len(row["total_reward"]) == 2 for row in cycles)
-        # In both cycles two copies of three updates, looked at before and after; and the Solver's
-        # own action.
-        assert metrics[-1]["curriculum_frames"] == 2 * 2 * 3 * 4 * 10
-        assert metrics[-1]["evaluations"] == 2 * (2 * 2 + 1) * 16
+    cycles = read_jsonl(folder / "cycles.jsonl")
+    assert [row["cycle"] for row in cycles] == [0, 1]
+    assert all(len(row["return_gain"]) == len(row["total_reward"]) == 2 for row in cycles)
+    # In both cycles two copies of three updates, looked at before and after; and the Solver's own
+    # action.
+    assert metrics[-1]["curriculum_frames"] == 2 * 2 * 3 * 4 * 10
+    assert metrics[-1]["evaluations"] == 2 * (2 * 2 + 1) * 16
     said = capsys.readouterr().out
     assert "not reached in 6 updates (censored)" in said and "run.png" in said
 
@@ -87,16 +81,16 @@ def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train,
 
 
 def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
-    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt") == 0
+    assert train("+method=perf_gain", *FEW, "hydra.run.dir=learnt") == 0
     arguments = ["+method=frozen_proposer", *SMOKE, "checkpoint=learnt", "hydra.run.dir=run"]
     assert train(*arguments, "proposer.observes=[return,progress]") == 2
     said = "checkpoint=learnt: its Proposer has learnt with observes=['log_success', 'progress']"
     assert said in capsys.readouterr().err and not Path("run").exists()
-    assert train(*arguments, "schedule.updates=4") == 0
+    assert train(*arguments, "schedule.updates=1") == 0
     # The checkpoint moves on, and the Proposer that this run began with does not.
     began = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
-    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt", "schedule.updates=9") == 0
-    assert train(*arguments) == 0
+    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt", "schedule.updates=4") == 0
+    assert train(*arguments, "schedule.updates=2") == 0
     ended = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
     for name, entry in began.items():
         assert torch.equal(entry["value"], ended[name]["value"])
@@ -105,11 +99,11 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
 @pytest.mark.parametrize("method", ["perf_gain", "first_order_proposer"])
 def test_what_a_proposer_has_learnt_is_a_file_of_its_own(method: str, train) -> None:
     """Another run begins with it as it does with the whole run."""
-    assert train(f"+method={method}", *SMOKE, "hydra.run.dir=learnt") == 0
+    assert train(f"+method={method}", *FEW, "hydra.run.dir=learnt") == 0
     proposer = Path("learnt/proposer.pt")
     (whole,) = sorted(Path("learnt/checkpoints").glob("*.pt"))[-1:]
     assert proposer.stat().st_size < whole.stat().st_size / 2
-    again = ["+method=frozen_proposer", *SMOKE]
+    again = ["+method=frozen_proposer", *FEW]
     if method == "first_order_proposer":
         again += ["proposer/action=problems", "proposer.observes=[]", "proposer.action_repeat=1"]
     runs = {"of_run": "learnt", "of_file": str(proposer), "of_folder": "light"}
@@ -122,10 +116,10 @@ def test_what_a_proposer_has_learnt_is_a_file_of_its_own(method: str, train) -> 
 
 
 def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:
-    arguments = ["+method=target", *SMOKE, "hydra.run.dir=run"]
+    arguments = ["+method=target", *FEW, "hydra.run.dir=run"]
     assert train(*arguments) == 0
-    assert train(*arguments, "schedule.updates=8") == 0
-    assert [row["updates"] for row in read_csv("run/metrics.csv")] == [0, 2, 4, 6, 8]
+    assert train(*arguments, "schedule.updates=4") == 0
+    assert [row["updates"] for row in read_csv("run/metrics.csv")] == [0, 2, 4]
     before = tables(Path("run"))
     assert train(*arguments, "solver.ppo.gamma=0.5") == 2
     assert "solver.ppo.gamma=0.5: the run in" in capsys.readouterr().err
@@ -133,7 +127,7 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> Non
 
 
 def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, capsys) -> None:
-    arguments = ["+method=target", *SMOKE, "hydra.run.dir=run"]
+    arguments = ["+method=target", *FEW, "hydra.run.dir=run"]
     assert train(*arguments) == 0
     before = tables(Path("run"))
 
@@ -144,16 +138,16 @@ def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, 
         return capsys.readouterr().err
 
     Path("run/summary.json").unlink()  # as if it had been interrupted just before
-    assert "schedule.updates=4: the run in" in (said := refused(4)) and "made 6 updates" in said
+    assert "schedule.updates=1: the run in" in (said := refused(1)) and "made 2 updates" in said
     assert train(*arguments) == 0
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "run", lambda _: os.kill(os.getpid(), signal.SIGINT))
         patched.setattr("proposer_rl.runs.signals.StopSignals._keep", signal.default_int_handler)
-        assert train(*arguments, "schedule.updates=8") == 128 + signal.SIGINT
+        assert train(*arguments, "schedule.updates=4") == 128 + signal.SIGINT
     assert not Path("run/summary.json").exists()  # it is not at the end of what was asked for
     assert train(*arguments) == 0
     shutil.rmtree("run/checkpoints")
-    assert "ended after 6 updates and has no checkpoint to go on from" in refused(8)
+    assert "ended after 2 updates and has no checkpoint to go on from" in refused(4)
     monkeypatch.setattr("proposer_rl.cli.run.logger", None)  # nothing is left to be logged
     assert train(*arguments) == 0
 
@@ -179,7 +173,7 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
         assert folder in words[-1]
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text(st.characters(exclude_characters="\0\n\r$", codec="utf-8"), min_size=1))
 @example("runs/é").via("letters that Hydra's grammar has not")
 @example("a b=c,d").via("signs that it reads as its own")
@@ -253,7 +247,7 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkey
 
 
 def test_a_precision_that_nobody_wrote_is_told_in_one_line(train, capsys) -> None:
-    command = ["+method=domain_randomization", *FEW, "hydra.run.dir=run"]
+    command = ["+method=domain_randomization", *SMOKE, "schedule.updates=1", "hydra.run.dir=run"]
     assert train(*command) == 0
     config = Path("run/config.json")
     config.write_text(config.read_text().replace('"fp32"', '"fp8"'))

@@ -167,7 +167,7 @@ WRONG = [
     ),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
-    ("solver.ppo.gama=1", "solver.ppo.gama: unknown; there are: adam_eps, clip_"),
+    ("solver.ppo.gama=1", "solver.ppo.gama: unknown; there are: adam_eps, anneal_"),
     ("solver.x.y=1", "solver.x: unknown; there are: batch_size, ppo"),
     ("+sede=1", "sede: unknown; there are: method, scale"),
     ("+solver.x=1", "solver.x: unknown; there are: batch_size, ppo"),
@@ -429,25 +429,22 @@ def test_a_file_of_ones_own_that_is_no_yaml_gets_one_line(train, capsys, tmp_pat
 
 
 REFUSED = [
-    ["sede=1"],
-    ["+method=target", "seed=-1"],
     ["+method=target", "task.network.channels=[13]"],
     ["-m", "+method=target,magic"],
-    ["-m", "+method=target", "sede=1,2"],
     ["+sweep=quick", "sede=1"],
 ]
 
 
+@pytest.mark.parametrize("others", [[], ["outputs/target/other", "multirun/other", "sweeps/other"]])
 @pytest.mark.parametrize("arguments", REFUSED)
 def test_a_refused_command_leaves_no_folder_and_nothing_of_others_is_lost(
-    arguments: list[str], train, capsys
+    arguments: list[str], others: list[str], train, capsys
 ) -> None:
-    for kept in ([], ["outputs/target/other", "multirun/other", "sweeps/other"]):
-        for folder in kept:
-            Path(folder).mkdir(parents=True)
-        before = sorted(Path().rglob("*"))
-        assert train(*arguments, *SMOKE) == 2
-        assert sorted(Path().rglob("*")) == before
+    for folder in others:
+        Path(folder).mkdir(parents=True)
+    before = sorted(Path().rglob("*"))
+    assert train(*arguments, *SMOKE) == 2
+    assert sorted(Path().rglob("*")) == before
 
 
 def test_a_folder_that_was_there_stays(train) -> None:
@@ -477,10 +474,11 @@ def test_an_order_that_is_refused_would_undo_something(late: str, early: str, ke
 
 
 def test_a_value_may_refer_to_another(train) -> None:
-    arguments = ["+method=target", *SMOKE, "schedule.updates=${solver.batch_size}"]
+    arguments = ["+method=target", *SMOKE, "solver.batch_size=1"]
+    arguments.append("schedule.updates=${solver.batch_size}")
     assert train(*arguments, "hydra.run.dir=run") == 0
     found = json.loads(Path("run/run.json").read_text())
-    assert found["planned_updates"] == 4
+    assert found["planned_updates"] == 1
     assert found["overrides"] == arguments
 
 
@@ -646,7 +644,8 @@ def test_a_stored_configuration_instantiates_nothing(finished: Path, train, caps
     assert "curriculum._target_='proposer_rl.methods.target': the run in" in refused(train, capsys)
     assert not Path("executed").exists()
     (folder / "config.json").write_text(json.dumps(stored))
-    assert train("+method=target", *SMOKE, "hydra.run.dir=run") == 0
+    few = "schedule.updates=1"
+    assert train("+method=target", *SMOKE, few, "hydra.run.dir=run") == 0
     assert not Path("executed").exists()
 
 
@@ -660,8 +659,9 @@ def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> 
 def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
     folder = copy_of(finished)
     free = ["schedule.checkpoint_seconds=null", "schedule.keep_checkpoints=3", "compute.cores=1"]
-    assert train("+method=target", *SMOKE, "hydra.run.dir=run", *free) == 0
-    assert train("+method=target", *SMOKE, "hydra.run.dir=whole") == 0
+    few = [*SMOKE, "schedule.updates=2"]
+    assert train("+method=target", *few, "hydra.run.dir=run", *free) == 0
+    assert train("+method=target", *few, "hydra.run.dir=whole") == 0
     assert_same_run(Path("whole"), folder)
 
 
@@ -751,7 +751,7 @@ def little_memory() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("little_memory")
-@hypothesis.settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis.settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
     smoke: dict[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory

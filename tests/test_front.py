@@ -86,7 +86,7 @@ def test_signatures_of_classes_are_true(name: str) -> None:
 
 
 def test_a_run_in_a_maze_is_that_of_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     curriculum = prl.curricula.plr(temperature=0.5, score="max_mc")
     run = prl.train(
@@ -114,6 +114,7 @@ def test_a_run_in_a_maze_is_that_of_the_command_line(
     watch([str(run.folder), "--once"])
     assert "plr" in capsys.readouterr().out
     evaluate([str(run.folder), "--levels", "id", "-o", str(tmp_path / "rows.json")])
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [])
     report([str(run.folder), "-q", "-o", str(tmp_path / "report")])
     assert (tmp_path / "report" / "report.html").exists()
     assert open_session(run.folder).about()["board"] is not None

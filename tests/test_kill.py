@@ -14,20 +14,13 @@ from tests.same_run import assert_same_run
 
 # A checkpoint at every safe point. Episodes of a Proposer's copies are none: they are played again.
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.checkpoint_seconds=1e-6"]
-SMOKE += ["proposer.meta_episode_length=5"]
+SMOKE += ["schedule.updates=4", "proposer.meta_episode_length=3"]
 # At any time; before any write; in the middle of a checkpoint's temporary file; before it gets its
 # name. A method meets some of them, one after another; which ones, methods have no part in.
 MOMENTS = ["", "", "fsync .step_", "replace .step_"]
 # In one process every curriculum is taken up from its state, in tests/curricula/test_contract.py.
-# These differ in what a checkpoint holds of them: nothing, a buffer, bins of episodes, a Proposer
-# that learns, one that another run has trained.
-METHODS = {
-    "target": [0, 2],
-    "plr": [1],
-    "alp_gmm": [3],
-    "perf_gain": [0, 2],
-    "frozen_proposer": [1],
-}
+# These differ in what a checkpoint holds of them: nothing, a buffer, a Proposer that learns.
+METHODS = {"target": [0, 2], "plr": [1, 3], "perf_gain": [0, 2]}
 
 
 def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:
@@ -39,22 +32,12 @@ def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:
     return {"signal_at": {draw.choice(candidates): SIGKILL}}
 
 
-@pytest.fixture(scope="module")
-def learnt(processes: Processes, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose Proposer the method frozen_proposer goes on with."""
-    folder = tmp_path_factory.mktemp("learnt")
-    assert processes("+method=perf_gain", *SMOKE, f"hydra.run.dir={folder}").code == 0
-    return folder
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
-    method: str, learnt: Path, processes: Processes, tmp_path: Path
+    method: str, processes: Processes, tmp_path: Path
 ) -> None:
     draw = random.Random(f"moments of {method}")
     command = [f"+method={method}", *SMOKE]
-    if method == "frozen_proposer":
-        command.append(f"checkpoint={learnt}")
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
     kinds, attempt = [*METHODS[method]], 0

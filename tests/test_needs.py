@@ -14,7 +14,7 @@ from proposer_rl.cli.help import needs
 from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.meta.rewards import performance_gain
 from proposer_rl.methods import Components, proposer
-from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import ProposerSettings
 from proposer_rl.tasks.mazes.task import MazeTask
@@ -54,7 +54,7 @@ def test_every_method_says_what_it_needs() -> None:
 
 
 @pytest.mark.parametrize("method", sorted(NEEDS.keys() - {REUSED}))
-def test_a_method_asks_for_what_it_says(
+def test_every_method_runs_and_asks_for_what_it_says(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -66,9 +66,12 @@ def test_a_method_asks_for_what_it_says(
         self.target = self.distributions[given["target"]] = Watched(self.target, asked)
 
     monkeypatch.setattr(MazeTask, "__init__", watched)
-    config = composed(f"+method={method}", *SMALL)
-    signals = StopSignals()
+    config, signals = composed(f"+method={method}", *SMALL), StopSignals()
     summary = build(config, parts(config, signals), RunFolder(tmp_path), signals).run()
+    assert summary["frames"] == 2 * 4 * 10
+    for name in ("metrics", "training"):
+        assert read_csv(tmp_path / f"{name}.csv")[-1]["updates"] == 2
+    assert 0 <= read_csv(tmp_path / "metrics.csv")[-1]["ood_success"] <= 1
     assert bool(asked) == (TARGET in NEEDS[method]), asked
     assert (summary["evaluations"] > 0) == (EXACT in NEEDS[method])
     assert GRADIENTS not in NEEDS[method] or EXACT in NEEDS[method]

@@ -46,7 +46,9 @@ def smallest(words: list[str]) -> list[str]:
     """The same arguments of ``bin/train`` with those overrides that make a run of seconds."""
     small = [re.sub(r"^\+scale=.*", "+scale=smoke", word) for word in words]
     small = [re.sub(r"^(seed=\d+),.*", r"\1", word) for word in small]
-    small = [re.sub(r"^(schedule\.updates=).*", r"\g<1>8", word) for word in small]
+    small = [re.sub(r"^(schedule\.updates=).*", r"\g<1>6", word) for word in small]
+    if not any(word.startswith("schedule.updates=") for word in small):
+        small.append("schedule.updates=3")
     if any(word.startswith("task=") for word in small):  # scales are of mazes
         return [*small, *TINY]
     scaled = any(word.startswith("+scale=") for word in small)

@@ -348,7 +348,7 @@ def choices_of_copies(draw: st.DrawFn) -> list[int]:
     return draw(st.lists(st.integers(0, copies - 1), min_size=copies, max_size=copies))
 
 
-@hypothesis.settings(max_examples=15, deadline=None)
+@hypothesis.settings(max_examples=8)
 @hypothesis.given(chosen=choices_of_copies(), seed=st.integers(0, 9))
 def test_a_copy_trains_alike_in_whatever_place_it_stands(chosen: list[int], seed: int) -> None:
     """Choosing copies and then training is training and then choosing.

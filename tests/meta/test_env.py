@@ -21,7 +21,7 @@ from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
-K, P, C, E, L = 3, 4, 2, 6, 5
+K, P, C, E, L = 3, 4, 2, 6, 3
 SPACE = TASK.space
 
 

@@ -27,13 +27,12 @@ from tests.skill_ladder import any_mixture, best_constant, best_sequence, even, 
 SKILLS, UPDATES, COPIES, PROBLEMS = 3, 6, 16, 16
 
 
-def problem_choices(*, shuffled: bool = False) -> PPO:
+def problem_choices() -> PPO:
     """The paper's Proposer: every problem's choice is an action, a critic gives the advantage."""
     env = ladder_env(
         ProblemChoices,
         copies=COPIES,
         problems=PROBLEMS,
-        shuffled=shuffled,
         meta_episode_length=UPDATES,
     )
     head = ProblemHead(33, PROBLEMS, SKILLS, hidden=32)
@@ -68,14 +67,14 @@ def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:
 def _ppo(env, head, distribution, advantage, *, loss=None, **numbers) -> PPO:
     network = ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
     agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
-    numbers = {"epochs": 8, "learning_rate": 3e-3, **numbers}
+    numbers = {"epochs": 4, "learning_rate": 1e-2, **numbers}
     settings = PPOSettings(horizon=env.steps, gamma=1.0, **numbers)
     return PPO(env, agent, settings, advantage=advantage, loss=loss)
 
 
-def learnt_gain(make: Callable[..., PPO], seed: int, cycles: int = 60, **options) -> float:
+def learnt_gain(make: Callable[..., PPO], cycles: int = 45, **options) -> float:
     """Mean total gain of the last ten cycles, each from a beginner."""
-    streams = Streams(seed)
+    streams = Streams(0)
     with streams.as_default("weights"):
         proposer = make(**options)
     beginner, gains = proposer.env.solvers.snapshot()[0], []
@@ -94,22 +93,19 @@ def test_the_even_mixture_is_far_from_the_best() -> None:
 
 @pytest.mark.parametrize("make", [problem_choices, mixtures])
 def test_it_finds_the_best_curriculum(make: Callable[..., PPO]) -> None:
-    assert learnt_gain(make, 0) > 0.9 * best_sequence(SKILLS, UPDATES)
+    assert learnt_gain(make) > 0.9 * best_sequence(SKILLS, UPDATES)
 
 
 @pytest.mark.parametrize("kind", [A2CLoss, ReinforceLoss])
 def test_it_finds_the_best_curriculum_by_another_loss(kind: type[LossModule]) -> None:
-    assert learnt_gain(other_loss(kind), 0, cycles=80) > 0.9 * best_sequence(SKILLS, UPDATES)
+    assert learnt_gain(other_loss(kind), cycles=80) > 0.9 * best_sequence(SKILLS, UPDATES)
 
 
 def test_it_finds_the_best_mixture_where_one_action_holds_for_an_episode() -> None:
     best = best_constant(SKILLS, UPDATES, PROBLEMS)
-    held = {"idle": SKILLS, "action_repeat": UPDATES}
-    assert learnt_gain(mixtures, 0, cycles=160, **held) > 0.9 * best
+    held = {"idle": SKILLS, "action_repeat": UPDATES, "epochs": 8}
+    assert learnt_gain(mixtures, cycles=80, **held) > 0.9 * best
 
 
-@pytest.mark.parametrize("make", [problem_choices, mixtures])
-def test_it_does_not_when_the_rewards_are_shuffled_between_copies(
-    make: Callable[..., PPO],
-) -> None:
-    assert learnt_gain(make, 0, shuffled=True) < 0.4 * best_sequence(SKILLS, UPDATES)
+def test_it_does_not_when_the_rewards_are_shuffled_between_copies() -> None:
+    assert learnt_gain(mixtures, shuffled=True) < 0.4 * best_sequence(SKILLS, UPDATES)

