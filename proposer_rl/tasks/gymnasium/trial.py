@@ -75,9 +75,10 @@ def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSe
         ("wrappers", partial(wrapper_of, one)) for one in make.wrappers
     ]
     functions += [
-        (f"parameters.{name}.name", partial(imported, given.name))
+        (f"parameters.{name}.name", partial(imported, path if given.name else None))
         for name, given in parameters.items()
         if given.set == "call"
+        for path in given.names(name)
     ]
     for key, find in functions:
         try:
