@@ -58,12 +58,15 @@ class ConfigError(ValueError):
 
 
 @contextmanager
-def key(name: str, other: str = "") -> Iterator[None]:
+def key(
+    name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
+) -> Iterator[None]:
     """Put a key of the configuration before what is said of the arguments that stand below it.
 
     Args:
         name: the key.
-        other: what comes before any other TypeError or ValueError.
+        other: what comes before any other error of these kinds.
+        kinds: that tell of bad input.
 
     Raises:
         ConfigError: in place of all of these.
@@ -72,7 +75,7 @@ def key(name: str, other: str = "") -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except (TypeError, ValueError) as error:
+    except kinds as error:
         lead = f"{name}." if isinstance(error, ArgumentError) else other
         raise ConfigError(f"{lead}{one_line(error)}") from error
 

@@ -112,7 +112,9 @@ def _check_wrappers(
             raise WrapperError(
                 make.wrappers[count - 1],
                 "it keeps running statistics or the like, or draws numbers without the seed: the "
-                "same actions on the same level can end otherwise the second time",
+                "same actions on the same level can end otherwise the second time. What all "
+                "environments share is normalised by solver.ppo.normalize_observations and "
+                "normalize_rewards",
             )
         warnings.warn(
             f"{make.env_id}: the same actions on the same level end otherwise the second time: the "
