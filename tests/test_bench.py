@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from proposer_rl.report.publish import publish
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import MazeEnv, generate_levels
 from research.benchmarks import worker
@@ -121,7 +122,8 @@ def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path
     for method in ("domain_randomization", "perf_gain"):
         few = ["+scale=smoke", "schedule.updates=1"]
         assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0
-    assert bench("curricula", "--runs", "runs", "--repeats", "1", "--threads", "1") == 0
+    publish([Path("runs")], Path("study"))
+    assert bench("curricula", "--runs", "study", "--repeats", "1", "--threads", "1") == 0
     assert "a Solver update of perf_gain, Smoke scale" in capsys.readouterr().out
     timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}

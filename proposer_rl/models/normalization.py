@@ -1,4 +1,4 @@
-"""Running moments of what an agent sees and is paid, one set for each of K replicas.
+"""Running moments of what an agent sees and of its rewards, one set for each of K replicas.
 
 TorchRL's ``VecNormV2`` has one set for a whole batch of environments or one for each of them, and
 none for each row; and what a transform of an environment knows, an agent that is evaluated
