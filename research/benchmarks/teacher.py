@@ -32,7 +32,7 @@ def teacher_calls(options: Options) -> Result:
     rows = [
         Row(
             f"an ask and a tell of PLR with {SLOTS} slots, {name}, each",
-            "a number by itself; Syllabus 0.7 and TeachMyAgent do not run beside it",
+            "a number by itself: no other library is timed",
             Spread.of([each / count for each in seconds[name]]),
             "ms",
             target=TARGETS[name] / 1e6,
