@@ -50,7 +50,6 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     """
     require_logger(config.logger)
     task = make_task(config)
-    with key("task"):
     with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
     _check_memory(learner)
