@@ -45,6 +45,7 @@ from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 from proposer_rl.teaching import (
+    ActorStudent,
     Items,
     LevelGenerator,
     LevelTransform,
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 __all__ = [
     "PPO",
     "ActorCritic",
+    "ActorStudent",
     "ArgumentError",
     "Batch",
     "ComputeContext",

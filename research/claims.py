@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special, stats
 
 from proposer_rl.report.comparisons import (
     ALIKE,
@@ -28,7 +29,7 @@ from proposer_rl.report.comparisons import (
 )
 from proposer_rl.report.records import Record, numbers, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import ERROR, FEWEST, holm, majority, mean_of
+from proposer_rl.report.statistics import ERROR, FEWEST, Estimate, holm, mean_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
 from proposer_rl.runs.columns import is_rate
@@ -112,7 +113,7 @@ def _beats(
         f"{f' ({decision.reason})' * (number == 0)}"
         for number, outcome in enumerate(outcomes(study)[:3])
     )
-    costs = [np.mean([r.total_frames[-1] / max(r.updates, 1) for r in g.runs]) for g in groups]
+    costs = [np.mean([r.total_frames.iloc[-1] / max(r.updates, 1) for r in g.runs]) for g in groups]
     ratio = costs[0] / costs[1] if costs[1] else math.nan
     return verdict, f"{text}; frames: {ratio:.1f} times as many"
 
@@ -149,7 +150,7 @@ def _learn_at_once(study: Study) -> Evidence | None:
 
 def _started(study: Study, group: Group) -> tuple[int, int, str]:
     """How many runs of a group learnt at once, of how many, and both in words."""
-    first = max(run.metrics["updates"][:2][-1] for run in group.runs)
+    first = max(run.metrics["updates"][:2].iloc[-1] for run in group.runs)
     limit = max(SOON * study.horizon, float(first))  # no run can be seen to be faster
     known = [run.reached(study.headline, STARTED) for run in group.runs]
     soon = sum(updates <= limit for updates in known)
@@ -180,11 +181,11 @@ def _alike(study: Study) -> Evidence | None:
     text = f"{name}: {text}; alike is taken as within ±{ALIKE}, by two one-sided tests at 5 %"
     if min(len(outcome.known(group)) for group in groups) < FEWEST:
         return "too few seeds", text
-    if all(each.within(ALIKE) for each in found):
+    if all(within(each, ALIKE) for each in found):
         if all(learnt(group, names[0], study.horizon) for group in groups):
             return "supported", text
         return "undecided", f"{text}; not all have learnt"
-    known = [p for each in found if not math.isnan(p := each.beyond(ALIKE))]
+    known = [p for each in found if not math.isnan(p := beyond(each, ALIKE))]
     smallest = min(holm(known), default=math.nan)
     text += f"; the smallest p of a larger difference is {smallest:.2g} after correction"
     return _either(math.nan, smallest), text
@@ -202,7 +203,7 @@ def _slightly(study: Study, beats: Test) -> Evidence | None:
     found = difference(primary(study), *groups)
     if found.p <= ERROR:  # the more methods are compared, the less of it corrections leave
         return "undecided", f"{text}; significant without correction (p = {found.p:.2g})"
-    slight = is_rate(study.headline) and found.value > 0 and found.within(ALIKE)
+    slight = is_rate(study.headline) and found.value > 0 and within(found, ALIKE)
     if slight and all(learnt(group, study.headline, study.horizon) for group in groups):
         return "supported", f"{text}; it is shown to be within ±{ALIKE}"
     return "undecided", f"{text}; it is not shown to be small and positive either"
@@ -269,6 +270,26 @@ def _gains(study: Study) -> Evidence | None:
     if interval.low > 0 or share < 0.5:
         return "contradicted", text
     return ("supported" if share > 0.9 and interval.high < 0 else "undecided"), text
+
+
+def within(found: Estimate, bound: float) -> bool:
+    """Whether a value is shown to be between ``-bound`` and ``bound``.
+
+    Two one-sided tests, each at 5 %: the interval of 90 % is inside (Schuirmann, Journal of
+    Pharmacokinetics and Biopharmaceutics 15, 1987).
+    """
+    interval = found.interval(1 - 2 * ERROR)
+    return -bound < interval.low and interval.high < bound
+
+
+def beyond(found: Estimate, bound: float) -> float:
+    """p-value of a value being farther from zero than ``bound``, one-sided."""
+    return float(special.stdtr(found.freedom, (bound - abs(found.value)) / found.error))
+
+
+def majority(count: int, of: int) -> float:
+    """How surely a share is more than a half: the binomial test's p-value, one-sided and exact."""
+    return float(stats.binomtest(count, of, 0.5, alternative="greater").pvalue)
 
 
 def _either(p_for: float, p_against: float) -> Verdict:
@@ -378,7 +399,7 @@ def _against(study: Study, one: Group, other: Group, decision: Decision) -> str:
 
 def _frames(one: Group, others: Sequence[Group]) -> str:
     own, *rest = (
-        float(np.mean([r.total_frames[-1] for r in g.runs])) / 1e6 for g in (one, *others)
+        float(np.mean([r.total_frames.iloc[-1] for r in g.runs])) / 1e6 for g in (one, *others)
     )
     return f"cost: {write(own)} million frames, theirs {write(min(rest))} to {write(max(rest))}"
 

@@ -19,7 +19,7 @@ from proposer_rl.report.comparisons import (
 from proposer_rl.report.measures import COSTS
 from proposer_rl.report.records import words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import FEWEST, INTERVALS, median_interval
+from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
 
@@ -76,7 +76,7 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
     name, whole = study.headline, [run for group in study.compared for run in group.runs]
     found = {"updates": primary(study)}
     for axis, cost in COSTS.items():
-        budget = min(float(cost(run)[-1]) for run in whole)
+        budget = min(float(cost(run).iloc[-1]) for run in whole)
         value = partial(Run.mean_until, measurement=name, budget=budget, cost=cost)
         text = f"{float(f'{budget:.2g}'):,g}"  # 370, where .2g alone says 3.7e+02
         found[axis] = Outcome(f"{words(name)}, mean over {text} {UNITS[axis]}", value)
@@ -90,7 +90,7 @@ def spread(study: Study, scarce: str) -> float:
     """
     if scarce not in COSTS:
         return 1.0
-    spent = [[float(COSTS[scarce](run)[-1]) for run in group.runs] for group in study.compared]
+    spent = [[float(COSTS[scarce](run).iloc[-1]) for run in group.runs] for group in study.compared]
     return max((max(each) / min(each) for each in spent if min(each) > 0), default=1.0)
 
 
@@ -112,7 +112,7 @@ def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[s
     found = set(filter(None, said.split(", "))) if isinstance(said, str) else known
     # Where performance is played, an evaluation is episodes.
     exact = [each for each in group.runs if each.task.exact is not False]
-    asked = any(each.metrics["evaluations"][-1] > 0 for each in exact)
+    asked = any(each.last("evaluations") > 0 for each in exact)
     return found | {EXACT} if asked else found - {EXACT, GRADIENTS}
 
 
@@ -155,7 +155,7 @@ def choose(
         doubt = "it is not shown to have learnt"
     elif unsteady > STEADY:
         doubt = f"what runs of one method took differs by up to {unsteady:.1f} times"
-    return Choice(best, write(median_interval(means[best.label])), level, len(others), doubt)
+    return Choice(best, write(outcome.median(best)), level, len(others), doubt)
 
 
 def choices(
@@ -202,12 +202,11 @@ def ranking(study: Study, needs: Needs) -> Table:
         row: dict[str, Cell] = {"method": group.label, "needs": ", ".join(said) or "nothing"}
         row["seeds"] = len(group.runs)
         for outcome in ranked.values():
-            values = outcome.values(group)
-            row[outcome.name] = median_interval(values) if values else None
-        last = [run.metrics["evaluations"][-1] for run in group.runs]
-        row["frames (M)"] = float(np.mean([run.total_frames[-1] for run in group.runs]) / 1e6)
+            row[outcome.name] = outcome.median(group)
+        last = [run.last("evaluations") for run in group.runs]
+        row["frames (M)"] = float(np.mean([run.total_frames.iloc[-1] for run in group.runs]) / 1e6)
         row["evaluations"] = int(np.mean(last))
-        row["seconds"] = float(np.mean([run.own_seconds[-1] for run in group.runs]))
+        row["seconds"] = float(np.mean([run.own_seconds.iloc[-1] for run in group.runs]))
         rows.append(row)
     note = (
         f"{INTERVALS} Frames, evaluations of "

@@ -122,7 +122,7 @@ def _timed(group: Group, seconds: Seconds) -> Group:
         runs=tuple(
             replace(
                 run,
-                metrics={**run.metrics, "seconds": each * run.metrics["updates"]},
+                metrics=run.metrics.assign(seconds=each * run.metrics["updates"]),
                 shared_by=1,
             )
             for run in group.runs

@@ -47,6 +47,10 @@ class There(Tensor):
         made.here = here
         return made
 
+    def __tensor_flatten__(self) -> tuple[list[str], None]:
+        """What counts bytes asks where they are."""
+        return ["here"], None
+
     def tolist(self) -> Any:
         return self.here.tolist()
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from proposer_rl.report.publish import publish
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import MazeEnv, generate_levels
+from research.benchmarks import worker
 from research.benchmarks.__main__ import main
 from research.benchmarks.ceiling import convolutions
 from research.benchmarks.curricula import Training
@@ -55,29 +60,34 @@ def test_every_benchmark_measures_something(name: str, monkeypatch: pytest.Monke
     assert again == result
 
 
+def absent(_: Options) -> Result:
+    raise KeyError("nothing")
+
+
 def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
     bench, capsys, monkeypatch, tmp_path: Path
 ) -> None:
-    # In the worker's own process nothing but the arguments can be changed from here.
+    # What a process of its own would do; the test below starts one.
+    def here(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", command[2:])
+        worker.main()
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(worker.subprocess, "run", here)
     monkeypatch.setattr(
         "research.benchmarks.command.selected", lambda *_: ["absent", "shortest_paths"]
     )
-    monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"])
+    monkeypatch.setitem(BENCHMARKS, "absent", BENCHMARKS["levels"]._replace(run=absent))
     arguments = ["--tiny", "--repeats", "1", "--threads", "1", "--precision", "fp32"]
     assert bench(*arguments, "--output", "b.json") == 1
     printed = capsys.readouterr()
     assert "| what" in printed.out and "networkx" in printed.out
-    assert "KeyError: 'absent'" in printed.err and "[2/2] shortest_paths:" in printed.err
+    assert "KeyError: 'nothing'" in printed.err and "[2/2] shortest_paths:" in printed.err
     content = json.loads((tmp_path / "b.json").read_text())
     assert list(content["benchmarks"]) == ["absent", "shortest_paths"]
-    assert content["options"] == {
-        "repeats": 1,
-        "precision": "fp32",
-        "device": "cuda" if torch.cuda.is_available() else "cpu",
-        "size": "tiny",
-        "jaxued": None,
-        "runs": [],
-    }
+    told = {"repeats": 1, "precision": "fp32", "size": "tiny", "jaxued": None, "runs": []}
+    told["device"] = "cuda" if torch.cuda.is_available() else "cpu"
+    assert {**content["options"], **told} == content["options"]
     assert content["machine"]["cores"] and content["versions"]["torch"] == torch.__version__
     assert "error" in content["benchmarks"]["absent"]
     measured = content["benchmarks"]["shortest_paths"]
@@ -112,7 +122,8 @@ def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path
     for method in ("domain_randomization", "perf_gain"):
         few = ["+scale=smoke", "schedule.updates=1"]
         assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0
-    assert bench("curricula", "--runs", "runs", "--repeats", "1", "--threads", "1") == 0
+    publish([Path("runs")], Path("study"))
+    assert bench("curricula", "--runs", "study", "--repeats", "1", "--threads", "1") == 0
     assert "a Solver update of perf_gain, Smoke scale" in capsys.readouterr().out
     timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}

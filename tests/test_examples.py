@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
+import proposer_rl as prl
 from proposer_rl.curricula import TaskStudent, outcome_of
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
@@ -49,7 +50,8 @@ def test_each_says_what_it_shows_and_is_listed(name: str) -> None:
     is_task = (EXAMPLES / "conf" / "task" / f"{name}.yaml").exists()
     started = f"task={name}" if is_task else f"python examples/{name}.py"
     assert text.startswith('"""') and started in docstring
-    assert f"{name}.py" in (ROOT / "docs/how_to/own_parts.md").read_text(encoding="utf-8")
+    pages = (ROOT / "docs/how_to" / f"{page}.md" for page in ("own_parts", "own_loop"))
+    assert any(name in page.read_text(encoding="utf-8") for page in pages)
 
 
 def test_the_mountain_car_is_gymnasiums(example: Load) -> None:
@@ -205,3 +207,26 @@ def test_methods_of_ones_own_run_from_the_command_line(
     assert train(*arguments, "hydra.run.dir=run") == 0
     rows = read_csv(Path("run/metrics.csv"))
     assert [row["updates"] for row in rows] == [0, 2, 4, 6]
+
+
+TAUGHT = {"torchrl": 2, "sb3": 512, "single_file": 3, "dqn": 20, "robots": 60, "memory": 22}
+
+
+@pytest.mark.parametrize("name", TAUGHT)
+def test_curricula_in_other_loops_run(
+    example: Load, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    example(f"taught_{name}").main(TAUGHT[name])
+    assert numbers(capsys.readouterr().out, r"(\d+)")
+
+
+def test_each_loop_is_short() -> None:
+    for file in EXAMPLES.glob("taught_*.py"):
+        assert len(file.read_text(encoding="utf-8").splitlines()) <= 60, file.name
+
+
+def test_a_curriculum_draws_prompts(example: Load) -> None:
+    pytest.importorskip("trl")
+    prompts = example("taught_prompts")
+    within, solved = prompts.main(prl.curricula.plr(**prompts.REPLAY), steps=3)
+    assert 0 <= within <= 1 and 0 <= solved <= 100

@@ -1,6 +1,6 @@
 """A long run needs no more memory and no more open files than a short one.
 
-Here 200 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
+Here 100 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from tests.tiny import composed
 
-UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "200"))
+UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "100"))
 CYCLES = 20
 MIB = 2**20
 
@@ -27,12 +27,8 @@ def resident() -> float:
 
 def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
     options = [
-        *(
-            "+method=perf_gain",
-            "+scale=smoke",
-            "compute.progress=false",
-            "proposer.meta_episode_length=2",
-        ),
+        *("+method=perf_gain", "+scale=smoke", "proposer.meta_episode_length=2"),
+        *("compute.progress=false", "solver.ppo.horizon=5", "solver.ppo.epochs=1"),
         *(f"schedule.updates={UPDATES}", f"schedule.cycle_length={UPDATES // CYCLES}"),
         *(f"schedule.evaluate_every={UPDATES // CYCLES}", "schedule.checkpoint_every=20"),
     ]

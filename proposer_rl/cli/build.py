@@ -53,13 +53,13 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     task = make_task(config)
     with key("task"):
         checked(TaskFacts, task.facts, "task")  # as the run's readers will
-    with key("solver.ppo", other=""):
+    with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
     _check_memory(learner)
     with key("schedule"):
         check_headline(task, config.schedule)
     curriculum = _curriculum(config, task, signals, status)
-    with key("curriculum", other="curriculum: "):
+    with key("curriculum", "curriculum: ", (TypeError, ValueError)):
         require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
     return Made(task, learner, curriculum)
 
@@ -96,7 +96,7 @@ def make_task(config: RunConfig) -> Task:
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
     context = ComputeContext(device, config.precision, compute.cores)
-    with key("task", other="task."):
+    with key("task", "task."):
         task: Task = _made(
             task_maker(config.task), config.solver, context, compute.graphs, str(device)
         )
@@ -140,7 +140,7 @@ def _curriculum(
 
     workers = _workers(config, task, tell)
     components = Components(task, config.proposer, config.seeds, on_update, workers)
-    with key("curriculum", other="curriculum: "):
+    with key("curriculum", "curriculum: ", (TypeError, ValueError)):
         curriculum = curriculum_maker(config.curriculum)(components)
         if not isinstance(curriculum, Curriculum):
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")

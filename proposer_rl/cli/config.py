@@ -7,7 +7,6 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,12 +58,15 @@ class ConfigError(ValueError):
 
 
 @contextmanager
-def key(name: str, other: str = "") -> Iterator[None]:
+def key(
+    name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
+) -> Iterator[None]:
     """Put a key of the configuration before what is said of the arguments that stand below it.
 
     Args:
         name: the key.
-        other: what comes before any other TypeError or ValueError.
+        other: what comes before any other error of these kinds.
+        kinds: that tell of bad input.
 
     Raises:
         ConfigError: in place of all of these.
@@ -73,7 +75,7 @@ def key(name: str, other: str = "") -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except (TypeError, ValueError) as error:
+    except kinds as error:
         lead = f"{name}." if isinstance(error, ArgumentError) else other
         raise ConfigError(f"{lead}{one_line(error)}") from error
 
@@ -184,7 +186,19 @@ def saved_config(folder: Path) -> RunConfig:
     file = folder / "config.json"
     if not file.is_file():
         raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
-    values = stored_config(file)
+    return checked_config(stored_config(file), file)
+
+
+def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
+    """Settings as a run stored them; where it is computed is left to choice.
+
+    Args:
+        values: as read, such as those of a run of a study.
+        file: where they stand, for the error.
+
+    Raises:
+        ConfigError: if they are of another version.
+    """
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return _checked({**values, **free})
@@ -250,10 +264,9 @@ def check_packages(config: DictConfig) -> None:
     Raises:
         ConfigError: naming the file.
     """
-    top = {field.name for field in fields(RunConfig)}
     for group, name in HydraConfig.get().runtime.choices.items():
         below = config.get(group)
-        if not isinstance(below, DictConfig) or not top & {*below}:
+        if not isinstance(below, DictConfig) or group not in below:
             continue
         folders = (Path(source.path) for source in HydraConfig.get().runtime.config_sources)
         files = [folder / group / f"{name}.yaml" for folder in folders]
@@ -262,7 +275,7 @@ def check_packages(config: DictConfig) -> None:
         hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
         raise ConfigError(
             f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
-            f"become {group}.{next(map(str, below))} and so on{hidden if marked else ''}"
+            f"become {group}.{group} and so on{hidden if marked else ''}"
         )
 
 

@@ -65,6 +65,8 @@ class MixtureCurriculum(Curriculum):
         refit: episodes between two mixtures, and that one is fitted to.
         components: the most Gaussians of a mixture; there are at least two.
         exploration: part of the draws that come uniformly from the box.
+        rounded: whether points become bins; else they are levels and tasks as they are, which a
+            space of continuous parameters has (its method ``at``).
 
     Raises:
         ValueError: if scikit-learn is missing, or the numbers of episodes are not in order.
@@ -82,7 +84,12 @@ class MixtureCurriculum(Curriculum):
         refit: TwoOrMore = 250,
         components: TwoOrMore = 10,
         exploration: Share = 0.2,
+        rounded: bool = True,
     ) -> None:
+        if not rounded and not hasattr(space, "at"):
+            raise ArgumentError(
+                f"rounded=false: {type(space).__name__} has bins alone; leave rounded=true"
+            )
         if find_spec("sklearn") is None:
             raise ValueError(
                 f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"
@@ -95,7 +102,7 @@ class MixtureCurriculum(Curriculum):
         self.space = space
         self.needs = ("performance",) if source == "exact" else ()
         self._source, self._components, self._refit = source, components, refit
-        self._warmup, self._exploration = warmup, exploration
+        self._warmup, self._exploration, self._rounded = warmup, exploration, rounded
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
         self._mixtures: list[TaskMixture] = []  # of each student
@@ -116,7 +123,9 @@ class MixtureCurriculum(Curriculum):
         drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
         points = torch.stack(drawn)
         bins = nearest(points.flatten(0, 1), self.space.coordinates.double()).view(points.shape[:2])
-        levels = self.space.generate(bins, [s.generator("levels") for s in streams])
+        draws = [s.generator("levels") for s in streams]
+        make: Any = self.space.generate if self._rounded else getattr(self.space, "at")  # noqa: B009
+        levels = make(bins if self._rounded else points, draws)
         notes = {"bins": bins, "points": points}
         if self._source == "exact":
             reached = student.performance(levels, streams[0].generator("performance"))["return"]
@@ -157,7 +166,9 @@ class MixtureCurriculum(Curriculum):
             self._remember(evidence)
 
     def _remember(self, evidence: TensorDict) -> None:
-        tasks, returns = self.space.coordinates.double()[evidence["bins"]], evidence["returns"]
+        tasks, returns = evidence["points"], evidence["returns"]
+        if self._rounded:
+            tasks = self.space.coordinates.double()[evidence["bins"]]
         progress = torch.zeros_like(returns)
         if history := self._history:
             past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)

@@ -54,6 +54,8 @@ class Modelled(Combinator):
     ) -> None:
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)
+        if labels == "success" and "success" not in self.reads:
+            self.reads = (*self.reads, "success")
         self._features, self._labels = features, labels
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life, scaled=1)
         self._inbox = Inbox()

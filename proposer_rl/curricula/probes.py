@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Space
 
 Measure = Literal["success", "return"]
+MANY = 10_000  # levels of a scoring pass, beyond which its cost is told
 
 
 class Probes:
@@ -31,6 +33,12 @@ class Probes:
 
     def __init__(self, space: Space, count: int, measure: Measure) -> None:
         self._space, self._count, self.measure = space, count, measure
+        if space.size * count > MANY:
+            warnings.warn(
+                f"{space.size:,} bins with {count} probes each: {space.size * count:,} levels are "
+                "evaluated at every scoring pass; fewer bins, or a lower `probes`, cost less",
+                stacklevel=2,
+            )
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 

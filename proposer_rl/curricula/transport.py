@@ -20,6 +20,7 @@ from proposer_rl.task import Space
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MOST_BINS = 4096
 NOTHING = 1e-6  # a share that is rounding of the solver's
 
 
@@ -76,6 +77,11 @@ class TransportCurriculum(BinCurriculum):
             )
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
+        if space.size > MOST_BINS:
+            raise ArgumentError(
+                f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares a linear "
+                "program is made; give its axes fewer"
+            )
         target = target_shares.double()
         self._target = (target / target.sum()).numpy()
         places = space.coordinates.double()

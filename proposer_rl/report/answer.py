@@ -8,7 +8,7 @@ import numpy as np
 
 from proposer_rl.report.comparisons import TOO_FEW, Decision, between, decisions, primary
 from proposer_rl.report.records import LONGEST_TEXT, printable
-from proposer_rl.report.statistics import FEWEST, median_interval
+from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
 
@@ -23,7 +23,7 @@ def answer(study: Study) -> tuple[str, str]:
     outcome, baseline = primary(study), study.baseline
     ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
     best, *others = ranked
-    reached = f"{outcome.name}: {write(median_interval(outcome.values(best)))} (median over seeds)"
+    reached = f"{outcome.name}: {write(outcome.median(best))} (median over seeds)"
     if not others:
         return (
             f"{best.label} is the only method here ({reached}).",

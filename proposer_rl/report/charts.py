@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from proposer_rl.report.comparisons import Outcome, outcomes, updates_needed, waiting_outcome
+from proposer_rl.report.comparisons import Outcome, outcomes
 from proposer_rl.report.measures import (
     COSTS,
     UPDATES,
     Measure,
     Series,
     axis_text,
-    band,
     gains,
     level_means,
     measured,
@@ -29,7 +28,7 @@ from proposer_rl.report.measures import (
 )
 from proposer_rl.report.records import LevelRecord, number, picture
 from proposer_rl.report.runs import Run, share_map
-from proposer_rl.report.statistics import median_interval
+from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
 
@@ -119,15 +118,15 @@ def _levels(study: Study) -> list[Json]:
 def _series(series: Series | None) -> Json:
     if series is None:
         return None
-    found = band(series.rows)
+    median, low, high = median_of(series)
     return {
-        "x": plain(series.x),
-        "median": plain(found.median),
-        "whole": found.whole.tolist(),
-        "low": plain(found.low),
-        "high": plain(found.high),
-        "seeds": [run.seed for run in series.runs],
-        "rows": [plain(row) for row in series.rows],
+        "x": plain(series.columns),
+        "median": plain(median),
+        "whole": series.notna().all().tolist(),
+        "low": plain(low),
+        "high": plain(high),
+        "seeds": series.index.tolist(),
+        "rows": [plain(row) for row in series.to_numpy()],
     }
 
 
@@ -139,7 +138,7 @@ def _outcomes(study: Study) -> list[Json]:
             "sign": outcome.sign,
             "methods": [
                 {
-                    "estimate": plain(_estimate(study, study.group(group.label), outcome)),
+                    "estimate": plain(_estimate(study, group, outcome)),
                     "values": plain(outcome.value(run.until(study.horizon)) for run in group.runs),
                 }
                 for group in study.groups
@@ -149,14 +148,10 @@ def _outcomes(study: Study) -> list[Json]:
     ]
 
 
-def _estimate(study: Study, group: Group | None, outcome: Outcome) -> Sequence[float]:
-    """Estimate and interval; empty without a run of full length."""
-    if group is None:
-        return ()
-    if outcome.name == waiting_outcome(study).name:
-        return updates_needed(study, group) or ()
-    values = outcome.values(group)
-    return median_interval(values) if values else ()
+def _estimate(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
+    """Median and interval; empty without a run of full length."""
+    whole = study.group(group.label)
+    return (whole and outcome.median(whole)) or ()
 
 
 def _stages(study: Study) -> dict[str, Json] | None:

@@ -54,6 +54,11 @@ class Outcome(NamedTuple):
         """The known values of a group's runs."""
         return [value for _, value in self.known(group)]
 
+    def median(self, group: Group) -> Interval | None:
+        """Their median with its interval; None without any."""
+        values = self.values(group)
+        return median_interval(values) if values else None
+
 
 class Decision(NamedTuple):
     """Which of two methods is better, by an outcome.
@@ -94,22 +99,16 @@ def waiting_outcome(study: Study) -> Outcome:
     )
 
 
+def at_the_end(study: Study, name: str, title: str = "") -> Outcome:
+    """A measurement at the horizon."""
+    value = partial(Run.at, measurement=name, updates=study.horizon)
+    return Outcome(title or f"{words(name)} after {study.horizon} updates", value)
+
+
 def outcomes(study: Study) -> list[Outcome]:
     """The primary outcome, then the secondary ones, on which nothing is decided."""
-    ends = [
-        Outcome(
-            f"{words(name)} after {study.horizon} updates",
-            partial(Run.at, measurement=name, updates=study.horizon),
-        )
-        for name in study.measurements
-    ]
+    ends = [at_the_end(study, name) for name in study.measurements]
     return [primary(study), waiting_outcome(study), *ends]
-
-
-def updates_needed(study: Study, group: Group) -> Interval | None:
-    """A group's median of updates to the threshold, cut at the horizon; None without a run."""
-    values = waiting_outcome(study).values(group)
-    return median_interval(values) if values else None
 
 
 def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
@@ -127,7 +126,7 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
 
 def learnt(group: Group, name: str, updates: float) -> bool:
     """Whether a measurement is shown to have grown by then, a rate by more than :data:`ALIKE`."""
-    gains = np.array([run.at(name, updates) - run.metrics[name][0] for run in group.runs])
+    gains = np.array([run.at(name, updates) - run.metrics[name].iloc[0] for run in group.runs])
     known = gains[~np.isnan(gains)]
     if len(known) < FEWEST:
         return False

@@ -11,12 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
-from proposer_rl.report.comparisons import updates_needed, waiting_outcome
+from proposer_rl.report.comparisons import waiting_outcome
 from proposer_rl.report.measures import (
     TRAINED,
     Measure,
     Series,
-    band,
     gains,
     level_means,
     measured,
@@ -27,7 +26,7 @@ from proposer_rl.report.measures import (
     worst_tenths,
 )
 from proposer_rl.report.records import words
-from proposer_rl.report.statistics import FEWEST, HELD
+from proposer_rl.report.statistics import FEWEST, HELD, median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import PANEL, Drawing, Look, axes_of, finish, style
 from proposer_rl.runs.columns import is_rate
@@ -122,11 +121,10 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
     Returns:
         The median, float [n].
     """
-    seen = ~np.isnan(series.rows).all(0)
-    x, rows = series.x[seen], series.rows[:, seen]
-    median, whole, low, high = band(rows)
-    if len(rows) < FEWEST:
-        axes.plot(x, rows.T, alpha=0.5, linewidth=0.6, color=look.colour, linestyle=look.dash)
+    series = series.dropna(axis=1, how="all")
+    x, whole, (median, low, high) = series.columns, series.notna().all(), median_of(series)
+    if len(series) < FEWEST:
+        axes.plot(x, series.T, alpha=0.5, linewidth=0.6, color=look.colour, linestyle=look.dash)
     axes.plot(x, median, alpha=0.5, linewidth=0.8, color=look.colour, linestyle=look.dash)
     axes.plot(x, np.where(whole, median, np.nan), **style(look, len(x)))
     axes.fill_between(x, low, high, color=look.colour, alpha=0.15, linewidth=0)
@@ -164,8 +162,8 @@ def _draw_scatter(figure: FigureBase, study: Study, group: Group, name: str) -> 
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = axes_of(figure)
-    horizon = study.horizon
-    needed = [(updates_needed(study, group), group) for group in study.compared]
+    horizon, outcome = study.horizon, waiting_outcome(study)
+    needed = [(outcome.median(group), group) for group in study.compared]
     found = [(interval, group) for interval, group in needed if interval is not None]
     found.sort(key=lambda each: -each[0].estimate)
     groups = [group for _, group in found]
@@ -190,7 +188,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel(waiting_outcome(study).name)
+    axes.set_xlabel(outcome.name)
 
 
 def _of_measures(

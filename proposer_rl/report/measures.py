@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from proposer_rl.report.records import (
     GAINS,
@@ -22,15 +21,14 @@ from proposer_rl.report.records import (
     words,
 )
 from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
 
 UPDATES = "Solver updates"
 # What training cost beside updates: in words, and of a run at each of its evaluations.
-COSTS: Mapping[str, Callable[[Run], Column]] = {
+COSTS: Mapping[str, Callable[[Run], pd.Series]] = {
     "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
-    "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
+    "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds.iloc[0],
 }
 GRID_POINTS = 100
 SHARES = np.geomspace(0.01, 1.0, 61)  # of the levels, the worst
@@ -50,37 +48,12 @@ RECORDED = "The curricula's own numbers"
 Value = Callable[[Record], float]  # of a cycle; NaN where it has none
 
 
-class Series(NamedTuple):
-    """A number of a method's runs along an axis.
-
-    Attributes:
-        x: places on the axis, [n].
-        rows: of each run, [runs, n], NaN where it has none.
-        runs: whose rows these are.
-    """
-
-    x: Column
-    rows: Column
-    runs: Sequence[Run]
+# A number of a method's runs along an axis: a row for each run, by its seed, and a column for each
+# place on the axis; NaN where a run has none.
+Series: TypeAlias = pd.DataFrame
 
 
-class Band(NamedTuple):
-    """Median and interval of the runs at each place, [n]; NaN where there is none.
-
-    Attributes:
-        median: over the runs that have a value.
-        whole: whether all runs have one, bool [n].
-        low, high: ends of the interval, where all runs have a value.
-    """
-
-    median: Column
-    whole: NDArray[np.bool_]
-    low: Column
-    high: Column
-
-
-@dataclass(frozen=True)
-class Measure:
+class Measure(NamedTuple):
     """A number of every method along one axis or several.
 
     Attributes:
@@ -193,14 +166,11 @@ def over_updates(group: Group, name: str, table: str = "metrics") -> Series | No
 
     Runs that were evaluated at different updates have no value at those of the others.
     """
-    runs = [run for run in group.runs if name in getattr(run, table)]
-    if not runs:
-        return None
-    columns = [getattr(run, table) for run in runs]
-    return _aligned([(own["updates"], own[name]) for own in columns], runs)
+    tables = {run.seed: getattr(run, table) for run in group.runs}
+    return _aligned({s: (own["updates"], own[name]) for s, own in tables.items() if name in own})
 
 
-def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series | None:
+def over_cost(group: Group, name: str, cost: Callable[[Run], pd.Series]) -> Series | None:
     """A measurement against a cost; None where no run has it.
 
     Runs stand at different costs when they are measured, so they are interpolated in between.
@@ -208,39 +178,25 @@ def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series 
     runs = [run for run in group.runs if name in run.metrics]
     if not runs:
         return None
-    x = np.linspace(0, max(cost(run)[-1] for run in runs), GRID_POINTS)
+    x = np.linspace(0, max(cost(run).iloc[-1] for run in runs), GRID_POINTS)
     rows = [np.interp(x, cost(r), r.metrics[name], left=np.nan, right=np.nan) for r in runs]
-    return Series(x, np.array(rows), runs)
+    return pd.DataFrame(rows, [run.seed for run in runs], x)
 
 
 def over_cycles(group: Group, value: Value) -> Series | None:
     """A number of every cycle against updates, for each of the group's records of cycles."""
-    runs = group.logs
-    if not runs:
-        return None
-    columns = [
-        ([number(cycle["updates"]) for cycle in run.cycles], [value(c) for c in run.cycles])
-        for run in runs
-    ]
-    return _aligned(columns, runs)
+    return _aligned(
+        {
+            run.seed: ([number(c["updates"]) for c in run.cycles], [value(c) for c in run.cycles])
+            for run in group.logs
+        }
+    )
 
 
-def _aligned(columns: Sequence[tuple[Iterable[float], Iterable[float]]], runs: list[Run]) -> Series:
-    x = np.unique(np.concatenate([np.asarray(places, float) for places, _ in columns]))
-    rows = np.full((len(runs), len(x)), np.nan)
-    for row, (places, values) in zip(rows, columns, strict=True):
-        row[np.searchsorted(x, np.asarray(places, float))] = values
-    return Series(x, rows, runs)
-
-
-def band(rows: Column) -> Band:
-    """Median and interval over runs.
-
-    Args:
-        rows: [runs, n], NaN where a run has no value.
-    """
-    median, low, high = median_of(rows)
-    return Band(median, np.all(np.isfinite(rows), axis=0), low, high)
+def _aligned(runs: Mapping[int, tuple[Iterable[float], Iterable[float]]]) -> Series | None:
+    """Of each run places and values; None without a run."""
+    rows = {seed: dict(zip(*own, strict=True)) for seed, own in runs.items()}
+    return pd.DataFrame(rows, dtype=float).sort_index().T if rows else None
 
 
 def worst_means(scores: Column, shares: Column) -> Column:
@@ -296,7 +252,8 @@ def _worst_series(group: Group, study: Study, name: str) -> Series | None:
     scores = study.scores(group, name)
     if scores is None:
         return None
-    return Series(SHARES, worst_means(scores, SHARES), study.tellers(group, name))
+    seeds = [run.seed for run in study.tellers(group, name)]
+    return pd.DataFrame(worst_means(scores, SHARES), seeds, SHARES)
 
 
 def _value(cycle: Record, name: str) -> float:

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from proposer_rl.report.comparisons import (
+    at_the_end,
     between,
     decisions,
     difference,
     outcomes,
     primary,
-    updates_needed,
-    waiting_outcome,
 )
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
     INTERVALS,
-    Interval,
     interquartile_mean,
     jackknife,
     median_interval,
@@ -34,7 +32,6 @@ from proposer_rl.report.tables import Cell, Table
 from proposer_rl.runs.columns import is_rate
 
 MILLION = 1e6
-MOST_COLUMNS, DEEPEST = 200, 8
 
 
 def comparison_table(study: Study) -> Table:
@@ -97,7 +94,8 @@ def against_baseline(study: Study) -> Table:
 def group_table(study: Study) -> Table:
     """One row per group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
-    waiting, worst = waiting_outcome(study).name, f"{headline}_worst10"
+    first, waiting, *ends = outcomes(study)
+    shown, worst = [waiting, first, *ends], f"{headline}_worst10"
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         whole = study.group(group.label) or replace(group, runs=())
@@ -107,19 +105,17 @@ def group_table(study: Study) -> Table:
             "method": group.label,
             "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
-            waiting: updates_needed(study, group),
-            primary(study).name: _median(primary(study).values(group)),
+            **{outcome.name: outcome.median(whole) for outcome in shown},
+            **_over_levels(study, group),
         }
-        for name in study.measurements:
-            row[f"{words(name)} after {horizon} updates"] = _median(_known(runs, name, horizon))
-        row |= _over_levels(study, group)
         if any(worst in run.metrics for run in study.runs):
-            row[f"{words(headline)}, worst 10 %"] = _median(_known(runs, worst, horizon))
+            title = f"{words(headline)}, worst 10 %"
+            row[title] = at_the_end(study, worst, title).median(whole)
         cost: dict[str, Callable[[Run], float]] = {
-            "frames (M)": lambda run: run.metrics["frames"][-1] / MILLION,
-            "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
-            "evaluations": lambda run: run.metrics["evaluations"][-1],
-            "seconds per run": lambda run: run.own_seconds[-1],
+            "frames (M)": lambda run: run.last("frames") / MILLION,
+            "with the curriculum's (M)": lambda run: run.total_frames.iloc[-1] / MILLION,
+            "evaluations": lambda run: run.last("evaluations"),
+            "seconds per run": lambda run: run.own_seconds.iloc[-1],
         }
         row |= {
             name: float(np.mean([spent(run) for run in runs or group.runs]))
@@ -163,7 +159,6 @@ def run_table(study: Study) -> Table:
         for run in group.runs:
             reached = run.reached(study.headline, study.threshold)
             censored = math.isnan(reached)
-            last = {name: float(values[-1]) for name, values in run.metrics.items()}
             rows.append(
                 {
                     "method": group.label,
@@ -175,20 +170,11 @@ def run_table(study: Study) -> Table:
                         None if censored else int(reached)
                     ),
                     "threshold": f"censored at {run.updates}" if censored else "reached",
-                    **{f"last {words(name)}": last[name] for name in study.measurements},
-                    "frames": int(last["frames"]),
-                    "the curriculum's frames": int(last["curriculum_frames"]),
-                    "evaluations": int(last["evaluations"]),
-                    "seconds": float(run.own_seconds[-1]),
+                    **{f"last {words(name)}": run.last(name) for name in study.measurements},
+                    "frames": int(run.last("frames")),
+                    "the curriculum's frames": int(run.last("curriculum_frames")),
+                    "evaluations": int(run.last("evaluations")),
+                    "seconds": float(run.own_seconds.iloc[-1]),
                 }
             )
     return Table("runs", "Runs", "Measurements are the run's last.", rows)
-
-
-def _known(runs: Sequence[Run], name: str, updates: float) -> list[float]:
-    found = [run.at(name, updates) for run in runs if name in run.metrics]
-    return [value for value in found if not math.isnan(value)]
-
-
-def _median(values: Sequence[float]) -> Interval | None:
-    return median_interval(values) if values else None

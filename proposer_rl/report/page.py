@@ -103,10 +103,8 @@ def facts(study: Study) -> list[tuple[str, str]]:
 def origin(study: Study) -> list[tuple[str, str]]:
     """With which versions, where, and for how much."""
     runs = study.runs
-    own, spent, evaluations = (
-        sum(float(run.metrics[name][-1]) for run in runs) for name in COST[1:4]
-    )
-    seconds = sum(float(run.own_seconds[-1]) for run in runs)
+    own, spent, evaluations = (sum(run.last(name) for run in runs) for name in COST[1:4])
+    seconds = sum(run.own_seconds.iloc[-1] for run in runs)
     return [
         ("Versions", _distinct(runs, _versions)),
         ("Hardware", _distinct(runs, _hardware)),

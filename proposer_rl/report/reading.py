@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from proposer_rl.report.records import (
     LARGEST,
@@ -26,13 +27,12 @@ from proposer_rl.report.records import (
     number,
     printable,
 )
-from proposer_rl.report.runs import COST, Run, headline_of, measurements_of
-from proposer_rl.report.tidy import LARGEST_FILE, STUDY, read_table
+from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.tidy import LARGEST_FILE, NAMES, STUDY, read_table
 from proposer_rl.runs.columns import is_rate
 from proposer_rl.runs.folder import read_csv, read_jsonl
 
 MOST_FOLDERS = 20_000
-RECORDED = ("metrics", "training", "cycles")  # tables of a study, a row for each moment
 FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
@@ -120,49 +120,59 @@ def _read_folder(folder: Path) -> list[Run]:
         folder,
         _read_json(folder, "config.json"),
         {**(_read_json(folder, "run.json") or {}), **summary},
-        summary.get("updates"),
-        read_csv(_checked(folder, "metrics.csv")),
-        _optional(folder, "training.csv", read_csv),
+        pd.DataFrame(read_csv(_checked(folder, "metrics.csv"))),
+        pd.DataFrame(_optional(folder, "training.csv", read_csv)),
         _optional(folder, "cycles.jsonl", read_jsonl),
-        samples=checked(list[SampleRecord], recorded, "curriculum.jsonl"),
-        levels=checked(list[LevelResults], reached, "levels.jsonl"),
+        checked(list[LevelResults], reached, "levels.jsonl"),
+        checked(list[SampleRecord], recorded, "curriculum.jsonl"),
+        summary.get("updates"),
     )
 
 
 def _read_study(folder: Path) -> list[Run]:
     """Runs as :func:`~proposer_rl.report.tidy.write_study` wrote them; they lie in the folder."""
-    found: dict[str, dict[str, list[Any]]] = {}
-    for name in RECORDED:
-        rows: dict[str, list[Any]] = defaultdict(list)
-        if (folder / f"{name}.csv.gz").exists():
-            read = json.loads if name == "cycles" else float
-            for row in read_table(folder / f"{name}.csv.gz"):
-                rows[row.pop("run")].append({key: read(cell) for key, cell in row.items()})
-        found[name] = rows
-    levels = _study_levels(folder)
+    tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
-    for row in read_table(folder / STUDY):
-        name, facts = row["run"], json.loads(row["facts"])
+    for row in read_table(folder / STUDY).to_dict("records"):
+        name, config, facts = row["run"], json.loads(row["config"]), json.loads(row["facts"])
         if ".." in Path(checked(Text, name, f"{STUDY}: run")).parts or Path(name).is_absolute():
             raise ValueError(f"{STUDY}: {name} leads out of the study")
-        ended, own = facts.get("updates"), [found[table][name] for table in RECORDED]
-        config = json.loads(row["config"])
-        runs += _runs(folder / name, config, facts, ended, *own, samples=[], levels=levels[name])
+        metrics, training, cycles, levels = (
+            tables[table].get(name, pd.DataFrame()) for table in NAMES
+        )
+        recorded = [
+            {key: json.loads(cell) for key, cell in cycle.items() if cell == cell}
+            for cycle in cycles.to_dict("records")
+        ]
+        runs += _runs(
+            folder / name,
+            config,
+            facts,
+            metrics.astype(float),
+            training.astype(float),
+            recorded,
+            _level_results(levels),
+            (),
+            facts.get("updates"),
+        )
     return runs
 
 
-def _study_levels(folder: Path) -> Mapping[str, list[LevelResults]]:
-    values: dict[tuple[str, ...], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    if (folder / "levels.csv.gz").exists():
-        for row in read_table(folder / "levels.csv.gz"):
-            place = (row["run"], row["seed"], row["updates"], row["distribution"])
-            for kind in ("success", "return"):
-                if kind in row:
-                    values[place][kind].append(float(row[kind]))
-    found: dict[str, list[LevelResults]] = defaultdict(list)
-    for (run, seed, updates, distribution), kinds in values.items():
-        about = {"seed": int(seed), "updates": int(updates), "distribution": distribution}
-        found[run].append(checked(LevelResults, {**about, **kinds}, "levels.csv.gz"))
+def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
+    """A table of a study in those of its runs; columns that a run has nothing in are left out."""
+    if not (folder / f"{name}.csv.gz").exists():
+        return {}
+    groups = read_table(folder / f"{name}.csv.gz").groupby("run")
+    return {str(run): own.drop(columns="run").dropna(axis=1, how="all") for run, own in groups}
+
+
+def _level_results(levels: pd.DataFrame) -> list[LevelResults]:
+    place = ["seed", "updates", "distribution"]
+    found = []
+    for (seed, updates, name), own in levels.groupby(place, sort=False) if len(levels) else ():
+        values = own.drop(columns=[*place, "level"]).dropna(axis=1).astype(float).to_dict("list")
+        about = {"seed": int(seed), "updates": int(updates), "distribution": name}
+        found.append(checked(LevelResults, {**about, **values}, "levels.csv.gz"))
     return found
 
 
@@ -170,47 +180,43 @@ def _runs(
     folder: Path,
     config: dict[str, Any] | None,
     facts: dict[str, Any],
-    ended: Any,
-    rows: Sequence[Mapping[str, float]],
-    training: Sequence[Mapping[str, float]],
+    metrics: pd.DataFrame,
+    training: pd.DataFrame,
     cycles: Sequence[Any],
-    *,
-    samples: Sequence[SampleRecord],
     levels: Sequence[LevelResults],
+    samples: Sequence[SampleRecord],
+    ended: Any,
 ) -> list[Run]:
     """A run for each seed, of all that is on record; ``ended`` is its length if it is finished."""
     config = _check_config(config)
     task = checked(TaskFacts, facts["task"], "run.json: task")
-    seeds = sorted({int(row["seed"]) for row in rows})
-    if not seeds:
+    if not len(metrics):
         raise ValueError("metrics.csv has no rows yet")
-    if training and "updates" not in training[0]:
+    if len(training) and "updates" not in training:
         raise ValueError("training.csv has no column 'updates'")
     if any(math.isnan(number(row["updates"])) for row in cycles):
         raise ValueError("cycles.jsonl: updates is no number")
     sheets = [checked(Sheets, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
+    seeds = sorted(metrics["seed"].astype(int).unique().tolist())
     runs = []
     for seed in seeds:
-        metrics = _columns(rows, seed)
-        _check_metrics(metrics, {*COST, *measurements_of(task, metrics), headline_of(config)})
-        updates = int(metrics["updates"][-1])
-        runs.append(
-            Run(
-                folder=folder,
-                seed=seed,
-                shared_by=len(seeds),
-                config=config,
-                facts=facts,
-                task=task,
-                finished=ended == updates,
-                metrics=metrics,
-                training=_columns(training, seed),
-                cycles=cycles,
-                samples=[sample for sample in samples if sample.seed == seed],
-                levels=_levels(levels, seed, updates),
-                sheets=_last_sheets(cycles, sheets, seed),
-            )
+        run = Run(
+            folder=folder,
+            seed=seed,
+            shared_by=len(seeds),
+            config=config,
+            facts=facts,
+            task=task,
+            finished=False,
+            metrics=_of_seed(metrics, seed),
+            training=_of_seed(training, seed),
+            cycles=cycles,
+            samples=[sample for sample in samples if sample.seed == seed],
+            sheets=_last_sheets(cycles, sheets, seed),
         )
+        _check_metrics(run)
+        reached = _levels(levels, seed, run.updates)
+        runs.append(replace(run, finished=ended == run.updates, levels=reached))
     return runs
 
 
@@ -272,22 +278,20 @@ def _rounded(name: str, values: Column) -> Column:
     return np.where(is_rate(name) & (np.abs(values - inside) < ROUNDING), inside, values)
 
 
-def _columns(rows: Sequence[Mapping[str, float]], seed: int) -> dict[str, Column]:
-    own = [row for row in rows if row["seed"] == seed]
-    columns = {}
-    for name in dict.fromkeys(name for row in own for name in row):
-        values = _rounded(name, np.array([row.get(name, math.nan) for row in own], dtype=float))
-        checked(Name, name, "the name of a column")
-        columns[name] = np.where(np.abs(values) < LARGEST, values, np.nan)
-    columns.pop("seed", None)
-    return columns
+def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
+    if not len(table):
+        return table
+    own = table[table["seed"] == seed].drop(columns="seed").astype(float)
+    names = [checked(Name, name, "the name of a column") for name in own]
+    known = own.where(own.abs() < LARGEST)
+    return pd.DataFrame({name: _rounded(name, known[name].to_numpy()) for name in names})
 
 
-def _check_metrics(metrics: Mapping[str, Column], needed: set[str]) -> None:
-    for name in sorted(needed):
-        if name not in metrics:
+def _check_metrics(run: Run) -> None:
+    for name in sorted({*COST, *run.measurements, run.headline}):
+        if name not in run.metrics:
             raise ValueError(f"metrics.csv has no column {name!r}")
-        if not np.isfinite(metrics[name]).all():
+        if run.metrics[name].isna().any():
             raise ValueError(f"metrics.csv: {name} is not always a number")
-    if (np.diff(metrics["updates"]) <= 0).any():
+    if (run.metrics["updates"].diff() <= 0).any():
         raise ValueError("metrics.csv: updates do not grow from row to row")

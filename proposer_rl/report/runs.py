@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from proposer_rl.report.records import (
     Column,
@@ -38,7 +39,7 @@ class Run:
         facts: versions, device, command and length, from ``run.json`` and ``summary.json``.
         task: what ``run.json`` says of the task.
         finished: whether it got to the end of its schedule.
-        metrics, training: columns of the tables, equally long within a table.
+        metrics, training: the tables, float64, a row for each evaluation.
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
         levels: what was reached on every level at the end, [levels], by the measurement's column.
@@ -52,8 +53,8 @@ class Run:
     facts: Mapping[str, Any]
     task: TaskFacts
     finished: bool
-    metrics: Mapping[str, Column]
-    training: Mapping[str, Column]
+    metrics: pd.DataFrame
+    training: pd.DataFrame
     cycles: Sequence[Record]
     samples: Sequence[SampleRecord]
     levels: Mapping[str, Column] = field(default_factory=dict)
@@ -78,12 +79,14 @@ class Run:
     @property
     def headline(self) -> str:
         """The measurement that runs are summed up by."""
-        return headline_of(self.config)
+        return str(self.config["schedule"]["headline"])
 
     @property
     def measurements(self) -> list[str]:
         """A column for each distribution measured on: success or, where that is none, return."""
-        return measurements_of(self.task, self.metrics)
+        columns = ((f"{name}_success", f"{name}_return") for name in self.task.distributions)
+        found = ([name for name in pair if name in self.metrics] for pair in columns)
+        return [names[0] for names in found if names]
 
     @property
     def statistics(self) -> list[str]:
@@ -94,7 +97,7 @@ class Run:
     @property
     def updates(self) -> int:
         """Updates of the Solver at the last evaluation."""
-        return int(self.metrics["updates"][-1])
+        return int(self.last("updates"))
 
     @property
     def planned(self) -> int | None:
@@ -103,14 +106,18 @@ class Run:
         return value if isinstance(value, int) else None
 
     @property
-    def total_frames(self) -> Column:
+    def total_frames(self) -> pd.Series:
         """Environment frames at each evaluation, those that the curriculum spent included."""
         return self.metrics["frames"] + self.metrics["curriculum_frames"]
 
     @property
-    def own_seconds(self) -> Column:
+    def own_seconds(self) -> pd.Series:
         """Wall seconds at each evaluation: an even share where seeds were trained together."""
         return self.metrics["seconds"] / self.shared_by
+
+    def last(self, name: str) -> float:
+        """The last value of a column of the measurements."""
+        return float(self.metrics[name].iloc[-1])
 
     def until(self, horizon: int) -> Run:
         """The run as it was after so many updates, measurements linear between evaluations.
@@ -124,11 +131,10 @@ class Run:
             name: np.append(column[x < horizon], np.interp(horizon, x, column))
             for name, column in self.metrics.items()
         }
-        early = self.training.get("updates", np.empty(0)) <= horizon
         return replace(
             self,
-            metrics=metrics,
-            training={name: column[early] for name, column in self.training.items()},
+            metrics=pd.DataFrame(metrics),
+            training=self.training[self.training.get("updates", pd.Series()) <= horizon],
             cycles=[cycle for cycle in self.cycles if number(cycle["updates"]) < horizon],
             samples=[sample for sample in self.samples if sample.updates <= horizon],
             levels={},
@@ -137,8 +143,7 @@ class Run:
 
     def reached(self, measurement: str, threshold: float) -> float:
         """Updates until a measurement first reached a threshold; NaN where it never did."""
-        reached = self.metrics["updates"][self.metrics[measurement] >= threshold]
-        return float(reached[0]) if len(reached) else math.nan
+        return float(self.metrics["updates"][self.metrics[measurement] >= threshold].min())
 
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
         """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.
@@ -152,11 +157,11 @@ class Run:
 
     def at(self, measurement: str, updates: float) -> float:
         """A measurement after exactly that many updates; NaN where there was none."""
-        found = np.flatnonzero(self.metrics["updates"] == updates)
-        return float(self.metrics[measurement][found[0]]) if len(found) else math.nan
+        row = self.metrics[self.metrics["updates"] == updates]
+        return float(row[measurement].iloc[0]) if len(row) and measurement in row else math.nan
 
     def mean_until(
-        self, measurement: str, budget: float, cost: Callable[[Run], Column] | None = None
+        self, measurement: str, budget: float, cost: Callable[[Run], pd.Series] | None = None
     ) -> float:
         """Mean of a measurement along training; NaN for a run that did not spend the budget.
 
@@ -165,7 +170,8 @@ class Run:
             budget: of what is on the axis.
             cost: of the run at each evaluation, the axis; None for updates.
         """
-        x, y = self.metrics["updates"] if cost is None else cost(self), self.metrics[measurement]
+        axis = self.metrics["updates"] if cost is None else cost(self)
+        x, y = axis.to_numpy(), self.metrics[measurement].to_numpy()
         if x[-1] < budget:
             return math.nan
         end = float(np.interp(budget, x, y))
@@ -188,16 +194,3 @@ class Run:
 def share_map(shares: Column) -> Column:
     """Shares over the first axis (rows) and the second (columns); of one axis a single row."""
     return np.atleast_2d(shares.sum(tuple(range(2, shares.ndim))))
-
-
-def headline_of(config: Mapping[str, Any]) -> str:
-    """The measurement that a run with these settings is summed up by."""
-    headline: str = config["schedule"]["headline"]
-    return headline
-
-
-def measurements_of(task: TaskFacts, metrics: Mapping[str, Column]) -> list[str]:
-    """A column for each distribution measured on: success or, where that is none, return."""
-    columns = [[f"{name}_success", f"{name}_return"] for name in task.distributions]
-    found = [next((name for name in pair if name in metrics), None) for pair in columns]
-    return [name for name in found if name is not None]

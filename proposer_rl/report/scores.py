@@ -6,13 +6,15 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from proposer_rl.report.comparisons import Outcome, at_the_end
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.records import number, printable, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import INTERVALS, median_interval
+from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
 from proposer_rl.runs.columns import is_rate
@@ -113,11 +115,11 @@ def generalisation_table(study: Study, scores: Sequence[Score]) -> Table:
     for group in study.compared:
         row: dict[str, Cell] = {"method": group.label}
         for levels in sets:
-            found = [_result(run, scores, levels, study) for run in group.runs]
-            row |= _row(levels, found)
+            value = partial(_result, scores=scores, levels=levels, study=study)
+            row[levels] = Outcome(levels, value).median(group)
         for name in worst:
-            found = [run.at(name, study.horizon) for run in group.runs if name in run.metrics]
-            row |= _row(words(name).replace("worst10", "on the worst 10 %"), found)
+            title = words(name).replace("worst10", "on the worst 10 %")
+            row[title] = at_the_end(study, name).median(group)
         rows.append(row)
     measure = "Success" if is_rate(study.headline) else "Return"
     note = (
@@ -132,11 +134,6 @@ def _result(run: Run, scores: Sequence[Score], levels: str, study: Study) -> flo
     if score is None:
         return math.nan
     return score.success if is_rate(study.headline) else score.returns
-
-
-def _row(name: str, values: Sequence[float]) -> dict[str, Cell]:
-    known = [value for value in values if not math.isnan(value)]
-    return {name: median_interval(known) if known else None}
 
 
 def whole(groups: Iterable[Group]) -> list[Run]:

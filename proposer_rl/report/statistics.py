@@ -63,19 +63,6 @@ class Estimate(NamedTuple):
         """Two-sided p-value against zero."""
         return float(2 * special.stdtr(self.freedom, -abs(self.value) / self.error))
 
-    def within(self, bound: float) -> bool:
-        """Whether the value is shown to be between ``-bound`` and ``bound``.
-
-        Two one-sided tests, each at 5 %: the interval of 90 % is inside (Schuirmann, Journal of
-        Pharmacokinetics and Biopharmaceutics 15, 1987).
-        """
-        interval = self.interval(1 - 2 * ERROR)
-        return -bound < interval.low and interval.high < bound
-
-    def beyond(self, bound: float) -> float:
-        """p-value of the value being farther from zero than ``bound``, one-sided."""
-        return float(special.stdtr(self.freedom, (bound - abs(self.value)) / self.error))
-
 
 def mean_of(values: Values) -> Estimate:
     """Mean of independent values.
@@ -191,11 +178,6 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
     low = special.betaincinv(wins, losses + 1, ERROR / 2) if wins else 0.0
     high = special.betaincinv(wins + 1, losses, 1 - ERROR / 2) if losses else 1.0
     return Interval(share, float(low), float(high))
-
-
-def majority(count: int, of: int) -> float:
-    """How surely a share is more than a half: the binomial test's p-value, one-sided and exact."""
-    return float(stats.binomtest(count, of, 0.5, alternative="greater").pvalue)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

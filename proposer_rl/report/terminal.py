@@ -105,14 +105,14 @@ def _name(progress: Progress) -> Text:
 def _bar(progress: Progress) -> RenderableType:
     run = progress.runs[0]
     total = run.planned or run.updates
-    frames = f"{run.metrics['frames'][-1]:,.0f} frames"
-    spent = run.metrics["curriculum_frames"][-1]
+    frames = f"{run.last('frames'):,.0f} frames"
+    spent = run.last("curriculum_frames")
     if spent:
         frames += f" + {spent:,.0f} of the curriculum"
     grid = Table.grid(padding=(0, 1))
     bar = ProgressBar(total=max(total, 1), completed=run.updates, width=WIDTH)
     grid.add_row(bar, f"{_updates(progress)} updates")
-    return Group(grid, Text(f"{frames}, {run.metrics['seconds'][-1]:.0f} s"))
+    return Group(grid, Text(f"{frames}, {run.last('seconds'):.0f} s"))
 
 
 def _curves(runs: Sequence[Run]) -> RenderableType:
@@ -191,7 +191,7 @@ def _headline(progress: Progress) -> str:
     if not progress.runs:
         return ""
     name = progress.runs[0].headline
-    values = [float(run.metrics[name][-1]) for run in progress.runs]
+    values = [run.last(name) for run in progress.runs]
     return f"{words(name)} {np.mean(values):.3f}"
 
 

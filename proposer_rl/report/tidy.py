@@ -12,9 +12,10 @@ import gzip
 import io
 import json
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+
+import pandas as pd
 
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import read_bounded, write_atomically
@@ -23,48 +24,47 @@ STUDY = "runs.csv.gz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
 LARGEST_FILE = 64 * 2**20  # bytes, unpacked
 
-Rows = list[dict[str, Any]]
 
-
-def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, Rows]:
-    """What runs recorded, as rows.
+def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.DataFrame]:
+    """What runs recorded, as tables.
 
     Args:
         runs: each with the name that its rows carry.
         key: the column of that name; where it is not the run's, cycles have its seed beside it.
 
     Returns:
-        By the name of the table its rows; tables without rows are left out.
+        By their names; those without rows are left out.
     """
-    found: dict[str, Rows] = {name: [] for name in NAMES}
+    found: dict[str, list[pd.DataFrame]] = {name: [] for name in NAMES}
     seen: set[Path] = set()
     for name, run in runs:
         place = {key: name, "seed": run.seed}
-        for table in ("metrics", "training"):
-            columns: Mapping[str, Any] = getattr(run, table)
-            for values in zip(*columns.values(), strict=True):
-                found[table].append(place | dict(zip(columns, map(_plain, values), strict=True)))
+        for table, own in (("metrics", run.metrics), ("training", run.training)):
+            found[table].append(pd.DataFrame(place, own.index).join(own))
         if run.folder not in seen:  # seeds that were trained together have one curriculum
             whose = {key: name} if key == "run" else place
-            found["cycles"] += [whose | _cycle(cycle) for cycle in run.cycles]
+            cells = (
+                {k: json.dumps(v) for k, v in cycle.items() if v is not None and v == v}
+                for cycle in run.cycles
+            )
+            found["cycles"].append(pd.DataFrame([whose | cycle for cycle in cells]))
         seen.add(run.folder)
-        for distribution in dict.fromkeys(key.rpartition("_")[0] for key in run.levels):
+        for distribution in dict.fromkeys(name.rpartition("_")[0] for name in run.levels):
             # Returns where there is no success, which is what is shown.
             kind = "success" if f"{distribution}_success" in run.levels else "return"
             where = place | {"updates": run.updates, "distribution": distribution}
-            found["levels"] += [
-                where | {"level": level, kind: float(value)}
-                for level, value in enumerate(run.levels[f"{distribution}_{kind}"])
-            ]
-    return {name: rows for name, rows in found.items() if rows}
+            values = run.levels[f"{distribution}_{kind}"]
+            level = {"level": range(len(values)), kind: values}
+            found["levels"].append(pd.DataFrame(where | level))
+    known = {name: [part for part in parts if len(part)] for name, parts in found.items()}
+    return {name: pd.concat(parts) for name, parts in known.items() if parts}
 
 
-def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Rows as CSV; an empty cell where a row has nothing, or no number, under a column."""
-    import pandas as pd  # only now: what looks at runs without writing any comes at once
-
-    # As objects, so that whole numbers stay whole in columns with empty cells.
-    text: str = pd.DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
+def to_csv(table: pd.DataFrame) -> bytes:
+    """A table as CSV; whole numbers without a point, an empty cell where there is none."""
+    text: str = table.to_csv(
+        index=False, lineterminator="\n", float_format=lambda x: repr(float(x)).removesuffix(".0")
+    )
     return text.encode()
 
 
@@ -86,17 +86,17 @@ def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
         }
         for name, run in dict(runs).items()
     ]
-    written = {"runs": listed, **tables(runs)}
+    written = {"runs": pd.DataFrame(listed), **tables(runs)}
     for name in NAMES:
         if name not in written:
             (folder / f"{name}.csv.gz").unlink(missing_ok=True)
-    for name, rows in reversed(written.items()):  # what makes it a study comes last
-        packed = gzip.compress(to_csv(rows), 9, mtime=0)
+    for name, table in reversed(written.items()):  # what makes it a study comes last
+        packed = gzip.compress(to_csv(table), 9, mtime=0)
         write_atomically(folder / f"{name}.csv.gz", packed)
 
 
-def read_table(file: Path) -> Iterator[dict[str, str]]:
-    """The rows of a table of a study, as text; cells that are empty are left out.
+def read_table(file: Path) -> pd.DataFrame:
+    """A table of a study, its cells as text; NaN where one is empty.
 
     Raises:
         ValueError: if it is none, or too large.
@@ -111,17 +111,6 @@ def read_table(file: Path) -> Iterator[dict[str, str]]:
         raise ValueError(f"{file.name} is not packed by gzip: {error}") from None
     if len(text) > LARGEST_FILE or not unpacker.eof:
         raise ValueError(f"{file.name} is cut off, or larger than {LARGEST_FILE // 2**20} MiB")
-    import pandas as pd
-
-    frame = pd.read_csv(io.BytesIO(text), dtype=str, keep_default_na=False, index_col=False)
-    for row in frame.fillna("").to_dict("records"):
-        yield {str(key): cell for key, cell in row.items() if cell}
-
-
-def _cycle(cycle: Mapping[str, Any]) -> dict[str, str]:
-    return {k: json.dumps(v) for k, v in cycle.items() if v is not None and v == v}
-
-
-def _plain(value: Any) -> float | int:
-    number = float(value)
-    return int(number) if number.is_integer() and abs(number) < 2**53 else number
+    return pd.read_csv(
+        io.BytesIO(text), dtype=str, keep_default_na=False, na_values=[""], index_col=False
+    )

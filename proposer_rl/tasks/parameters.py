@@ -14,6 +14,7 @@ Number = int | float
 
 SEED = "seed"
 LARGEST_SEED = 2**31 - 1
+STEP = 0.1  # standard deviation of an edit, as a share of a range
 MOST_BINS = 256  # along an axis; readers of runs take no more
 
 
@@ -47,6 +48,27 @@ class Bins(NamedTuple):
         if low.is_floating_point():
             return low.lerp(high, share)
         return low + (share * (high - low + 1)).long()
+
+    def at(self, share: Tensor) -> Tensor:
+        """The values at these shares of the whole range, float64 [*B] from 0 to 1: [*B]."""
+        if self.wide and self.low.is_floating_point():
+            return self.low[0].lerp(self.high[-1], share)
+        values = torch.arange(int(self.low[0]), int(self.high[-1]) + 1) if self.wide else self.low
+        return values[(share * len(values)).long().clamp(max=len(values) - 1)]
+
+    def moved(self, old: Tensor, noise: Tensor) -> Tensor:
+        """Values [n] moved by a tenth of the range times noise, float64 [n]: [n], within it.
+
+        Whole numbers and single values move by one at least.
+        """
+        if not self.wide:
+            line = self.low.double()
+            place = (line - old.unsqueeze(-1)).abs().argmin(-1)
+            return self.low[(place + _one_at_least(noise, len(line))).clamp(0, len(line) - 1)]
+        low, high = self.low[0], self.high[-1]
+        if self.low.is_floating_point():
+            return (old + noise * STEP * (high - low)).clamp(low, high)
+        return (old + _one_at_least(noise, float(high - low))).clamp(low, high)
 
     def shares(self, of: Bins) -> Tensor:
         """Which of these parts values of other parts lie in, float64 [n].
@@ -102,6 +124,7 @@ class ParameterSpace:
     Args:
         bins: of each parameter, by name.
         seeded: whether levels have seeds.
+        seeds: that they are drawn from.
 
     Example:
         >>> space = ParameterSpace({"gravity": points([5, 10]), "force": intervals(2.0, 18.0, 4)})
@@ -109,8 +132,10 @@ class ParameterSpace:
         (8, ['gravity', 'force', 'seed'])
     """
 
-    def __init__(self, bins: Mapping[str, Bins], seeded: bool = True) -> None:
-        self.bins, self._seeded = dict(bins), seeded
+    def __init__(
+        self, bins: Mapping[str, Bins], seeded: bool = True, seeds: range = range(LARGEST_SEED)
+    ) -> None:
+        self.bins, self._seeded, self._seeds = dict(bins), seeded, seeds
         self.axes = {name: part.middles for name, part in self.bins.items()}
         self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
 
@@ -118,6 +143,8 @@ class ParameterSpace:
     def coordinates(self) -> Tensor:
         """Of each bin, from -1 to 1 along every axis (0 along one of a single bin): [N, D]."""
         lines = [_scaled(values) for values in self.axes.values()]
+        if not lines:
+            return torch.zeros(1, 0)
         return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
 
     def locate(self, levels: TensorDictBase) -> Tensor:
@@ -140,14 +167,66 @@ class ParameterSpace:
         return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts).float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
-        places = torch.unravel_index(choices, [len(values) for values in self.axes.values()])
+        sizes = [len(values) for values in self.axes.values()]
+        places = torch.unravel_index(choices, sizes) if sizes else ()
         level = {
             name: part.draw(place, generator)
             for (name, part), place in zip(self.bins.items(), places, strict=True)
         }
-        if self._seeded:
-            level[SEED] = torch.randint(LARGEST_SEED, choices.shape, generator=generator)
-        return TensorDict(level, choices.shape)
+        return TensorDict({**level, **self._drawn_seeds(choices.shape, generator)}, choices.shape)
+
+    def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        """Levels [K, P] at points of the box [-1, 1]^D that the whole ranges span.
+
+        A parameter of single values has the one whose share of the range the point lies in.
+
+        Args:
+            points: float [K, P, D].
+            generators: of the seeds of each row.
+        """
+        shares = (points.double() + 1) / 2
+        level = {name: part.at(shares[..., i]) for i, (name, part) in enumerate(self.bins.items())}
+        seeds = [self._drawn_seeds(points.shape[1:2], g) for g in generators]
+        drawn = {key: torch.stack([one[key] for one in seeds]) for key in seeds[0]}
+        return TensorDict({**level, **drawn}, points.shape[:2])
+
+    def edit(
+        self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]
+    ) -> TensorDict:
+        """Levels [K, n] after so many steps along one parameter each.
+
+        A number moves by a tenth of its range in the standard deviation, and stays within; a whole
+        number, or one of single values, moves by one at least.
+        """
+        return torch.stack(
+            [self._edited(own, count, g) for own, g in zip(levels, generators, strict=True)]
+        )
+
+    def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
+        levels, shape = levels.clone(), levels.batch_size
+        for _ in range(count):
+            which = torch.randint(len(self.bins), shape, generator=generator)
+            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+            for i, name in enumerate(self.bins):
+                old = levels[name]
+                levels[name] = self._moved(name, old, noise).where(which == i, old)
+        return levels
+
+    def _moved(self, name: str, old: Tensor, noise: Tensor) -> Tensor:
+        """Values [n] of a parameter moved by normal noise, float64 [n]."""
+        return self.bins[name].moved(old, noise)
+
+    def _drawn_seeds(self, shape: torch.Size, generator: torch.Generator) -> dict[str, Tensor]:
+        if not self._seeded:
+            return {}
+        ends = self._seeds.start, self._seeds.stop
+        return {SEED: torch.randint(*ends, shape, generator=generator)}
+
+
+def _one_at_least(noise: Tensor, reach: float) -> Tensor:
+    """Whole steps, int64 [n]: a tenth of a reach times noise, and one at least."""
+    steps = (noise * max(STEP * reach, 1)).round()
+    return steps.where(steps != 0, noise.sign()).long()
 
 
 def _scaled(values: Sequence[Number], points: Tensor | None = None) -> Tensor:

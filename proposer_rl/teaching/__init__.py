@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from proposer_rl.teaching.abilities import ActorStudent
 from proposer_rl.teaching.gymnasium import TaughtEnv
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.sampler import TeacherSampler
@@ -10,6 +11,7 @@ from proposer_rl.teaching.teacher import Teacher
 from proposer_rl.teaching.torchrl import LevelTransform
 
 __all__ = [
+    "ActorStudent",
     "Items",
     "LevelGenerator",
     "LevelSpace",

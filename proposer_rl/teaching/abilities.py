@@ -7,7 +7,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
+from proposer_rl.curricula import Student
+from proposer_rl.curricula.student import VALUE, advantages
+from proposer_rl.learning import DivergedError
+from proposer_rl.meta.first_order import Direction, alignment
 from proposer_rl.settings import ArgumentError
 
 OF_LEVELS = ("values", "optimal_return", "exact_performance", "performance", "play")
@@ -38,3 +43,94 @@ def adapted(name: str, function: Any, given: Callable[[Any], Any]) -> Any:
         return torch.as_tensor(found).unsqueeze(0)
 
     return of_one
+
+
+class ActorStudent(Student):
+    """One student that is an actor, a critic and an optimiser of TorchRL's or of one's own.
+
+    It can do what first-order gain from episodes asks for, ``first_order_sampled``: ``play``,
+    ``sampled_direction`` and ``sampled_alignment``; see :mod:`proposer_rl.meta.first_order` for the
+    formulas. With ``can`` it can do more.
+
+    Args:
+        actor: a :class:`~torchrl.modules.ProbabilisticActor`.
+        critic: writes ``state_value``.
+        optimizer: of the actor's parameters. Where it is an Adam, its second moments say how far a
+            step along each of them goes; else the direction is that of the gradient. Its learning
+            rate is the step of the differences.
+        play: ``play(levels, generator)`` gives a rollout [n, T] of the actor on levels [n].
+        given: from levels inside to levels as ``play`` takes them; that of the space.
+        gamma, lmbda: discount, and decay of the traces of generalised advantages.
+        can: further functions, as of :class:`~proposer_rl.curricula.Student`.
+    """
+
+    def __init__(
+        self,
+        actor: Any,
+        critic: Any,
+        optimizer: torch.optim.Optimizer,
+        play: Callable[[Any, torch.Generator], TensorDictBase],
+        *,
+        given: Callable[[Any], Any],
+        gamma: float = 0.99,
+        lmbda: float = 0.95,
+        **can: Any,
+    ) -> None:
+        super().__init__(
+            gamma=gamma,
+            lmbda=lmbda,
+            sampled_direction=self._sampled_direction,
+            sampled_alignment=self._sampled_alignment,
+            **{name: adapted(name, one, given) for name, one in {"play": play, **can}.items()},
+        )
+        self._actor, self._critic, self._optimizer = actor, critic, optimizer
+
+    def _sampled_direction(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        advantage = self._advantage(rollout)
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+        parameters = dict(self._actor.named_parameters())
+        with torch.enable_grad():
+            gained = (advantage * self._log_prob(rollout)).mean()
+            gradients = torch.autograd.grad(gained, list(parameters.values()))
+        direction = {
+            name: gradient / self._scale(parameter)
+            for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True)
+        }
+        numbers = sum(entry.numel() for entry in direction.values())
+        size = (sum(entry.square().sum() for entry in direction.values()) / numbers) ** 0.5
+        if not bool(torch.as_tensor(size).isfinite() & (torch.as_tensor(size) > 0)):
+            raise DivergedError(f"the target direction has length {float(size)}")
+        return {name: entry / size for name, entry in direction.items()}
+
+    def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
+        advantage = self._advantage(rollout)
+
+        def gained() -> Tensor:
+            return (advantage * self._log_prob(rollout)).mean(-1)
+
+        step = self._optimizer.param_groups[0]["lr"]
+        slope = alignment(self._actor, direction, step, gained)
+        return TensorDict({"slope": slope}, slope.shape)
+
+    def _advantage(self, rollout: TensorDictBase) -> Tensor:
+        if VALUE not in rollout.keys() or VALUE not in rollout["next"].keys():
+            rollout = rollout.copy()
+            with torch.no_grad():
+                rollout[VALUE] = self._critic(rollout.copy())[VALUE]
+                rollout["next", VALUE] = self._critic(rollout["next"].copy())[VALUE]
+        return advantages(self, rollout).float()
+
+    def _log_prob(self, rollout: TensorDictBase) -> Tensor:
+        """Log pi(a_t | s_t), [1, n, T]."""
+        log_prob = self._actor.get_dist(rollout.copy()).log_prob(rollout["action"])
+        return log_prob.reshape(*rollout.batch_size, -1).sum(-1)
+
+    def _scale(self, parameter: Tensor) -> Tensor:
+        """What Adam divides a gradient by; 1 where there is no second moment."""
+        state = self._optimizer.state.get(parameter, {})
+        if "exp_avg_sq" not in state:
+            return torch.ones_like(parameter)
+        groups = self._optimizer.param_groups
+        group = next(g for g in groups if any(p is parameter for p in g["params"]))
+        bias = 1 - group["betas"][1] ** float(state["step"])
+        return (state["exp_avg_sq"] / bias).sqrt() + group["eps"]

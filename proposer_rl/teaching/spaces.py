@@ -18,7 +18,6 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import Bins, ParameterSpace, intervals, points
 
-STEP = 0.1  # standard deviation of an edit, as a share of a range
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
 
@@ -127,48 +126,13 @@ class Parameters(LevelSpace, ParameterSpace):
                 columns[name] = [labels[place] for place in columns[name]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
-    def edit(
-        self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]
-    ) -> TensorDict:
-        """Levels [K, n] after so many steps along one parameter each.
-
-        A number moves by a tenth of its range in the standard deviation, and stays within; a whole
-        number moves by one at least; of texts another one is drawn.
-        """
-        return torch.stack(
-            [self._edited(own, count, g) for own, g in zip(levels, generators, strict=True)]
-        )
-
-    def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
-        levels, shape = levels.clone(), levels.batch_size
-        names = list(self.bins)
-        for _ in range(count):
-            which = torch.randint(len(names), shape, generator=generator)
-            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
-            for i, (name, part) in enumerate(self.bins.items()):
-                low, high = part.low[0], part.high[-1]
-                labels = self._labels[name]
-                step = noise * STEP * (high - low)
-                old = levels[name]
-                if labels is not None:  # another one: so many places further on
-                    others = max(len(labels) - 1, 1)
-                    further = 1 + (noise.abs() * 1e6).long() % others
-                    new = (old + further) % len(labels)
-                elif not part.wide:
-                    near = part.low.double()
-                    at = (near - old.unsqueeze(-1)).abs().argmin(-1)
-                    places = (noise * max(STEP * len(near), 1)).round()
-                    at = (at + places.where(places != 0, noise.sign()).long()).clamp(
-                        0, len(near) - 1
-                    )
-                    new = part.low[at]
-                elif part.low.is_floating_point():
-                    new = (old + step).clamp(low, high)
-                else:
-                    whole = step.round()
-                    new = (old + whole.where(whole != 0, step.sign()).long()).clamp(low, high)
-                levels[name] = new.where(which == i, old)
-        return levels
+    def _moved(self, name: str, old: Tensor, noise: Tensor) -> Tensor:
+        """Of texts another one, so many places further on; numbers as those of any space."""
+        labels = self._labels[name]
+        if labels is None:
+            return super()._moved(name, old, noise)
+        further = 1 + (noise.abs() * 1e6).long() % max(len(labels) - 1, 1)
+        return (old + further) % len(labels)
 
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
         """The bins of a part of the space: one for each parameter or value."""

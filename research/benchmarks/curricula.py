@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.build import Made, parts
-from proposer_rl.cli.config import saved_config
+from proposer_rl.cli.config import RunConfig, checked_config
 from proposer_rl.curricula import LearnedCurriculum, TaskStudent, outcome_of
 from proposer_rl.report.reading import UnreadableRun, find_runs
 from proposer_rl.report.studies import Group, Study, read_studies
@@ -55,7 +55,7 @@ def read_methods(folders: Sequence[str]) -> Study:
     if len(study.compared) < 2:
         raise UnreadableRun("the runs are of one method, with which nothing can be compared")
     for group in study.compared:
-        saved_config(group.runs[0].folder)
+        _config(group)
     return study
 
 
@@ -76,11 +76,16 @@ def _of_runs(options: Options) -> Result:
     return _told(seconds, study.baseline.label, study.title)
 
 
+def _config(group: Group) -> RunConfig:
+    """The settings of a group's first run, in a folder or in a study."""
+    run = group.runs[0]
+    return checked_config(run.config, run.folder)
+
+
 def _made(group: Group, options: Options) -> Made:
     """Task, Solver and curriculum as in a group's first run."""
-    run = group.runs[0]
-    config = saved_config(run.folder)
-    schedule = replace(config.schedule, updates=run.updates)
+    config = _config(group)
+    schedule = replace(config.schedule, updates=group.runs[0].updates)
     compute = replace(config.compute, threads=None, device=options.device)  # as this process has
     whole = replace(config, schedule=schedule, compute=compute)
     return parts(whole, StopSignals())

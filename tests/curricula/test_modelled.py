@@ -23,11 +23,8 @@ from tests.tiny import TASK, composed, sledges, tiny_view_task
 ASKS_THE_MODEL_ALONE = [
     ["+method=model_transport", "+scale=smoke"],
     ["+method=domain_randomization", "+scale=smoke", "+filter=model"],
-    ["+method=currot", "+scale=smoke", "+source=model"],
     ["+method=learning_progress", "+scale=smoke", "+source=model"],
-    ["+method=sfl", "+scale=smoke", "+source=model"],
     ["+method=ncc", "+scale=smoke", "+source=model"],
-    ["+method=plr", "+scale=smoke", "+score=model"],
     ["+method=accel", "+scale=smoke", "+score=model"],
 ]
 

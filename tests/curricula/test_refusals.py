@@ -27,6 +27,7 @@ from proposer_rl.curricula import (
     TransportCurriculum,
 )
 from proposer_rl.settings import ArgumentError
+from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay, selection
 from tests.curricula.scripted import GivenScores
 from tests.tiny import TASK
@@ -120,3 +121,13 @@ def test_what_is_out_of_bounds_is_named(
 def test_a_mixture_is_not_filtered() -> None:
     with pytest.raises(ValueError, match="filter the curricula of a mixture, each by itself"):
         Filtered(Schedule([Mixed(TWO[:1], [1])], []), GivenScores(torch.zeros(1, 1)))
+
+
+def test_what_bins_cost_or_lack_is_told_first() -> None:
+    one, many = (ParameterSpace({"x": intervals(0.0, 1.0, count)}) for count in (1, 5000))
+    with pytest.raises(ArgumentError, match="single bin, so there is nothing to choose"):
+        LearningProgressCurriculum(one)
+    with pytest.raises(ArgumentError, match="5,000 bins: at most 4,096"):
+        TransportCurriculum(many, torch.ones(5000))
+    with pytest.warns(UserWarning, match="5,000 bins with 16 probes each: 80,000 levels"):
+        LearningProgressCurriculum(many)

@@ -451,11 +451,11 @@ def test_more_updates_on_one_batch_recompute_values_and_advantages() -> None:
 
 
 def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
-    """Ten updates: the same actions throughout, and the same weights up to rounding."""
+    """Four updates: the same actions throughout, and the same weights up to rounding."""
     by_level, by_step = learner(2), learner(2, per_step=True)
     assert by_level.agent.encoder is not None and by_step.agent.encoder is None
     start = [parameter.detach().clone() for parameter in by_level.agent.parameters()]
-    for one, other in zip(train(by_level, 10), train(by_step, 10), strict=True):
+    for one, other in zip(train(by_level, 4), train(by_step, 4), strict=True):
         assert torch.equal(one["rollout", "action"], other["rollout", "action"])
         for key, value in one["metrics"].items():
             torch.testing.assert_close(value, other["metrics", key], rtol=1e-3, atol=1e-4)
@@ -466,7 +466,7 @@ def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
         float((end.detach() - begin).abs().max())
         for end, begin in zip(by_level.agent.parameters(), start, strict=True)
     )
-    assert moved > 5e-3
+    assert moved > 2e-3
 
 
 @pytest.mark.parametrize("copies", [1, 2])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from proposer_rl.report.comparisons import difference, outcomes
+from proposer_rl.report.statistics import Estimate, mean_of
 from proposer_rl.report.studies import Study, read_studies
-from research.claims import paper_claims
+from research.claims import beyond, majority, paper_claims, within
 from tests.report.folders import TASK, cycle, write_run
 from tests.report.test_outcomes import FAST, SEEDS, SLOW, curve_of, study_of
 
@@ -82,7 +85,7 @@ def test_a_sure_but_small_difference_does_not_refute_alike(tmp_path: Path) -> No
     (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
     outcome = next(one for one in outcomes(study) if one.name.startswith("OOD"))
     pair = [group for label in ("target", "perf_gain") if (group := study.group(label))]
-    assert difference(outcome, *pair).p < 1e-3 and difference(outcome, *pair).within(0.1)
+    assert difference(outcome, *pair).p < 1e-3 and within(difference(outcome, *pair), 0.1)
     assert verdicts(study)[ALIKE] == "undecided"
 
 
@@ -138,3 +141,17 @@ def test_badge_and_text_tell_the_same(tmp_path: Path) -> None:
         p = float(text.split("p = ")[1].split(" ")[0])
         assert ("the difference is significant" in text) <= (p <= 0.05)
         assert claim == SLIGHTLY or (verdict == "undecided") == (p > 0.05)
+
+
+def test_two_are_alike_where_the_interval_of_90_percent_is_inside() -> None:
+    estimate = Estimate(0.02, 0.03, 9)
+    edge = 0.02 + 1.833113 * 0.03  # of the tables, 9 degrees of freedom at 95 %
+    assert within(estimate, edge + 1e-4) and not within(estimate, edge - 1e-4)
+    assert within(Estimate(-0.02, 0.03, 9), edge + 1e-4)
+    assert math.isnan(beyond(mean_of([1.0]), 1.0)) and not within(mean_of([1.0]), 100)
+
+
+def test_a_majority_is_that_of_the_binomial_law() -> None:
+    for count in range(8):
+        tail = sum(math.comb(7, k) for k in range(count, 8)) / 2**7
+        assert majority(count, 7) == pytest.approx(tail)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -65,13 +66,8 @@ class WorkerEnv(SolverTrainingEnv):
         return state.set("reward", torch.full_like(state["return"], torch.nan))
 
 
-class MakeEnv(Protocol):
-    """Makes a meta-environment of a share of the replicas; can be pickled."""
-
-    def __call__(
-        self, *, share: range, device: str, kind: type[SolverTrainingEnv]
-    ) -> SolverTrainingEnv:
-        """An environment of the class ``kind`` on a device."""
+MakeEnv = Callable[..., SolverTrainingEnv]
+"""Makes an environment of the class ``kind`` for a ``share`` on a ``device``; can be pickled."""
 
 
 def make_worker_env(make_env: MakeEnv, share: range, device: str, threads: int) -> Any:

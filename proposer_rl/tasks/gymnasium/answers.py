@@ -35,7 +35,14 @@ class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; what comes back must be an observation and an info."""
         self._steps, self.in_time = 0, True
-        result = self.env.reset(**given)
+        try:
+            result = self.env.reset(**given)
+        except TypeError as error:
+            if "unexpected keyword argument" not in str(error):
+                raise
+            raise UnfitEnvironmentError(
+                f"reset must take the arguments seed and options: {error} (as in old Gym?)"
+            ) from error
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping)):
             raise UnfitEnvironmentError(
                 "reset must return two values, the observation and an info, which is a "

@@ -17,6 +17,7 @@ from proposer_rl.runs.pictures import written
 from proposer_rl.tasks.gymnasium.env import as_actions, plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.parameters import SEED
 
 # Of pygame, with which most environments draw: no greeting, and no window or sound is needed.
 for name, value in {
@@ -73,7 +74,8 @@ class Camera:
                 return self._drawn(play, actions)
             except Exception:  # as above, of another level
                 self.works = False
-        return written([f"{name} {value:.4g}" for name, value in play.values.items()])
+        numbers = [f"{name} {value:.4g}" for name, value in play.values.items()]
+        return written(numbers or [f"{SEED} {play.seed}"])
 
     def _drawn(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
         self._player.play = play

@@ -125,9 +125,11 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         success: Callable[[Step], bool] | None = None,
     ) -> None:
         self._make, self._succeeded = make, success
-        self._ways = {
-            name: (settings.set, settings.name or name) for name, settings in parameters.items()
-        }
+        self._ways = [
+            (name, settings.set, path)
+            for name, settings in parameters.items()
+            for path in settings.names(name)
+        ]
         self._arguments = self._named("argument", play)
         super().__init__(self._built(play))
         self.play = play
@@ -179,7 +181,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def strays(self) -> str | None:
         """What of the level is not in the environment any more, as a line; None where all is."""
-        for name, (how, path) in self._ways.items():
+        for name, how, path in self._ways:
             line = how == "attribute" and stray(self.unwrapped, path, self._play.values[name])
             if line:
                 return f"parameters.{name}: {line}"
@@ -191,7 +193,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.env.close()
             self.env, self._arguments = self._built(self._play), arguments
         inner = self.env.unwrapped
-        for name, (how, path) in self._ways.items():
+        for name, how, path in self._ways:
             value = self._play.values[name]
             if how == "attribute":
                 try:
@@ -216,11 +218,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _named(self, way: str, play: Play) -> dict[str, float]:
         """The values that get into the environment in one way, by the names they have there."""
-        return {
-            name: play.values[parameter]
-            for parameter, (how, name) in self._ways.items()
-            if how == way
-        }
+        return {name: play.values[parameter] for parameter, how, name in self._ways if how == way}
 
     def _refused(self, play: Play, error: Exception) -> RefusedLevelError:
         level = ", ".join(f"{name}={value:g}" for name, value in play.values.items())

@@ -22,14 +22,15 @@ class ParameterSettings:
     """A number of the environment that differs between levels.
 
     Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
-    parts, within which it is drawn uniformly.
+    parts, within which it is drawn uniformly; without ``bins`` in one.
 
     Attributes:
         set: how it gets into the environment, before each reset: as an attribute, as an argument
             of the constructor (the environment is then built anew where it changes), as an option
             of the reset, or by a function that is called with the environment and the number.
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
-            argument, option or function (which must be given); None for the parameter's own name.
+            argument, option or function (which must be given), or of several that all get the
+            value; None for the parameter's own name.
         values: rising; whole numbers, if all are.
         low, high, bins: of a range.
         target: what is to be mastered: a number; of ``values`` also several, equally likely; of a
@@ -37,7 +38,7 @@ class ParameterSettings:
     """
 
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
-    name: str | None = None
+    name: str | Annotated[list[str], Len(1)] | None = None
     values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
     low: float | None = None
     high: float | None = None
@@ -55,9 +56,14 @@ class ParameterSettings:
             if (low, high, bins) != (None, None, None):
                 raise ValueError("either values, or low, high and bins")
             return points(self.values)
-        if low is None or high is None or bins is None:
-            raise ValueError("needs values, or low, high and bins")
-        return intervals(low, high, bins)
+        if low is None or high is None:
+            raise ValueError("needs values, or low, high and perhaps bins")
+        return intervals(low, high, bins or 1)
+
+    def names(self, own: str) -> list[str]:
+        """Where the value of the parameter, whose own name this is, goes."""
+        name = own if self.name is None else self.name
+        return [name] if isinstance(name, str) else name
 
     def target_bins(self) -> Bins:
         """What of the parameter the Solver is to master.

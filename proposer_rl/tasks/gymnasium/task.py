@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import gymnasium
 import numpy as np
 import torch
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -39,7 +39,7 @@ from proposer_rl.tasks.gymnasium.settings import (
 )
 from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, spaces_of
 from proposer_rl.tasks.gymnasium.trial import tried
-from proposer_rl.tasks.parameters import SEED, ParameterSpace
+from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
 
 # Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
@@ -69,6 +69,8 @@ class GymnasiumTask(Task):
         solver: the Solver's training.
         context: precision and cores.
         transforms: TorchRL's, of the environments as one; of rewards, in training only.
+        train_seeds: number of seeds of the levels that are trained on; ``target`` and ``all`` are
+            then measured on others, and ``train`` on those. None for any seed.
 
     Raises:
         ValueError: naming the key, if there is no such environment or parameter, it refuses a value
@@ -94,6 +96,7 @@ class GymnasiumTask(Task):
         solver: SolverSettings,
         context: ComputeContext,
         transforms: list[Any] | None = None,
+        train_seeds: Annotated[int, Ge(1), Le(LARGEST_SEED - 1)] | None = None,
     ) -> None:
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
@@ -105,9 +108,18 @@ class GymnasiumTask(Task):
         self._vectorization = vectorization
         self._transforms = _checked_transforms(transforms or [])
         self._envs: dict[torch.Size, EnvBase] = {}
-        space, target = _spaces(parameters)
+        train = range(LARGEST_SEED) if train_seeds is None else range(train_seeds)
+        space, target = _spaces(parameters, train)
+        self._test: Mapping[str, ParameterSpace] = {}
+        distributions = {"target": target, "all": space}
+        if train_seeds is not None:
+            distributions["train"] = space
+            both = _spaces(parameters, range(train_seeds, LARGEST_SEED))
+            self._test = dict(zip(("all", "target"), both, strict=True))
+        if parameters:
+            self.edit = space.edit
         super().__init__(
-            distributions={"target": target, "all": space},
+            distributions=distributions,
             target="target",
             space=space,
             solver=solver,
@@ -131,6 +143,7 @@ class GymnasiumTask(Task):
             "parameters": {name: asdict(p) for name, p in parameters.items()},
             "success": asdict(success),
             "evaluation": asdict(evaluation),
+            "train_seeds": train_seeds,
         }
 
     @property
@@ -153,7 +166,8 @@ class GymnasiumTask(Task):
             "Target": "; ".join(
                 f"{name} {' or '.join(_range(*ends) for ends in zip(*bins, strict=True))}"
                 for name, bins in self.target.bins.items()
-            ),
+            )
+            or "any level",
             "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
             f"all bins; {evaluation.episodes} episode(s) on each, with "
             f"{evaluation.actions.replace('_', ' ')} actions",
@@ -187,6 +201,12 @@ class GymnasiumTask(Task):
             return memory_actor_critic(population, seen, memory, distribution_class=distribution)
         module = TensorDictModule(population, seen, ["logits", "state_value"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
+
+    def evaluation_levels(self, name: str) -> TensorDictBase:
+        """The fixed evaluation levels [E] of a distribution, of other seeds than the training's."""
+        distribution = self._test.get(name, self.distributions[name])
+        levels: TensorDictBase = distribution.sample(self._levels, self.stream("levels", name))
+        return levels
 
     def stream(self, use: str, name: str) -> torch.Generator:
         """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
@@ -252,11 +272,9 @@ def _checked_transforms(transforms: list[Any]) -> list[Transform]:
 
 
 def _spaces(
-    parameters: Mapping[str, ParameterSettings],
+    parameters: Mapping[str, ParameterSettings], seeds: range
 ) -> tuple[ParameterSpace, ParameterSpace]:
     """The Proposer's space and the target."""
-    if not parameters:
-        raise ValueError("parameters: at least one: what differs between levels")
     bins, target = {}, {}
     for name, settings in parameters.items():
         try:
@@ -267,7 +285,7 @@ def _spaces(
             bins[name], target[name] = settings.space_bins(), settings.target_bins()
         except ValueError as error:
             raise ValueError(f"parameters.{name}: {error}") from error
-    return ParameterSpace(bins), ParameterSpace(target)
+    return ParameterSpace(bins, seeds=seeds), ParameterSpace(target, seeds=seeds)
 
 
 @contextmanager

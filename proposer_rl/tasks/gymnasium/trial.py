@@ -75,9 +75,10 @@ def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSe
         ("wrappers", partial(wrapper_of, one)) for one in make.wrappers
     ]
     functions += [
-        (f"parameters.{name}.name", partial(imported, given.name))
+        (f"parameters.{name}.name", partial(imported, path if given.name else None))
         for name, given in parameters.items()
         if given.set == "call"
+        for path in given.names(name)
     ]
     for key, find in functions:
         try:
@@ -111,7 +112,9 @@ def _check_wrappers(
             raise WrapperError(
                 make.wrappers[count - 1],
                 "it keeps running statistics or the like, or draws numbers without the seed: the "
-                "same actions on the same level can end otherwise the second time",
+                "same actions on the same level can end otherwise the second time. What all "
+                "environments share is normalised by solver.ppo.normalize_observations and "
+                "normalize_rewards",
             )
         warnings.warn(
             f"{make.env_id}: the same actions on the same level end otherwise the second time: the "

@@ -16,12 +16,13 @@ from tests.meta.workers.curricula import cycles, make
 from tests.meta.workers.test_workers import assert_near
 
 pytestmark = pytest.mark.slow
+LIGHT = {"include_dashboard": False, "include_log_monitor": False}  # Ray gives a machine 30 s
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head without processors, so that any of the others may be lost."""
-    found = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    found = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **LIGHT})
     yield found
     ray.shutdown()
     found.shutdown()
@@ -30,12 +31,12 @@ def cluster() -> Iterator[Cluster]:
 @pytest.fixture(autouse=True)
 def two_machines(cluster: Cluster) -> Iterator[None]:
     """Each test begins with two."""
-    added = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    for _ in range(2):
+        cluster.add_node(num_cpus=1, **LIGHT)
     cluster.wait_for_nodes()
     yield
-    for node in added:
-        if node in cluster.list_all_nodes():
-            cluster.remove_node(node)
+    for node in worker_machines(cluster):
+        cluster.remove_node(node)
 
 
 def settings(cluster: Cluster, cores: int = 1) -> WorkerSettings:
@@ -48,16 +49,12 @@ def worker_machines(cluster: Cluster) -> list[Any]:
 
 def test_machines_that_are_too_small_are_told_at_once(cluster: Cluster) -> None:
     """Together they have as many processors as are asked for, but no worker has two of one."""
-    cluster.add_node(num_cpus=1)
-    cluster.add_node(num_cpus=1)
+    for _ in range(2):
+        cluster.add_node(num_cpus=1, **LIGHT)
     cluster.wait_for_nodes()
-    try:
-        line = r"^workers=2: the Ray cluster has 4 CPU on 5 machines, each worker needs 2 CPU of"
-        with pytest.raises(WorkersError, match=line):
-            cycles(*make(settings(cluster, cores=2)))
-    finally:
-        for node in worker_machines(cluster)[-2:]:
-            cluster.remove_node(node)
+    line = r"^workers=2: the Ray cluster has 4 CPU on 5 machines, each worker needs 2 CPU of"
+    with pytest.raises(WorkersError, match=line):
+        cycles(*make(settings(cluster, cores=2)))
 
 
 def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
@@ -90,7 +87,7 @@ def test_machines_come_and_go_and_the_numbers_stay(cluster: Cluster) -> None:
     task, curriculum = make(settings(cluster))
 
     def one_goes_another_comes() -> None:
-        cluster.add_node(num_cpus=1)
+        cluster.add_node(num_cpus=1, **LIGHT)
         cluster.wait_for_nodes()
         cluster.remove_node(worker_machines(cluster)[0])
 

@@ -99,8 +99,8 @@ def test_a_single_bin_lies_in_the_middle() -> None:
 @pytest.mark.parametrize(
     ("given_", "message"),
     [
-        ({"target": 1.0}, "needs values, or low, high and bins"),
-        ({"target": 1.0, "low": 1.0, "high": 2.0}, "needs values, or low, high and bins"),
+        ({"target": 1.0}, "needs values, or low, high and perhaps bins"),
+        ({"target": 1.0, "low": 1.0, "bins": 2}, "needs values, or low, high and perhaps bins"),
         ({"target": 1.0, "values": [1.0], "bins": 2}, "either values, or low, high and bins"),
         ({"target": 1.0, "values": [2.0, 1.0]}, r"values=\[2.0, 1.0\] must rise"),
         ({"target": 1.0, "low": 2.0, "high": 2.0, "bins": 1}, "low=2.0 must be below high=2.0"),
@@ -113,3 +113,31 @@ def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
     settings = ParameterSettings(**given_)
     with pytest.raises(ValueError, match=message):
         settings.space_bins(), settings.target_bins()
+
+
+def test_points_of_the_box_are_levels_of_all_of_the_range() -> None:
+    """The ends are the range's, not the middles of bins; single values have equal parts of it."""
+    points = torch.linspace(-1, 1, 5).view(1, 5, 1).expand(1, 5, 4)
+    levels = SPACE.at(points, [Streams(0).generator()])[0]
+    assert levels["speed"].tolist() == [0.5, 0.75, 1.0, 1.25, 1.5]
+    assert levels["width"].tolist() == [1.0, 1.0, 2.0, 2.0, 2.0]
+    assert levels["begin"].tolist() == [0, 0, 1, 1, 1] and levels["begin"].dtype == torch.int64
+    assert levels["wind"].tolist() == [-1, -1, 1, 1, 1] and levels["seed"].unique().numel() == 5
+
+
+def test_edits_are_gaussian_steps_along_one_parameter() -> None:
+    space = ParameterSpace(
+        {
+            "mass": ParameterSettings(low=0.0, high=10.0, target=1.0).space_bins(),
+            "kind": ParameterSettings(values=[1, 2, 4, 8], target=1).space_bins(),
+        }
+    )
+    levels = space.at(torch.zeros(1, 4000, 2), [Streams(0).generator()])
+    edited = space.edit(levels, 1, [Streams(1).generator()])[0]
+    moved = edited["mass"] != 5.0
+    assert not (moved & (edited["kind"] != 4)).any() and abs(moved.double().mean() - 0.5) < 0.04
+    assert float(edited["mass"][moved].std()) == pytest.approx(1.0, abs=0.1)  # a tenth of 10
+    assert set(edited["kind"][~moved].tolist()) == {1, 2, 8}  # one or two places further
+    assert torch.equal(edited["seed"], levels["seed"][0])
+    far = space.edit(levels, 100, [Streams(1).generator()])[0]
+    assert 0.0 <= far["mass"].min() < 0.5 < 9.5 < far["mass"].max() <= 10.0

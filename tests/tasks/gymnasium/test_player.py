@@ -17,7 +17,7 @@ from proposer_rl.tasks.gymnasium.player import (
     imported,
 )
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
-from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK
+from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
 
 LEVEL = {"speed": 1.25, "width": 2.0, "begin": 1, "wind": -1}
 CARTPOLE = {
@@ -176,3 +176,24 @@ def test_what_the_environment_refuses_is_told(parameters: dict, values: dict, me
 def test_what_cannot_be_imported_is_told(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         imported(name)
+
+
+@NO_BOX2D
+def test_stumps_stand_where_they_are_asked_for() -> None:
+    """As high and as far apart as the level says, by the bodies in Box2D's world."""
+    names = ("stump_height", "stump_spacing")
+    parameters = {name: ParameterSettings(values=[1.0], target=1.0) for name in names}
+    env_id = "proposer_rl.tasks.gymnasium.stumps:BipedalStumps-v0"
+    player = LevelPlayer(
+        MakeEnvironment(env_id), parameters, Play(dict(zip(names, (1.5, 4.0), strict=True)), 3)
+    )
+    player.reset()
+    inner: Any = player.unwrapped
+    boxes = [body.fixtures[0].shape.vertices for body in inner.terrain]
+    stumps = [[*map(tuple, corners)] for corners in boxes if len(corners) == 4]
+    lefts = sorted(min(x for x, _ in corners) for corners in stumps)
+    rights = sorted(max(x for x, _ in corners) for corners in stumps)
+    gaps = [left - right for left, right in zip(lefts[1:], rights[:-1], strict=True)]
+    assert len(stumps) > 10 and gaps == pytest.approx([4.0] * len(gaps), abs=1e-3)
+    heights = [max(y for _, y in c) - min(y for _, y in c) for c in stumps]
+    assert heights == pytest.approx([1.5] * len(heights), abs=1e-3)

@@ -6,8 +6,7 @@ import base64
 import io
 import json
 import re
-import sys
-from importlib.util import find_spec
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +21,11 @@ from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import env, pictures
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
-from tests.tasks.gymnasium.toys import PARAMETERS, TINY, Walk, walk_task
+from tests.tasks.gymnasium.toys import NO_BOX2D, PARAMETERS, TINY, WALK, Walk, walk_task
 from tests.test_readme import ROOT, commands, write_files
 from tests.tiny import composed
-
-NO_BOX2D = pytest.mark.skipif(
-    sys.version_info >= (3, 14) and find_spec("Box2D") is None,
-    reason="Box2D would have to be compiled for this Python",
-)
 
 
 def picture(record: dict[str, Any]) -> np.ndarray:
@@ -46,7 +41,6 @@ def picture(record: dict[str, Any]) -> np.ndarray:
             {"env_id": "nowhere:Walk-v0"},
             "env_id=nowhere:Walk-v0: a package is missing; install it.*name its folder, as in",
         ),
-        ({"parameters": {}}, "parameters: at least one"),
         (
             {"parameters": {"seed": PARAMETERS["width"]}},
             "parameters.seed: is a column of training.csv",
@@ -247,6 +241,8 @@ def test_of_images_and_continuous_actions_it_learns(image: bool) -> None:
         ("cartpole", (4,), 2),
         pytest.param("lunar_lander", (8,), 4, marks=NO_BOX2D),
         ("minigrid", (7, 7, 3), 7),
+        ("multiroom", (7, 7, 3), 7),
+        pytest.param("bipedal_stumps", (24,), 4, marks=NO_BOX2D),
     ],
 )
 def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: int) -> None:
@@ -259,7 +255,7 @@ def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: i
     assert task.probe(learner.agent, levels).shape == (1, 4, answers)
     start, later = task.record(levels[:1], None), task.record(levels[:1], rollout[0, :1])
     assert picture(start[0]).std() > 1 and not np.array_equal(picture(start[0]), picture(later[0]))
-    assert task.target_shares.count_nonzero() == 1  # all three targets are a bin's
+    assert float(task.target_shares.sum()) == pytest.approx(1)
 
 
 METHODS = [
@@ -301,3 +297,43 @@ def test_the_files_that_the_page_shows_are_all_that_is_needed(
     assert told["space"] == {
         "force": pytest.approx([0.001, 0.002, 0.003, 0.004]), "gravity": [0.001, 0.0025]
     }  # fmt: skip
+
+
+def test_levels_can_be_seeds_alone_of_separate_sets() -> None:
+    task = walk_task(parameters={}, train_seeds=3)
+    trained = task.space.sample(200, Streams(0).generator())["seed"]
+    assert set(trained.tolist()) == {0, 1, 2} >= set(task.evaluated_on["train"]["seed"].tolist())
+    assert (task.evaluated_on["target"]["seed"] >= 3).all()
+    assert set(task.target.sample(200, Streams(0).generator())["seed"].tolist()) == {0, 1, 2}
+    learner = task.learner([Streams(0)])
+    assert {"train_success", "target_success"} <= set(task.measure(learner.agent).keys())
+    learner.env.set_levels(task.space.generate(torch.zeros(1, 4).long(), [torch.Generator()]))
+    learner.update([Streams(1).generator()])
+    (record,) = task.record(task.target.sample(1, torch.Generator()), None)
+    assert record["level"].keys() == {"seed"}
+
+
+def test_one_parameter_can_set_several_numbers() -> None:
+    both = ParameterSettings(name=["engine.speed", "wind"], values=[0.5, 1.0], target=1.0)
+    player = LevelPlayer(MakeEnvironment(WALK), {"both": both}, Play({"both": 0.5}, 0))
+    player.reset()
+    inner: Any = player.unwrapped
+    assert (inner.engine.speed, inner.wind) == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["accel curriculum.edits=2", "plr task.parameters={} task.train_seeds=5",
+     "target task.parameters={}",
+     "alp_gmm curriculum.rounded=false '++curriculum={warmup: 4, refit: 4, components: 2}'"],
+)  # fmt: skip
+@pytest.mark.usefixtures("own_folder")
+def test_levels_without_bins_are_trained_on(method: str, train: Any) -> None:
+    name, *more = shlex.split(method)
+    walk = [
+        f"task.env_id={WALK}", "task.success.kind=terminated", *TINY, "hydra.run.dir=run",
+        "++task.parameters.engine={name: engine.speed, low: 0.5, high: 1.5, target: [1.0, 1.25]}",
+    ]  # fmt: skip
+    kept = walk if "task.parameters={}" not in more else walk[:-1]
+    assert train("task=gymnasium", f"+method={name}", *kept, *more) == 0
+    assert len(read_csv(Path("run/metrics.csv"))) == 3

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
@@ -29,6 +32,12 @@ TINY = [
     "proposer.validation_levels=4", "proposer.probe_levels=2", "schedule.evaluate_every=2",
     "hand_designed.until=[2]", "pool.capacity=8", "pool.candidates=8", "pool.keep=4",
 ]  # fmt: skip
+
+
+NO_BOX2D = pytest.mark.skipif(
+    sys.version_info >= (3, 14) and find_spec("Box2D") is None,
+    reason="Box2D would have to be compiled for this Python",
+)
 
 
 class Engine:

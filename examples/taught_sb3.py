@@ -1,0 +1,39 @@
+"""A curriculum in Stable-Baselines3: CartPole of many gravities in eight environments.
+
+python examples/taught_sb3.py [steps]
+"""
+
+from __future__ import annotations
+
+import sys
+
+import gymnasium
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import proposer_rl as prl
+from proposer_rl.teaching.sb3 import TeacherCallback
+
+SPACE = prl.Parameters({"gravity": (5.0, 25.0), "length": (0.3, 1.0)})
+
+
+def main(steps: int = 20_000) -> PPO:
+    """Train; the log has the curriculum's numbers as ``teacher/NAME``."""
+    teacher = prl.Teacher(prl.curricula.learning_progress(source="episodes"), SPACE, block=16)
+
+    def make() -> gymnasium.Env:
+        env = prl.TaughtEnv(
+            gymnasium.make("CartPole-v1"),
+            teacher,
+            {"gravity": "gravity", "length": "length"},
+            success="truncated",  # it survived
+        )
+        return Monitor(env)
+
+    model = PPO("MlpPolicy", DummyVecEnv([make] * 8), n_steps=64, verbose=1, device="cpu", seed=0)
+    return model.learn(steps, callback=TeacherCallback(teacher))
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

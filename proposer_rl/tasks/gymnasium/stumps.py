@@ -1,0 +1,54 @@
+"""Gymnasium's BipedalWalker on a track of stumps, of some height and with some space in between.
+
+Portelas et al. 2019 (arXiv 1910.07224) made such tracks from Gym's walker; here the grass is that
+of Gymnasium's, and stumps of one width stand on it.
+"""
+
+from __future__ import annotations
+
+from itertools import count, takewhile
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.box2d.bipedal_walker import (
+    TERRAIN_LENGTH,
+    TERRAIN_STARTPAD,
+    TERRAIN_STEP,
+    BipedalWalker,
+)
+
+GREY = (255, 255, 255), (153, 153, 153)
+
+
+class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
+    """The walker, the track from its next reset on.
+
+    Args:
+        render_mode: as of :class:`gymnasium.Env`.
+
+    Attributes:
+        stump_height: in metres of Box2D's; 0 for none.
+        stump_spacing: between two of them.
+    """
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        self.stump_height, self.stump_spacing = 0.0, 3.0
+
+    def _generate_terrain(self, hardcore: bool) -> None:
+        super()._generate_terrain(hardcore)
+        if self.stump_height <= 0:
+            return
+        first, last = TERRAIN_STARTPAD * TERRAIN_STEP, (TERRAIN_LENGTH - 2) * TERRAIN_STEP
+        every = self.stump_spacing + TERRAIN_STEP
+        for x in takewhile(lambda place: place < last, count(first, every)):
+            ground = self.terrain_y[int(x / TERRAIN_STEP)]
+            right, top = x + TERRAIN_STEP, ground + self.stump_height
+            corners: Any = [(x, ground), (right, ground), (right, top), (x, top)]
+            self.fd_polygon.shape.vertices = corners
+            stump = self.world.CreateStaticBody(fixtures=self.fd_polygon)
+            stump.color1, stump.color2 = GREY
+            self.terrain.append(stump)
+
+
+gymnasium.register("BipedalStumps-v0", BipedalStumps, max_episode_steps=2000)

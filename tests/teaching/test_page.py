@@ -1,0 +1,55 @@
+"""The page says of each curriculum what the code asks for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import proposer_rl as prl
+from proposer_rl.recipes import available
+
+PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "own_loop.md"
+TABLE = PAGE.read_text(encoding="utf-8").partition("## What each curriculum needs")[2]
+LINES = [line.split("|")[1:-1] for line in TABLE.splitlines() if line.startswith("| `")]
+ROWS = {
+    name: [*(re.findall(r"\w+", cell) for cell in cells[1:4])]
+    for cells in LINES
+    for name in re.findall(r"`(.+?)`", cells[0])
+}
+NUMBERS = prl.LevelGenerator(lambda n, g: torch.rand(n, generator=g))
+RANGES = prl.Parameters({"gravity": (0.0, 1.0)}, target={"gravity": 1.0}, named={"easy": {}})
+
+
+class Able(prl.Student):
+    """One that can do everything, and does nothing."""
+
+    def lacks(self, name: str) -> None:
+        return None
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_the_table_is_that_of_the_code(row: str) -> None:
+    told, functions, space = ROWS[row]
+    name, _, settings = row.partition("(")
+    recipe = getattr(prl.curricula, name)
+    given: Any = {"source": "episodes"} if settings else {}
+    if name == "hand_designed":
+        given = {"distributions": ["easy"], "until": []}
+    teacher = prl.Teacher(recipe(**given), RANGES, student=Able())
+    assert list(teacher.reads) == told
+    assert list(teacher.curriculum.needs) == functions
+    if {"bins", "target"} & {*space} or name == "accel":
+        with pytest.raises((prl.ArgumentError, TypeError), match=r"bins|target|edits"):
+            prl.Teacher(recipe(**given), NUMBERS, student=Able())
+    elif "named" not in space:
+        prl.Teacher(recipe(**given), NUMBERS, student=Able())
+
+
+def test_it_names_all_that_works_on_spaces() -> None:
+    others = {"perf_gain", "task_difficulty", "paired", "first_order_proposer", "frozen_proposer"}
+    listed = {row.partition("(")[0] for row in ROWS}
+    assert listed | others >= {*available("method")} - others
