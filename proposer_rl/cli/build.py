@@ -20,7 +20,6 @@ from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
 from proposer_rl.methods import Components, Workers, filtered, modelled
 from proposer_rl.models import available_cores
-from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
@@ -51,8 +50,6 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     """
     require_logger(config.logger)
     task = make_task(config)
-    with key("task"):
-        checked(TaskFacts, task.facts, "task")  # as the run's readers will
     with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
     _check_memory(learner)

@@ -21,6 +21,7 @@ from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.report.pictures import draw_run
+from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
 from proposer_rl.runs.lock import locked
@@ -65,6 +66,10 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     status = Status(config.proposer.meta_episode_length)
     config = as_begun(config, path)
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
+    try:
+        checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
+    except ValueError as error:
+        raise ConfigError(one_line(error)) from error
     with locked(path), signals:
         try:
             result = proceed(config, made, path, signals, status)

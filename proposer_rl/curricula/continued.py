@@ -87,8 +87,6 @@ class ContinuedLevels:
         if credits:
             batch, outcome = credits[-1]
             self._shown = batch.levels, outcome["rollout"]
-        elif self._shown is None:
-            self._shown = self._levels[:, :0], update.rollout[:, :0]
         return update, credits
 
     def _propose(self, streams: Sequence[Streams]) -> None:
@@ -150,9 +148,12 @@ class ContinuedLevels:
 
     @property
     def shown(self) -> Played:
-        """The levels that were observed last, and the episodes on them; none of both at first."""
-        assert self._shown is not None  # after an update
-        return self._shown
+        """The levels that were observed last, and the episodes on them [K, m, T].
+
+        Before anything was observed, the levels that are played, without a step (T = 0).
+        """
+        assert self._history is not None  # after an update
+        return self._shown or (self._levels, self._history[:, :, :0])
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs, the actions of episodes that are not over included."""

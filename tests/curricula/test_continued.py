@@ -190,8 +190,18 @@ def test_others_watch_whole_episodes_elsewhere() -> None:
     )
 
 
-def experiment(folder: Path, updates: int) -> Experiment:
-    task = continued_task(normalize_observations=True, normalize_rewards=True)
+def walking() -> Any:
+    return continued_task(normalize_observations=True, normalize_rewards=True)
+
+
+def remembering() -> Any:
+    ppo = PPOSettings(
+        horizon=T, epochs=2, minibatches=3, continue_episodes=True, normalize_rewards=True
+    )
+    return tiny_view_task(solver=SolverSettings(batch_size=P, ppo=ppo))
+
+
+def experiment(folder: Path, updates: int, task: Any) -> Experiment:
     learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
     rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
     curriculum = ReplayCurriculum(
@@ -207,7 +217,7 @@ def experiment(folder: Path, updates: int) -> Experiment:
             evaluate_every=1,
             checkpoint_every=3,
             checkpoint_seconds=None,
-            headline="target_success",
+            headline=task.metrics[0],
         ),
         seeds=SEEDS,
         folder=RunFolder(folder),
@@ -215,8 +225,9 @@ def experiment(folder: Path, updates: int) -> Experiment:
     )
 
 
-def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(tmp_path: Path) -> None:
-    for updates in (5, 12):
-        experiment(tmp_path / "resumed", updates).run()
-    experiment(tmp_path / "whole", 12).run()
+@pytest.mark.parametrize("task", [walking, remembering])
+def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(task: Any, tmp_path: Path) -> None:
+    for updates in (5, 9):
+        experiment(tmp_path / "resumed", updates, task()).run()
+    experiment(tmp_path / "whole", 9, task()).run()
     assert_same_run(tmp_path / "resumed", tmp_path / "whole")

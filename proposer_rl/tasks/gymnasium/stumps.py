@@ -51,4 +51,4 @@ class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
             self.terrain.append(stump)
 
 
-gymnasium.register("BipedalStumps-v0", BipedalStumps, max_episode_steps=2000)
+gymnasium.register("BipedalStumps-v0", f"{__name__}:BipedalStumps", max_episode_steps=2000)
