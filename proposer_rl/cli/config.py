@@ -66,7 +66,7 @@ def key(
     Args:
         name: the key.
         other: what comes before any other error of these kinds.
-        kinds: that tell of bad input.
+        kinds: that mean bad input.
 
     Raises:
         ConfigError: in place of all of these.
