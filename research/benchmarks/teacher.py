@@ -31,7 +31,7 @@ def teacher_calls(options: Options) -> Result:
         seconds = interleave(ways, options.repeats)
     rows = [
         Row(
-            f"an ask and a describe PLR with {SLOTS} slots, {name}, each",
+            f"ask and tell, PLR with {SLOTS} slots, {name}, each",
             "a number by itself: no other library is timed",
             Spread.of([each / count for each in seconds[name]]),
             "ms",
