@@ -139,7 +139,9 @@ def override_value(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, str | Path):
-        return "'" + str(value).replace("\\'", "\\\\'").replace("'", r"\'") + "'"
+        # Hydra takes backslashes as they are, but for those before a quote: these are doubled.
+        text = re.sub(r"(\\+)('|\Z)", r"\1\1\2", str(value))
+        return "'" + text.replace("'", r"\'") + "'"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(k)}: {override_value(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -11,7 +11,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import proposer_rl as prl
@@ -124,7 +124,7 @@ def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
     def train(updates: int, folder: str) -> prl.Run:
         task = prl.tasks.from_gymnasium("CartPole-v1", **CARTPOLE)
         settings = {
-            "solver": {"ppo": {"horizon": 20, "epochs": 1}},
+            "solver": {"ppo": {"horizon": 20, "epochs": 1, "anneal_updates": None}},
             "schedule": {"evaluate_every": 2},
         }
         return prl.train(
@@ -215,6 +215,8 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
+@example("\\")
+@example("\\\\'")
 def test_values_come_through_hydras_grammar(value: object) -> None:
     parsed = OverridesParser.create().parse_override(f"key={override_value(value)}")
     assert parsed.value() == value

@@ -81,7 +81,7 @@ class Parameters(LevelSpace, ParameterSpace):
     Example:
         >>> space = Parameters({"gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, bins=4)
         >>> space.size, space.rows(space.generate(torch.tensor([[7]]), [torch.Generator()])[0])
-        (8, [{'gravity': 23.8..., 'ground': 'stairs'}])
+        (8, [{'gravity': 20.6..., 'ground': 'stairs'}])
     """
 
     def __init__(

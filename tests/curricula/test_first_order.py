@@ -20,6 +20,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
+from proposer_rl.task import Task
 from proposer_rl.tasks.mazes import Level, SpecificationSpace, shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution
 from tests.meta import test_first_order as exact
@@ -100,6 +101,8 @@ class Axes(SpecificationSpace):
 
 class Mazes(Skills):
     """Small mazes with the exact evaluation of what plays them."""
+
+    spectators = Task.spectators
 
     def __init__(self) -> None:
         self.device, self.batch_size, self.distributions = torch.device("cpu"), P, {}

@@ -20,7 +20,6 @@ VIEWS = ["task=view_maze_smoke", "compute.progress=false"]
         ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
         ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
         ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
-        ([*CARS, "+method=accel"], "edits=5: the task has no edit(levels, count, generators)"),
         (
             [*VIEWS, "+method=first_order_gain"],
             "ViewMazeTask must define differentiable_performance",
