@@ -76,7 +76,7 @@ def test_a_run_ends_with_its_picture(train) -> None:
 def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train, capsys) -> None:
     arguments = ["+method=frozen_proposer", *SMOKE, f"checkpoint={checkpoint}"]
     assert train(*arguments, "hydra.run.dir=run") == 2
-    assert f"error: curriculum: {said}\n" in capsys.readouterr().err
+    assert f"error: curriculum.{said}\n" in capsys.readouterr().err
     assert not Path("run").exists()
 
 

@@ -33,7 +33,7 @@ def two_machines(cluster: Cluster) -> Iterator[None]:
     """Each test begins with two."""
     for _ in range(2):
         cluster.add_node(num_cpus=1, **LIGHT)
-    cluster.wait_for_nodes()
+    cluster.wait_for_nodes(timeout=600)
     yield
     for node in worker_machines(cluster):
         cluster.remove_node(node)
@@ -51,7 +51,7 @@ def test_machines_that_are_too_small_are_told_at_once(cluster: Cluster) -> None:
     """Together they have as many processors as are asked for, but no worker has two of one."""
     for _ in range(2):
         cluster.add_node(num_cpus=1, **LIGHT)
-    cluster.wait_for_nodes()
+    cluster.wait_for_nodes(timeout=600)
     line = r"^workers=2: the Ray cluster has 4 CPU on 5 machines, each worker needs 2 CPU of"
     with pytest.raises(WorkersError, match=line):
         cycles(*make(settings(cluster, cores=2)))
@@ -88,7 +88,7 @@ def test_machines_come_and_go_and_the_numbers_stay(cluster: Cluster) -> None:
 
     def one_goes_another_comes() -> None:
         cluster.add_node(num_cpus=1, **LIGHT)
-        cluster.wait_for_nodes()
+        cluster.wait_for_nodes(timeout=600)
         cluster.remove_node(worker_machines(cluster)[0])
 
     try:
