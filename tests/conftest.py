@@ -21,6 +21,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
 from hydra.core.default_element import ResultDefault
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 
 from proposer_rl.cli import run
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -101,7 +102,12 @@ def _seeded() -> None:
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The picture at the end of a run takes a third of a smoke run, and few tests look at it."""
     if request.node.get_closest_marker("pictures") is None:
-        monkeypatch.setattr(run, "draw_run", lambda folder, title: folder / "run.png")
+        monkeypatch.setattr(run, "draw_run", _draw_nothing)
+
+
+def _draw_nothing(folder: Path, title: str) -> Path:
+    Image.new("RGB", (1, 1)).save(folder / "run.png")
+    return folder / "run.png"
 
 
 @pytest.fixture(scope="session")

@@ -94,6 +94,11 @@ GYMNASIUM = [
     *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
     "solver.ppo.minibatches=2", "proposer.validation_levels=2", "proposer.probe_levels=2",
 ]  # fmt: skip
+TASKS = {
+    "box2d": ["lunar_lander", "bipedal_stumps"],
+    "minigrid": ["minigrid", "multiroom"],
+    "mujoco": ["half_cheetah"],
+}
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
 FEW = [*SMOKE, "schedule.evaluate_every=6", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
@@ -126,9 +131,9 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
     elif extra == "alp-gmm":
         # More than 250 episodes, after which a mixture is fitted for the first time.
         yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
-    elif extra in ("box2d", "minigrid"):
-        task = {"box2d": "lunar_lander", "minigrid": "minigrid"}[extra]
-        yield _trained(task, f"task={task}", "+method=domain_randomization", *GYMNASIUM)
+    elif extra in TASKS:
+        for task in TASKS[extra]:
+            yield _trained(task, f"task={task}", "+method=domain_randomization", *GYMNASIUM)
     else:
         logger = ["logger=tensorboard"] if extra == "tensorboard" else []
         yield _trained("run", "+method=target", *FEW, *logger)

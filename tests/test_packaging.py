@@ -60,7 +60,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
 
 
 # Each extra that a method, a task or a command names; the empty one is none.
-NAMED = ["", "alp-gmm", "box2d", "minigrid", "play", "tensorboard"]
+NAMED = ["", "alp-gmm", "box2d", "minigrid", "mujoco", "play", "tensorboard"]
 
 
 @pytest.mark.parametrize("extra", NAMED, ids=[extra or "none" for extra in NAMED])
