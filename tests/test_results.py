@@ -115,7 +115,7 @@ PROSE = {
     "docs/explanation/filtering.md": 5,
     "docs/explanation/first_order.md#Results": 4,
     "docs/explanation/proposer.md#Results": 3,
-    "docs/explanation/replay.md": 12,
+    "docs/explanation/replay.md": 10,
     "docs/explanation/results.md": 2,
     "docs/how_to/reuse_a_proposer.md": 2,
 }

@@ -44,7 +44,7 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: holds no checkpoints"),
+        (["nowhere"], "nowhere: there is no such file or folder"),
         (["{run}", "--explorations", "all"], "argument --explorations: invalid choice: 'all'"),
         (
             ["{run}", "--output", "no/where/snr.json"],
