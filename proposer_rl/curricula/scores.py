@@ -180,7 +180,7 @@ class Scorer:
                 infinity where nothing is known.
 
         Raises:
-            ValueError: if the outcome lacks what :attr:`reads` names.
+            ValueError: if the outcome lacks what ``reads`` names.
         """
         for entry in self.reads:
             if not {entry, "rollout"} & {*outcome.keys()}:

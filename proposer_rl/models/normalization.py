@@ -43,7 +43,7 @@ class RunningMoments(nn.Module):
         self.register_buffer("variance", torch.ones_like(zeros))
 
     def update(self, values: Tensor) -> None:
-        """Take numbers [K, *B, *shape] in, or without replicas [*B, *shape]."""
+        """Take numbers [K, *B, *S] in, or without replicas [*B, *S]."""
         shape = self.mean.shape[self._lead :]
         rows = values.detach().double().reshape(*self.mean.shape[: self._lead], -1, *shape)
         new = rows.shape[self._lead]
@@ -60,16 +60,16 @@ class RunningMoments(nn.Module):
 
     @property
     def deviation(self) -> Tensor:
-        """float32 [K, *shape]; 1 before the first numbers."""
+        """float32 [K, *S]; 1 before the first numbers."""
         return (self.variance + TINY).sqrt().float()
 
     def forward(self, values: Tensor) -> Tensor:
-        """Numbers [K, *B, *shape] without their mean, in standard deviations, cut off far out."""
+        """Numbers [K, *B, *S] without their mean, in standard deviations, cut off far out."""
         mean, deviation = (self.along(each, values) for each in (self.mean, self.deviation))
         return ((values - mean.float()) / deviation).clamp(-LARGEST, LARGEST)
 
     def along(self, moments: Tensor, values: Tensor) -> Tensor:
-        """Moments [K, *shape], to be broadcast against values [K, *B, *shape]."""
+        """Moments [K, *S], to be broadcast against values [K, *B, *S]."""
         between = values.ndim - moments.ndim
         lead = moments.shape[: self._lead]
         return moments.reshape(*lead, *[1] * between, *moments.shape[self._lead :])

@@ -80,8 +80,9 @@ class Parameters(LevelSpace, ParameterSpace):
 
     Example:
         >>> space = Parameters({"gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, bins=4)
-        >>> space.size, space.rows(space.generate(torch.tensor([[7]]), [torch.Generator()])[0])
-        (8, [{'gravity': 20.6..., 'ground': 'stairs'}])
+        >>> (level,) = space.rows(space.generate(torch.tensor([[7]]), [torch.Generator()])[0])
+        >>> space.size, 20 <= level["gravity"] <= 25, level["ground"]
+        (8, True, 'stairs')
     """
 
     def __init__(
