@@ -26,7 +26,7 @@ class RunningMoments(nn.Module):
 
     Args:
         copies: K, or None for a single set.
-        shape: of what has a mean and a variance.
+        shape: S, of what has a mean and a variance.
     """
 
     count: Tensor
