@@ -174,7 +174,7 @@ def _cluster_share(
         processors = max(os.cpu_count() or 1, cores * workers)
         cluster |= {"address": "local", "num_cpus": processors, "include_dashboard": False}
     try:
-        _elsewhere(lambda: ray.init(**cluster, ignore_reinit_error=True), check)
+        _connect(cluster, check)
     except TimeoutError:
         reason = f"no cluster that this machine is part of answers in {SECONDS_TO_ANSWER:.0f} s"
         raise WorkersError(f"ray_address={address}: {reason}") from None
@@ -251,24 +251,30 @@ def _wait(
         time.sleep(EVERY)
 
 
-def _elsewhere(function: Callable[[], Any], check: Callable[[], None]) -> None:
-    """Call a function in another thread.
+def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
+    """Begin with Ray in another thread, which lives as long as the connection.
 
     Ray puts handlers of its own in the place of those that save before the process ends, but only
-    in the main thread; and it goes on asking for a cluster for minutes.
+    in the main thread; and it goes on asking for a cluster for minutes. Linux ends the processes of
+    a cluster of one's own with the thread that has started them, as Ray asks it to.
 
     Raises:
-        TimeoutError: if it does not end in time.
+        TimeoutError: if Ray does not answer in time.
     """
+    import ray
+
     came: Future[None] = Future()
 
-    def call() -> None:
+    def live() -> None:
         try:
-            came.set_result(function())
+            ray.init(**cluster, ignore_reinit_error=True)
+            came.set_result(None)
         except BaseException as error:
             came.set_exception(error)
+        while ray.is_initialized():
+            time.sleep(EVERY)
 
-    threading.Thread(target=call, daemon=True).start()
+    threading.Thread(target=live, daemon=True).start()
     until = time.monotonic() + SECONDS_TO_ANSWER
     while True:
         with suppress(TimeoutError):

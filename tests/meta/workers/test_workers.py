@@ -49,18 +49,7 @@ def lethal(fuse: Path) -> Reward:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "engine",
-    [
-        "multiprocess",
-        pytest.param(
-            "ray",
-            marks=pytest.mark.skipif(
-                "RAY_CLUSTER" not in os.environ, reason="Ray may end this process, too"
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("engine", ["multiprocess", "ray"])
 def test_workers_give_the_numbers_of_one_process_also_where_they_die(
     engine: str, here: Came, tmp_path: Path
 ) -> None:
