@@ -311,7 +311,7 @@ def _wrapped(levels: Any) -> Levels:
 
 
 def _labels(values: Any) -> list[Any] | None:
-    """The choices, where they are no numbers."""
+    """The values of a list some of which are not numbers; None for any other."""
     if isinstance(values, list) and any(not _is_number(value) for value in values):
         return values
     return None
