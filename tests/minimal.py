@@ -109,8 +109,9 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 RUN = "runs"
 SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
 GYMNASIUM = [
-    *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
-    "solver.ppo.minibatches=2", "proposer.validation_levels=2", "proposer.probe_levels=2",
+    *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
+    "solver.ppo.horizon=16", "solver.ppo.minibatches=2",
+    "proposer.validation_levels=2", "proposer.probe_levels=2",
 ]  # fmt: skip
 TASKS = {
     "box2d": ["lunar_lander", "bipedal_stumps"],
@@ -119,7 +120,8 @@ TASKS = {
 }
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
-FEW = [*SMOKE, "schedule.evaluate_every=6", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
+FEW = [*SMOKE, "schedule.evaluate_every=4", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
+FEW += ["schedule.updates=4", "proposer.meta_episode_length=2"]
 
 
 def _trained(name: str, *arguments: str) -> list[str]:
@@ -139,13 +141,13 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
             if method not in others:
                 yield _trained(method, f"+method={method}", *FEW)
         # A run goes on; a Proposer that has learnt is taken over.
-        yield _trained("perf_gain", "+method=perf_gain", *FEW, "schedule.updates=9")
+        yield _trained("perf_gain", "+method=perf_gain", *FEW, "schedule.updates=6")
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
-        yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))
+        yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
     elif extra == "alp-gmm":
         # More than 250 episodes, after which a mixture is fitted for the first time.
         yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
@@ -200,6 +202,10 @@ def _run(extra: str) -> None:
             _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
         run.draw_run = lambda folder, title: folder / "run.png"  # one picture is enough
+    if extra == "":
+        import gymnasium
+
+        gymnasium.make("proposer_rl.tasks.mazes:proposer_rl/Maze-v0")
 
 
 def _end_with(function: Callable[..., None], *given: Any) -> None:

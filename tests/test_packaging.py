@@ -22,7 +22,6 @@ import yaml
 from proposer_rl.cli.config import methods
 from proposer_rl.cli.places import CONFIG_FOLDER, names
 from tests import minimal
-from tests.processes import python
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -162,10 +161,3 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert citation["title"] == PROJECT["name"]
     headings = re.findall(r"^## \[([^]]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == version
-
-
-def test_the_gymnasium_environment_comes_along(built: Built, tmp_path: Path) -> None:
-    code = "import gymnasium; print(gymnasium.make('proposer_rl.tasks.mazes:proposer_rl/Maze-v0'))"
-    process = python(code, path=built.site, folder=tmp_path)
-    assert process.returncode == 0, process.stderr
-    assert "proposer_rl/Maze-v0" in process.stdout

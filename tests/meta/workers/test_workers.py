@@ -63,8 +63,9 @@ def lethal(fuse: Path) -> Reward:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["multiprocess", "ray"])
 def test_workers_give_the_numbers_of_one_process_also_where_they_die(
-    engine: str, here: Came, tmp_path: Path
+    engine: str, here: Came, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else 15: where others compute, none starts
     fuse = tmp_path / "fuse"
     fuse.touch()
     told: list[int] = []
