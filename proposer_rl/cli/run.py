@@ -58,7 +58,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     Args:
         config: the run's settings.
         path: the run's folder.
-        signals: which may ask the run to stop.
+        signals: which may ask the run to stop; inside their context.
 
     Returns:
         The headline measurement at the end.
@@ -73,7 +73,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
         checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
-    with locked(path), signals:
+    with locked(path):
         try:
             result = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin

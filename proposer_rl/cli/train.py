@@ -95,10 +95,11 @@ def _main(hydra_config: DictConfig) -> float:
         forget_failure(path)
         check_groups(overrides())
         check_packages(hydra_config)
-        config = read_config(hydra_config)
-        from proposer_rl.cli.run import train  # only now: it takes seconds
+        with signals:  # already now: amid imports is no place to stop
+            config = read_config(hydra_config)
+            from proposer_rl.cli.run import train  # only now: it takes seconds
 
-        return train(config, path, signals)
+            return train(config, path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error, path), exit_code(error))
