@@ -70,12 +70,7 @@ def to_csv(table: pd.DataFrame) -> bytes:
 
 
 def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
-    """Write the tables of a study; those of a former one are replaced.
-
-    Args:
-        folder: of the study.
-        runs: each with its name, for all seeds of a folder the same.
-    """
+    """Write the tables of a study; those of a former one are replaced."""
     listed = [
         {
             "run": name,
