@@ -42,7 +42,8 @@ class Teacher:
         ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
         teacher.tell(ticket, return_=r, success=ok)
 
-    What was told is taken in when the curriculum proposes next, at every ``block`` tickets.
+    What was told is taken in when the curriculum proposes next, at every ``block`` tickets. Replay
+    draws blocks of more than 128 levels at once, which costs a fraction of one after another.
     Whatever is refused counts nothing, and leaves the teacher as it was.
 
     Args:
