@@ -20,15 +20,17 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
+from proposer_rl.cli.settings import (
+    ComputeSettings,
+    HandDesignedSettings,
+    LoggerSettings,
+    PoolSettings,
+)
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ArgumentError,
-    ComputeSettings,
     FilterSettings,
-    HandDesignedSettings,
-    LoggerSettings,
     ModelSettings,
-    PoolSettings,
     ProposerSettings,
     ScheduleSettings,
     SolverSettings,
