@@ -107,9 +107,9 @@ class PointMassTask(Task):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """The walls of levels [n], and where the mass was in the first episode of [n, T]."""
-        gates = torch.stack([levels["position"], levels["width"]], -1).tolist()
+        gates = list(zip(levels["position"].tolist(), levels["width"].tolist(), strict=True))
         if rollout is None:
-            return [draw(*gate, []) for gate in gates]
+            return [draw(x, width, []) for x, width in gates]
         after = rollout["next", "done"].squeeze(-1).long()
         first = after.cumsum(-1) - after == 0
         before, end = (part["observation"][..., [0, 2]] for part in (rollout, rollout["next"]))
