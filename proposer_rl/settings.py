@@ -481,7 +481,6 @@ class ComputeSettings:
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
-        graphs: replay updates and evaluations as CUDA graphs on a GPU, where it is untried.
         threads: CPU threads of one operation; None leaves torch's choice.
         cores: replicas of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
@@ -492,7 +491,6 @@ class ComputeSettings:
     """
 
     device: str = "auto"
-    graphs: bool = False
     threads: Annotated[int, Ge(1), Le(1024)] | None = None
     cores: Annotated[int, Ge(1), Le(1024)] | None = None
     collector: Literal["single", "multiprocess", "ray"] = "single"

@@ -30,6 +30,15 @@ from proposer_rl.runs.lock import InUseError
 LARGEST_PLAN, MOST_RUNS = 2**20, 10_000
 
 
+class LostJobError(RuntimeError):
+    """A job of another machine or process ended without a word of its run; the message is one line.
+
+    The same command goes on with what is left.
+    """
+
+    exit_code = 6
+
+
 class SweepSummary(Callback):
     """Says after each run what is left of a sweep, and lists its runs when it is over.
 
