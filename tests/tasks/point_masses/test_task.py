@@ -17,7 +17,8 @@ from tests.tiny import point_masses
 TINY = [
     "task=point_mass", "compute.progress=false", "task.max_steps=6", "task.levels=4",
     "solver.batch_size=4", "solver.ppo.horizon=6", "solver.ppo.epochs=1",
-    "solver.ppo.minibatches=2", "schedule.updates=4", "schedule.evaluate_every=2",
+    "solver.ppo.minibatches=2", "solver.ppo.anneal_updates=null", "schedule.updates=4",
+    "schedule.evaluate_every=2",
     "proposer.rollouts=2", "proposer.meta_episode_length=2", "proposer.validation_levels=4",
     "proposer.probe_levels=2", "pool.capacity=8", "pool.candidates=8", "pool.keep=4",
 ]  # fmt: skip
