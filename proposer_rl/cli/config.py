@@ -192,10 +192,6 @@ def saved_config(folder: Path) -> RunConfig:
 def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Settings as a run stored them; where it is computed is left to choice.
 
-    Args:
-        values: as read, such as those of a run of a study.
-        file: where they stand, for the error.
-
     Raises:
         ConfigError: if they are of another version.
     """
@@ -230,9 +226,6 @@ def overrides() -> list[str]:
 def check_groups(given: Sequence[str]) -> None:
     """Refuse groups of which one would undo another, since later ones win, or that do not fit.
 
-    Args:
-        given: overrides as they stand on the command line.
-
     Raises:
         ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them, or a
             scale of ours is of another of our tasks.
@@ -257,9 +250,6 @@ def check_groups(given: Sequence[str]) -> None:
 
 def check_packages(config: DictConfig) -> None:
     """Refuse a file of one's own that Hydra has put below its group, for want of its first line.
-
-    Args:
-        config: as composed by Hydra.
 
     Raises:
         ConfigError: naming the file.

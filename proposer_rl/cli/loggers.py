@@ -56,14 +56,7 @@ def require_logger(settings: LoggerSettings) -> None:
 def logger(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Write | None]:
-    """What writes to a logger of an installed package; None where the run's folder is enough.
-
-    Args:
-        settings: which logger.
-        path: the run's folder, where files of the logger go.
-        name: of the run.
-        config: the run's settings.
-    """
+    """What writes to a logger of an installed package; None where the run's folder is enough."""
     if settings.type == "tensorboard":
         with _tensorboard(path / name, config) as write:
             yield write
