@@ -10,6 +10,7 @@ NAMES = {
     "foresight": "how far ahead first-order gain predicts gains",
     "conditioning": "whether a Proposer conditions on the Solver",
     "intervals": "how often intervals over few seeds hold what they are of",
+    "slurm": "runs under a real Slurm of one node: time-outs, preemption, scancel",
     "pages": "the pages of a study: which curriculum to use, and which claims hold",
 }
 

@@ -1,7 +1,8 @@
-"""jaxued's maze beside ours: what it is given, who is refused, and that its process ends."""
+"""Peers beside ours: what jaxued's maze is given, who is refused, and that its process ends."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from research.benchmarks.__main__ import main
 from research.benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
 from research.benchmarks.peer import jaxued_maze, played
+from research.benchmarks.teacher import beside_syllabus
 from research.benchmarks.timing import threads
 from research.benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
 from tests.commands import call
@@ -78,6 +80,11 @@ def has_ended(note: Path) -> bool:
         (["view", "--jaxued", "/bin/echo"], "--jaxued /bin/echo: it does not run Python; must be"),
         (["meta", "levels", "--jaxued", "p"], "is for the benchmark view, not for meta, levels"),
         (["--jaxued", "p", "--device", "meta"], "measured on the CPU; give --device cpu, not meta"),
+        (
+            ["teacher", "--syllabus", sys.executable],
+            "No module named 'syllabus'; must be an interp",
+        ),
+        (["view", "--syllabus", "p"], "is for the benchmark teacher, not for view"),
     ],
 )
 def test_refused_before_anything_is_measured(
@@ -86,7 +93,7 @@ def test_refused_before_anything_is_measured(
     monkeypatch.chdir(tmp_path)
     assert call(main, *arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: --jaxued ") and message in line
+    assert line.startswith(("error: --jaxued ", "error: --syllabus ")) and message in line
     assert not (tmp_path / "bench.json").exists()
 
 
@@ -121,6 +128,16 @@ def test_rows_hold_the_times_of_the_process_s_own_clock(fake) -> None:
         expected = [seconds / time for time in reversed(mine)]
         assert [row.value.low, row.value.median, row.value.high] == pytest.approx(expected)
     assert has_ended(note)
+
+
+def test_what_syllabus_says_of_its_calls_becomes_rows(tmp_path: Path) -> None:
+    program = tmp_path / "fake"
+    said = {"syllabus": "0", "seconds": {"one": [0.004, 0.001, 0.002], "other": [1.0]}}
+    program.write_text(f"#!{sys.executable}\nprint({json.dumps(json.dumps(said))})\n")
+    program.chmod(0o755)
+    one, other = beside_syllabus(str(program), 16, 3)
+    assert (one.value.low, one.value.median, one.value.high) == (0.001, 0.002, 0.004)
+    assert "Syllabus 0, 4000 tasks, other" in other.what and other.reached is None
 
 
 def test_other_rewards_end_the_comparison_and_the_process(fake) -> None:

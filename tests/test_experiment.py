@@ -20,7 +20,9 @@ from proposer_rl.curricula import (
     Improvement,
     LearnedCurriculum,
     SamplingCurriculum,
+    TaskStudent,
     UnfitStudentError,
+    outcome_of,
 )
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO
@@ -29,6 +31,8 @@ from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.settings import ScheduleSettings
 from proposer_rl.streams import Streams
+from proposer_rl.teaching import Teacher
+from tests.curricula.made import MADE
 from tests.same_run import assert_same_run
 from tests.stops import StopAt
 from tests.tiny import TASK, mountain_cars
@@ -76,6 +80,21 @@ def test_a_run_is_a_plain_loop_of_updates(tmp_path: Path) -> None:
     assert summary["frames"] == 5 * P * T
     assert summary["curriculum_frames"] == summary["evaluations"] == 0
     assert not (tmp_path / "cycles.jsonl").exists()
+
+
+def test_a_teacher_in_a_plain_loop_trains_the_same_solvers(tmp_path: Path) -> None:
+    """The outer loop has no way into a curriculum that others have not."""
+    run = experiment(tmp_path, 7, 8, curriculum=MADE["plr"](), updates=8)
+    run.run()
+    solvers = learner(7, 8)
+    able = TaskStudent(TASK, solvers)
+    teacher = Teacher(MADE["plr"](), TASK, seed=7, students=2, student=able)
+    for update in range(8):
+        solvers.env.set_levels(teacher.propose(P))
+        actions = [Streams(seed, "update", update).generator("actions") for seed in (7, 8)]
+        teacher.observe(outcome_of(solvers.update(actions).rollout))
+    assert (run.learner.snapshot() == solvers.snapshot()).all()
+    assert 0 < teacher.log()["replayed"] < 1
 
 
 def test_seeds_in_one_population_are_those_of_separate_runs(tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 from functools import partial
 from pathlib import Path
 
 import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
+from submitit.core.utils import UncompletedJobError
 
 from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.places import CONFIG_FOLDER
@@ -18,6 +20,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
+from proposer_rl.runs.signals import Interrupted
 from tests.commands import call
 
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=2"]
@@ -231,6 +234,40 @@ def test_other_launchers_run_a_sweep(launcher: list[str], train, capfd) -> None:
     assert train(*arguments, *launcher) == 2
     assert len(states(Path("all"))) == 1
     assert "2 runs: 1 finished, 1 failed" in capfd.readouterr().out
+
+
+def test_a_job_that_is_stopped_is_interrupted_and_its_sweep_says_so(
+    train, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """Submitit waits for a result of every job, which a process that exits does not leave."""
+
+    def stopped(self: Experiment) -> dict[str, float]:
+        if self.seeds == [0]:
+            raise Interrupted(signal.SIGUSR2)
+        return original(self)
+
+    original = Experiment.run
+    arguments = ["-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    monkeypatch.setenv("SUBMITIT_EXECUTOR", "slurm")
+    with monkeypatch.context() as patched:
+        patched.setattr(Experiment, "run", stopped)
+        assert train(*arguments) == 128 + signal.SIGUSR2
+    said = capsys.readouterr()
+    assert "2 runs: 1 finished" in said.out and "failed" not in said.out
+    assert "Traceback" not in said.err
+    assert train(*arguments) == 0
+
+
+def test_a_job_that_leaves_no_result_is_told_in_a_line(
+    train, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def lost(*_: object, **__: object) -> None:
+        raise UncompletedJobError("Job 7 has not produced any output\n(state: CANCELLED)")
+
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.multirun", lost)
+    assert train("-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 6
+    line = "error: no job was sent, or it left no result: Job 7 has not produced any output (state"
+    assert capsys.readouterr().err.startswith(line)
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ import importlib, os, sys
 importlib.import_module(sys.argv[1])
 print(os.environ.get("GOMP_SPINCOUNT"), "torch" in sys.modules)
 """
-MODULES = sorted({script.partition(":")[0] for script in PROJECT["scripts"].values()})
+SCRIPTS = {script.partition(":")[0] for script in PROJECT["scripts"].values()}
+MODULES = sorted({*SCRIPTS, "research.__main__", "research.benchmarks.__main__"})
 
 
 def waits(module: str, **given: str) -> list[str]:

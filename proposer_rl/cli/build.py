@@ -16,10 +16,9 @@ from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, re
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
-from proposer_rl.learning.cuda_graphs import recorded, use
 from proposer_rl.meta.workers import WorkerSettings, shares
 from proposer_rl.methods import Components, Workers, filtered, modelled
-from proposer_rl.models import available_cores
+from proposer_rl.models import available_cores, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
@@ -39,11 +38,6 @@ class Made(NamedTuple):
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
     """Task, Solvers and curriculum of an experiment; nothing is written yet.
-
-    Args:
-        config: the run's settings.
-        signals: which may interrupt a curriculum's long work.
-        status: which is told of its parts.
 
     Raises:
         ConfigError: if settings that are each valid do not go together.
@@ -94,9 +88,7 @@ def make_task(config: RunConfig) -> Task:
         torch.set_num_threads(compute.threads)
     context = ComputeContext(device, config.precision, compute.cores)
     with key("task", "task."):
-        task: Task = _made(
-            task_maker(config.task), config.solver, context, compute.graphs, str(device)
-        )
+        task: Task = _made(task_maker(config.task), config.solver, context, str(device))
     return task
 
 
@@ -115,13 +107,10 @@ def _check_memory(learner: PPO) -> None:
         )
 
 
-def _made(
-    maker: partial[Any], solver: SolverSettings, context: ComputeContext, graphs: bool, device: str
-) -> Any:
+def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """The task on a device; a worker calls it, too."""
-    use(torch.device(device))
-    task = maker(solver=solver, context=context._replace(device=torch.device(device)))
-    return recorded(task) if graphs else task
+    use_device(torch.device(device))
+    return maker(solver=solver, context=context._replace(device=torch.device(device)))
 
 
 def _curriculum(
@@ -207,7 +196,7 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
     cores = compute.cores or max(1, available_cores() // count)
     settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
     context = ComputeContext(precision=task.precision, cores=cores)
-    make = partial(_made, task_maker(config.task), config.solver, context, compute.graphs)
+    make = partial(_made, task_maker(config.task), config.solver, context)
     return Workers(settings, make, tell)
 
 

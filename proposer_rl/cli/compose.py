@@ -46,7 +46,8 @@ def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Pa
                 config[key] = value
         path = folder or Path("outputs") / str(config.method) / _moment(config.seed)
         check_groups(list(overrides))
-        carry_out(read_config(config), path, StopSignals())
+        with StopSignals() as signals:
+            carry_out(read_config(config), path, signals)
     return path
 
 

@@ -29,11 +29,7 @@ def asks_for_help(arguments: Sequence[str]) -> bool:
 
 
 def help_text(arguments: Sequence[str]) -> str:
-    """Usage, what each group has, and examples.
-
-    Args:
-        arguments: of the command; a folder given with ``--config-dir`` is looked into, too.
-    """
+    """Usage, what each group has, also in a folder given with ``--config-dir``, and examples."""
     folders = [CONFIG_FOLDER, *own_folders(arguments)]
     parts = [USAGE]
     for option, meaning in GROUPS.items():
@@ -60,11 +56,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
 
 
 def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
-    """What methods need, by name, where their files have a line ``# Needs:``.
-
-    Args:
-        folders: as of :func:`choices`.
-    """
+    """What methods need, by name, where their files have a line ``# Needs:``."""
     found: dict[str, list[str]] = {}
     for folder in folders:
         for name in names(folder, "method"):

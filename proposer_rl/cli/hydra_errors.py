@@ -19,11 +19,7 @@ _NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults
 
 
 def explained(error: Exception) -> str:
-    """The message of an error from composing a configuration.
-
-    Args:
-        error: of Hydra or of OmegaConf.
-    """
+    """The message of an error from composing a configuration."""
     if isinstance(error, UnicodeDecodeError):
         return _not_utf8(error)
     if isinstance(error, MissingConfigException):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import LARGEST_FILE, ConfigError, RunConfig
-from proposer_rl.cli.errors import SIGNALLED, one_line
+from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import as_begun, check_same_run
@@ -42,7 +43,9 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
-        sys.exit(SIGNALLED + stop.signum)
+        if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
+            raise
+        sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
@@ -52,10 +55,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
 def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 
-    Args:
-        config: the run's settings.
-        path: the run's folder.
-        signals: which may ask the run to stop.
+    It is called inside the context of the signals that may ask the run to stop.
 
     Returns:
         The headline measurement at the end.
@@ -70,7 +70,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
         checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
-    with locked(path), signals:
+    with locked(path):
         try:
             result = proceed(config, made, path, signals, status)
             signals.deliver()  # of a sweep the next run is not to begin

@@ -30,6 +30,15 @@ from proposer_rl.runs.lock import InUseError
 LARGEST_PLAN, MOST_RUNS = 2**20, 10_000
 
 
+class LostJobError(RuntimeError):
+    """A job of another machine or process ended without a word of its run; the message is one line.
+
+    The same command goes on with what is left.
+    """
+
+    exit_code = 6
+
+
 class SweepSummary(Callback):
     """Says after each run what is left of a sweep, and lists its runs when it is over.
 
@@ -98,12 +107,6 @@ def record_failure(folder: Path, error: Exception, message: str, exit_code: int)
     """Record in a run's folder that it failed, and say so.
 
     Of a run that another process is working on nothing is recorded: the folder is not ours.
-
-    Args:
-        folder: of the run.
-        error: what happened.
-        message: in one line.
-        exit_code: of the sweep; 2 for bad input, whose traceback tells nothing.
 
     Returns:
         NaN, for the run's value.

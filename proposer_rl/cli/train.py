@@ -31,10 +31,11 @@ from proposer_rl.cli.config import (
 from proposer_rl.cli.errors import UNFORESEEN, command, exit_code, one_line, refuse
 from proposer_rl.cli.hydra_errors import explained
 from proposer_rl.cli.places import CONFIG_FOLDER
-from proposer_rl.cli.sweep import forget_failure, record_failure
+from proposer_rl.cli.sweep import LostJobError, forget_failure, record_failure
 from proposer_rl.cli.traces import remove_traces
 from proposer_rl.runs.signals import StopSignals
 
+LONGEST = 300  # characters of what is said of a lost job
 BEGUN: list[Path] = []  # folders of this process's runs: what comes after is no matter of overrides
 
 
@@ -54,6 +55,12 @@ def _compose_and_run() -> None:
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
+    except RuntimeError as error:
+        if not type(error).__module__.startswith("submitit."):
+            raise
+        raise LostJobError(
+            f"no job was sent, or it left no result: {one_line(error)[:LONGEST]}"
+        ) from error
     except OSError as error:  # of Hydra's own files
         remove_traces()
         refuse(error, traces.folder())
@@ -88,10 +95,11 @@ def _main(hydra_config: DictConfig) -> float:
         forget_failure(path)
         check_groups(overrides())
         check_packages(hydra_config)
-        config = read_config(hydra_config)
-        from proposer_rl.cli.run import train  # only now: it takes seconds
+        with signals:  # already now: amid imports is no place to stop
+            config = read_config(hydra_config)
+            from proposer_rl.cli.run import train  # only now: it takes seconds
 
-        return train(config, path, signals)
+            return train(config, path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error, path), exit_code(error))

@@ -14,6 +14,8 @@ from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
+CPU = torch.device("cpu")
+
 
 class SomeBins:
     """Levels of some of a space's bins, drawn uniformly.
@@ -114,3 +116,8 @@ def device_of(levels: Levels) -> torch.device:
         return levels.device
     device: torch.device = next(iter(levels.values(True, True))).device
     return device
+
+
+def moved(levels: Levels, device: torch.device) -> Levels:
+    """Levels on a device: the same ones where they are there already."""
+    return levels if device_of(levels) == device else levels.to(device)

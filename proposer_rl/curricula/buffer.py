@@ -1,4 +1,4 @@
-"""A buffer of N levels for each of K Solvers, as pure functions of tensors.
+"""A buffer of N levels for each of K Solvers, and functions that change it.
 
 Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with a score
 of how much there is to learn on them, and draws them again from
@@ -17,22 +17,20 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
   drawn or scored; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
   for none; ``generation`` int64: edits since a level that was generated; ``draws`` int64.
-
-Functions return a changed copy and leave the buffer that they are given as it was.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula import slots as rows
+from proposer_rl.curricula.batches import CPU, moved
 from proposer_rl.curricula.keys import level_keys
-from proposer_rl.curricula.slots import draw
-from proposer_rl.curricula.slots import insert as insert_levels
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
@@ -151,35 +149,39 @@ def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule)
 
 
 def draw_slots(
-    buffer: TensorDictBase, count: int, rule: ReplayRule, generators: Sequence[torch.Generator]
-) -> tuple[Tensor, TensorDict]:
+    buffer: TensorDictBase,
+    count: int,
+    rule: ReplayRule,
+    generators: Sequence[torch.Generator],
+    wanted: Tensor | None = None,
+) -> Tensor:
     """Draw levels one after another: each draw advances the clock and makes its level fresh.
 
     Args:
-        buffer: with a level in some slot of every copy.
+        buffer: with a level in some slot of every copy that is drawn from.
         count: number P of draws.
         rule: of the draws.
         generators: one for each copy.
+        wanted: bool [K], of the copies that are drawn from; None for all.
 
     Returns:
-        Slots int64 [K, P], and the buffer afterwards.
+        Slots int64 [K, P]; those of other copies are 0.
     """
-    by_score = score_weights(buffer["score"], buffer["filled"], rule).numpy()
-    changed = {name: buffer[name].clone() for name in ("touched", "clock")}
-    drawn = []
-    for copy, generator in enumerate(generators):
-        numbers = _row({"filled": buffer["filled"], **changed}, copy)
-        noise = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
-        drawn.append(torch.from_numpy(draw(numbers, by_score[copy], rule.staleness, noise)))
-    slots = torch.stack(drawn)
-    draws = buffer["draws"].scatter_add(1, slots, torch.ones_like(slots))
-    return slots, _changed(buffer, **changed, draws=draws)
+    entries = dict(buffer.items())
+    by_score = score_weights(entries["score"], entries["filled"], rule).numpy()
+    slots = torch.zeros(len(generators), count, dtype=torch.int64)
+    for copy in _copies(wanted, len(slots)):
+        noise = torch.rand(count, generator=generators[copy], dtype=torch.float64).numpy()
+        drawn = rows.draw(_row(entries, copy), by_score[copy], rule.staleness, noise)
+        slots[copy] = torch.from_numpy(drawn)
+        entries["draws"][copy].scatter_add_(0, slots[copy], torch.ones_like(slots[copy]))
+    return slots
 
 
 def insert(
     buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule, wanted: Tensor | None = None
-) -> TensorDict:
-    """Levels that were scored, one after another, each in a place of its own.
+) -> None:
+    """Insert levels that were scored, one after another, each in a place of its own.
 
     A level that is there already gets its new score. Another one gets the next free slot; where
     there is none, that of the level that is least likely to be drawn, if its score is higher than
@@ -193,40 +195,38 @@ def insert(
         rule: of the draws.
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
-    keys = level_keys(new["level"])
+
+    def weigh(falling: rows.Floats) -> rows.Floats:
+        count = torch.tensor([len(falling)])
+        return shares_by_rank(torch.from_numpy(falling), count, rule).numpy()
+
+    entries, fresh = dict(buffer.items()), dict(new.items())
+    keys = level_keys(fresh["level"])
     none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
-    buffer = buffer.clone()
-    for copy in range(len(keys)) if wanted is None else wanted.nonzero().flatten().tolist():
-        score, *seen = _of_equals(keys[copy], *(new[name][copy] for name in ("score", *SEEN)))
-        row = _row(buffer.exclude("level"), copy)
-        source, again = insert_levels(
-            row,
-            keys[copy].tolist(),
-            score.tolist(),
-            rule.staleness,
-            lambda falling: shares_by_rank(
-                torch.from_numpy(falling), torch.tensor([len(falling)]), rule
-            ).numpy(),
-            by_rank=rule.prioritization == "rank",
-        )
-        if again:
-            slots, which = torch.tensor(again).unbind(1)
-            for name, entry in zip(SEEN, seen, strict=True):
-                there = buffer[name][copy]
-                there.scatter_reduce_(0, slots, entry[which].to(there), "amax")
-        slots = torch.from_numpy((source >= 0).nonzero()[0])
-        which = torch.from_numpy(source)[slots]
+    for copy in _copies(wanted, len(keys)):
+        score, *seen = _of_equals(keys[copy], *(fresh[name][copy] for name in ("score", *SEEN)))
+        given = _row(entries, copy), keys[copy].numpy(), score.numpy(), rule.staleness, weigh
+        if len(score) > rows.ONE_BY_ONE:
+            source, again = map(torch.from_numpy, rows.insert_at_once(*given))
+        else:
+            by_rank = rule.prioritization == "rank"
+            source, again = map(torch.from_numpy, rows.insert(*given, by_rank=by_rank))
+        for name, entry in zip(SEEN, seen, strict=True):
+            there = entries[name][copy]
+            there.scatter_reduce_(0, again[0], entry[again[1]].to(there), "amax")
+        slots = (source >= 0).nonzero().flatten()
+        which = source[slots]
         told = {
             **dict(zip(SEEN, seen, strict=True)),
-            "parent": new.get("parent", none)[copy],
-            "generation": new.get("generation", none)[copy],
+            "parent": fresh.get("parent", none)[copy],
+            "generation": fresh.get("generation", none)[copy],
             "draws": none[copy],
-            "reached": new.get("reached", unknown)[copy],
+            "reached": fresh.get("reached", unknown)[copy],
         }
         for name, entry in told.items():
-            buffer[name][copy, slots] = entry[which].to(buffer[name])
-        buffer["level"][copy, slots] = new["level"][copy, which].cpu()
-    return buffer
+            there = entries[name][copy]
+            there[slots] = entry[which].to(there)
+        entries["level"][copy, slots] = moved(fresh["level"][copy, which], CPU)
 
 
 def rescore(
@@ -236,8 +236,8 @@ def rescore(
     best: Tensor,
     solved: Tensor,
     reached: Tensor | None = None,
-) -> TensorDict:
-    """New scores of levels that were drawn.
+) -> None:
+    """Take new scores of levels that were drawn.
 
     Args:
         buffer: [K, N].
@@ -248,12 +248,12 @@ def rescore(
         reached: float [K, P], the returns, taken as scores are; None where nobody was trained.
     """
     new = {"score": score, **({} if reached is None else {"reached": reached})}
-    means = {name: _mean_of_slots(buffer[name], slots, entry) for name, entry in new.items()}
-    seen = {
-        name: buffer[name].scatter_reduce(1, slots, new.to(buffer[name]), "amax")
-        for name, new in zip(SEEN, (best, solved), strict=True)
-    }
-    return _changed(buffer, **means, **seen)
+    for name, entry in new.items():
+        there = buffer[name]
+        there.copy_(_mean_of_slots(there, slots, entry))
+    for name, entry in zip(SEEN, (best, solved), strict=True):
+        there = buffer[name]
+        there.scatter_reduce_(1, slots, entry.to(there), "amax")
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
@@ -264,9 +264,14 @@ def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
     return means.to(old).where(counts > 0, old)
 
 
-def _row(buffer: Any, copy: int) -> dict[str, Any]:
-    """The numbers of one student, as arrays that share the buffer's memory."""
-    return {name: entry[copy].numpy() for name, entry in buffer.items()}
+def _copies(wanted: Tensor | None, copies: int) -> list[int]:
+    return list(range(copies)) if wanted is None else wanted.nonzero().flatten().tolist()
+
+
+def _row(entries: Mapping[str, Any], copy: int) -> dict[str, Any]:
+    """The numbers of one student, as arrays that share a buffer's memory."""
+    names = ("filled", "score", "key", "touched", "clock")
+    return {name: entries[name][copy].numpy() for name in names}
 
 
 def _of_equals(key: Tensor, score: Tensor, best: Tensor, solved: Tensor) -> list[Tensor]:
@@ -284,10 +289,3 @@ def _of_equals(key: Tensor, score: Tensor, best: Tensor, solved: Tensor) -> list
 
 def _shares(weight: Tensor) -> Tensor:
     return weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
-
-
-def _changed(buffer: TensorDictBase, **entries: Tensor) -> TensorDict:
-    changed = buffer.copy()
-    for name, entry in entries.items():
-        changed.set(name, entry)
-    return changed

@@ -247,19 +247,20 @@ class Inbox:
             ValueError: if it has another shape than the batch, a number in it is not finite, or the
                 batch is none of this curriculum's, or was observed before.
         """
-        notes, shape = batch.notes, list(batch.notes.batch_size)
+        notes, told = dict(batch.notes.items()), dict(outcome.items())
+        shape = list(batch.notes.batch_size)
         if list(outcome.batch_size) != shape:
             raise ValueError(
                 f"the outcome has shape {list(outcome.batch_size)}, the batch {shape}: there must "
                 "be one entry for each level"
             )
-        if "return" not in outcome.keys():
-            raise ValueError(f"the outcome has no return, only {sorted(map(str, outcome.keys()))}")
-        for name in ("return", "success", "score"):
-            if name in outcome.keys() and not bool(outcome[name].isfinite().all()):
+        if "return" not in told:
+            raise ValueError(f"the outcome has no return, only {sorted(map(str, told))}")
+        for name in {"return", "success", "score"} & told.keys():
+            if not bool(told[name].isfinite().all()):
                 raise ValueError(f"the outcome's {name} is not finite on every level")
-        if not {"number", "place", "size"} <= {*notes.keys()}:
-            raise ValueError(f"the batch is of another curriculum: its notes are {[*notes.keys()]}")
+        if not {"number", "place", "size"} <= notes.keys():
+            raise ValueError(f"the batch is of another curriculum: its notes are {[*notes]}")
         if not batch.count:
             return
         number, places = int(notes["number"][0, 0]), set(notes["place"][0].tolist())
@@ -291,9 +292,12 @@ class Inbox:
             batches.setdefault(int(part["number"][0, 0]), []).append(part)
         taken, self._parts = [], []
         for number in sorted(batches):
-            evidence: Any = torch.cat(batches[number], 1)
+            parts = batches[number]
+            evidence: Any = torch.cat(parts, 1) if len(parts) > 1 else parts[0]
             if self._parts or (whole and evidence.shape[1] < int(evidence["size"][0, 0])):
-                self._parts += batches[number]
+                self._parts += parts
+            elif bool((evidence["place"].diff() > 0).all()):
+                taken.append(evidence)
             else:
                 taken.append(levels_at(evidence, evidence["place"].argsort(1)))
         return taken

@@ -24,7 +24,15 @@ from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, packed, unpacked
+from proposer_rl.curricula.batches import (
+    CPU,
+    device_of,
+    fresh_levels,
+    levels_at,
+    moved,
+    packed,
+    unpacked,
+)
 from proposer_rl.curricula.buffer import (
     SEEN,
     ReplayRule,
@@ -163,22 +171,23 @@ class ReplayCurriculum(Curriculum):
         self._take_in()
         self._finish(student, streams)
         replayed = self._explore(student, count, streams)
-        slots = torch.zeros(copies, count, dtype=torch.int64)
+        each, slots = replayed.unsqueeze(-1), torch.zeros(copies, count, dtype=torch.int64)
+        new = None if bool(replayed.all()) else self._fresh(count, streams, "new")
+        levels = new
         if bool(replayed.any()):
             if self._renew:
                 self._score_all(student, streams)
             draws = [s.generator("slots") for s in streams]
-            slots, drawn = draw_slots(self.buffer, count, self._rule, draws)
-            self.buffer[replayed] = drawn[replayed]
-        levels = levels_at(self.buffer["level"], slots)
-        if not bool(replayed.all()):
-            levels[~replayed] = self._fresh(count, streams, "new")[~replayed]
-        each = replayed.unsqueeze(-1)
-        known = {name: self.buffer[name].gather(1, slots) for name in (*SEEN, "key", "reached")}
-        reached = self.buffer["reached"]
+            slots = draw_slots(self.buffer, count, self._rule, draws, replayed)
+            levels = levels_at(self.buffer["level"], slots)
+            if new is not None:
+                levels[~replayed] = new[~replayed]
+        buffer = dict(self.buffer.items())
+        known = {name: buffer[name].gather(1, slots) for name in (*SEEN, "key", "reached")}
+        reached = buffer["reached"]
         mean = reached.where(reached.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return self._inbox.batch(
-            levels.to(self._device),
+            moved(levels, self._device),
             slot=slots,
             replayed=each.expand(copies, count),
             key=known["key"],
@@ -190,15 +199,16 @@ class ReplayCurriculum(Curriculum):
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Score what was trained on, where its own episodes do."""
         self._inbox.check(batch, outcome)
-        notes = batch.notes
-        evidence = {"level": batch.levels.cpu(), **notes.select("slot", "replayed", "key")}
+        notes = dict(batch.notes.items())
+        evidence = {"level": moved(batch.levels, CPU)}
+        evidence |= {name: notes[name] for name in ("slot", "replayed", "key")}
         if self.scorer.from_episodes:
             known = (notes[name] for name in (*SEEN, "before"))
             evidence |= self.scorer.of_outcome(student, outcome, *known)._asdict()
             evidence["reached"] = outcome["return"].float()
         if self._edits and self._parents == "easy":
             evidence["easy"] = _easiness(student, outcome)
-        self._came_back["levels"] += notes.batch_size.numel()
+        self._came_back["levels"] += notes["replayed"].numel()
         self._came_back["replayed"] += int(notes["replayed"].sum())
         self._inbox.put(batch, **evidence)
 
@@ -249,8 +259,8 @@ class ReplayCurriculum(Curriculum):
         for evidence in self._inbox.take(whole=self._edits > 0 and self._parents == "easy"):
             self._last = evidence.select("level", "place")
             if self.scorer.from_episodes:
-                scored = Scored(*(evidence[name] for name in Scored._fields))
-                self._take(evidence, scored, evidence["reached"])
+                told = dict(evidence.items())
+                self._take(told, Scored(*(told[name] for name in Scored._fields)), told["reached"])
             if self._edits or not self.scorer.from_episodes:
                 self._due.append(evidence)
 
@@ -264,7 +274,7 @@ class ReplayCurriculum(Curriculum):
             known = self._renew and bool(replayed.all())
             if not self.scorer.from_episodes and not known:
                 scored = self._score(student, evidence["level"], streams, "trained", *which)
-                self._take(evidence, scored)
+                self._take(dict(evidence.items()), scored)
             if self._edit is None or not self._edits or not bool(replayed.any()):
                 continue
             count = evidence.shape[1]
@@ -316,14 +326,14 @@ class ReplayCurriculum(Curriculum):
         entries = {"level": levels, **scored._asdict(), **(more or {})}
         known = {name: entry for name, entry in entries.items() if entry is not None}
         new = TensorDict(known, levels.shape[:2])
-        self.buffer = insert(self.buffer, new, self._rule, wanted)
+        insert(self.buffer, new, self._rule, wanted)
         self._scored += new.shape[1]
 
     def _score(
         self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
     ) -> Scored:
         """Score levels [K, n] that nobody trains on."""
-        return self.scorer(student, levels.to(self._device), streams, *purpose)
+        return self.scorer(student, moved(levels, self._device), streams, *purpose)
 
     def _score_all(self, student: Student, streams: Sequence[Streams]) -> None:
         """Renew all scores."""
@@ -331,19 +341,20 @@ class ReplayCurriculum(Curriculum):
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
         scored = self._score(student, levels_at(self.buffer["level"], slots), streams, "all")
-        self.buffer = rescore(self.buffer, slots, *scored)
+        rescore(self.buffer, slots, *scored)
 
     def _take(
-        self, evidence: TensorDictBase, scored: Scored, reached: Tensor | None = None
+        self, evidence: Mapping[str, Any], scored: Scored, reached: Tensor | None = None
     ) -> None:
         """Take the scores of levels that were trained on: new ones go into the buffer."""
-        replayed = evidence["replayed"][:, 0]
-        slots, old = evidence["slot"], self.buffer
+        replayed, slots = evidence["replayed"][:, 0], evidence["slot"]
         if bool(replayed.any()):
             # Another level may have taken the place of one that was long on its way.
-            there = old["key"].gather(1, slots) == evidence["key"]
-            after = rescore(
-                old,
+            there = self.buffer["key"].gather(1, slots) == evidence["key"]
+            there &= evidence["replayed"]
+            before = self.buffer["score"].gather(1, slots)
+            rescore(
+                self.buffer,
                 slots,
                 scored.score.where(there, -torch.inf),
                 scored.best.where(there, -torch.inf),
@@ -351,30 +362,32 @@ class ReplayCurriculum(Curriculum):
                 None if reached is None else reached.where(there, -torch.inf),
             )
             if self._co_learnability:
-                after = self._credit(old, after, slots, replayed)
-            self.buffer = old.clone()
-            self.buffer[replayed] = after[replayed]
+                self._credit(before, slots, replayed)
         if not bool(replayed.all()):
             self._add(evidence["level"], scored, {"reached": reached}, ~replayed)
 
-    def _credit(
-        self, old: TensorDictBase, after: TensorDict, slots: Tensor, replayed: Tensor
-    ) -> TensorDict:
-        """Credit the levels that were trained on before with how far the present scores fell."""
-        fell = (old["score"] - after["score"]).gather(1, slots).mean(1, keepdim=True)
-        now = TensorDict({"slot": slots, "key": after["key"].gather(1, slots)}, slots.shape)
+    def _credit(self, score: Tensor, slots: Tensor, replayed: Tensor) -> None:
+        """Credit the levels that were trained on before with how far the present scores fell.
+
+        Args:
+            score: of the present ones until now, [K, m].
+            slots: where they are.
+            replayed: bool [K], of the students whose levels they are.
+        """
+        fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
+        now = TensorDict({"slot": slots, "key": self.buffer["key"].gather(1, slots)}, slots.shape)
         before = self._before
         if before is None or before.shape != now.shape:
             before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
-        there = after["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
-        credited = torch.zeros_like(after["filled"]).scatter(1, before["slot"], there)
-        after["score"] = after["score"] + self._co_learnability * fell * credited
-        self._before = now.where(replayed.unsqueeze(-1), before)
-        return after
+        each = replayed.unsqueeze(-1)
+        there = self.buffer["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
+        credited = torch.zeros_like(self.buffer["filled"]).scatter(1, before["slot"], there & each)
+        self.buffer["score"] += self._co_learnability * fell * credited
+        self._before = now.where(each, before)
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
         """New levels [K, count] on the CPU."""
-        return fresh_levels(self._new_levels, count, streams, *purpose).cpu()
+        return moved(fresh_levels(self._new_levels, count, streams, *purpose), CPU)
 
     def _shown(self) -> dict[str, Levels]:
         """Levels of the first student's buffer, to be looked at."""

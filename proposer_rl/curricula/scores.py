@@ -39,7 +39,7 @@ is not, so that ``max_mc`` is biased even at the optimum.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -188,7 +188,8 @@ class Scorer:
         if "rollout" in outcome.keys():
             scored = self.of_rollouts(student, [outcome["rollout"]], best, solved)
         else:
-            scored = _of_returns(self._name, outcome.cpu(), best, solved, before)
+            told = {name: entry.cpu() for name, entry in outcome.items()}
+            scored = _of_returns(self._name, told, best, solved, before)
         if "score" in outcome.keys():
             scored = scored._replace(score=outcome["score"].double().cpu())
         return scored
@@ -269,7 +270,7 @@ class Scorer:
 
 
 def _of_returns(
-    name: str, outcome: TensorDictBase, best: Tensor, solved: Tensor, before: Tensor
+    name: str, outcome: Mapping[str, Tensor], best: Tensor, solved: Tensor, before: Tensor
 ) -> Scored:
     """A score of levels [K, n] from returns and success alone; see the module's text."""
     reached = outcome["return"].double()

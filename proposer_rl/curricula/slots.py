@@ -4,14 +4,15 @@
 :mod:`~proposer_rl.curricula.buffer`. Scores only move the ranks between the old place and the new,
 so that a level costs microseconds and not another sort of all N.
 
-Of more than :data:`AT_ONCE` levels, as thousands of environments ask for them, so many at a time
-count as simultaneous: the shares are those before the first of them.
+More than :data:`ONE_BY_ONE` levels, as thousands of environments ask for them, are simultaneous:
+all are drawn by the shares before the first of them, and the best new ones take the places of the
+levels that are least likely to be drawn.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,11 @@ from numpy.typing import NDArray
 
 Numbers = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
 Weigh = Callable[[Floats], Floats]
 """Shares by rank, adding up to one, of scores that fall."""
 
-AT_ONCE = 256
-
-
-def at_once(count: int) -> int:
-    """How many of so many levels count as simultaneous."""
-    return 1 if count <= AT_ONCE else AT_ONCE
+ONE_BY_ONE = 128
 
 
 def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) -> NDArray[np.int64]:
@@ -47,8 +44,8 @@ def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) ->
     by_score = (1 - staleness) * by_score.cumsum()
     count = filled.cumsum().astype(np.float64)
     ages = ((clock - touched) * filled).cumsum().astype(np.float64)  # whole numbers
-    slots = np.empty(len(noise), np.int64)
-    some, shares = at_once(len(noise)), np.empty_like(count)
+    slots, shares = np.empty(len(noise), np.int64), np.empty_like(count)
+    some = 1 if len(noise) <= ONE_BY_ONE else len(noise)
     for start in range(0, len(noise), some):
         marks = noise[start : start + some]
         old = ages if ages[-1] > 0 else count
@@ -57,15 +54,10 @@ def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) ->
         # An empty slot adds nothing to the sum, so that no mark lies in it.
         which = np.minimum(shares.searchsorted(marks * shares[-1], "right"), last)
         slots[start : start + some] = which
-        if some == 1:
-            slot, clock = which[0], clock + 1
-            ages += count
-            ages[slot:] -= clock - touched[slot]
-            touched[slot] = clock
-        else:
-            touched[which] = clock + np.arange(1, len(which) + 1)
-            clock += len(which)
-            ages = ((clock - touched) * filled).cumsum().astype(np.float64)
+        ages += count
+        ages[which[0] :] -= clock + 1 - touched[which[0]]
+        touched[which] = clock + np.arange(1, some + 1)
+        clock += some
     numbers["clock"][:] = clock
     return slots
 
@@ -116,13 +108,8 @@ class Ranks:
 
 
 def insert(
-    numbers: Numbers,
-    keys: list[int],
-    scores: list[float],
-    staleness: float,
-    weigh: Weigh,
-    by_rank: bool,
-) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
+) -> tuple[Places, Places]:
     """Insert levels one after another into the slots of a row.
 
     Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
@@ -136,18 +123,16 @@ def insert(
         by_rank: as of :class:`Ranks`.
 
     Returns:
-        Which new level has gone into each slot, int64 [N], -1 for none; and (slot, level) of those
-        that were there already.
+        Which new level has gone into each slot, int64 [N], -1 for none; and slots and levels of
+        those that were there already, int64 [2, m].
     """
     filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
-    clock, some = int(numbers["clock"][0]), at_once(len(keys))
+    clock = int(numbers["clock"][0])
     place = dict(zip(key[filled].tolist(), filled.nonzero()[0].tolist(), strict=True))
     free = iter((~filled).nonzero()[0].tolist())
     source, again = np.full(len(filled), -1), []
     ranks: Ranks | None = None
-    victims: Iterator[int] = iter(())
-    victim, left = -1, 0
-    for i, (own, value) in enumerate(zip(keys, scores, strict=True)):
+    for i, (own, value) in enumerate(zip(keys.tolist(), scores.tolist(), strict=True)):
         clock += 1
         if not math.isfinite(value):
             continue
@@ -157,24 +142,10 @@ def insert(
         else:
             slot = next(free, -1)
             if slot < 0:
-                if left == 0:
-                    ranks = ranks or Ranks(score, weigh, by_rank)
-                    age = clock - touched
-                    shares = ranks.shares * (1 - staleness) + age * (
-                        staleness / max(int(age.sum()), 1)
-                    )
-                    left = some
-                    if some == 1:
-                        victim = int(shares.argmin())
-                    else:
-                        victims, ranks = iter(shares.argsort(kind="stable").tolist()), None
-                        victim, start = next(victims), clock
-                left -= 1
-                while some > 1 and touched[victim] >= start:  # has come again meanwhile
-                    victim = next(victims)
-                if not value > score[victim]:
+                ranks = ranks or Ranks(score, weigh, by_rank)
+                slot = int(_shares(ranks.shares, clock - touched, staleness).argmin())
+                if not value > score[slot]:
                     continue
-                slot = victim
                 del place[int(key[slot])]
             filled[slot], key[slot], source[slot] = True, own, i
             place[own] = slot
@@ -184,4 +155,42 @@ def insert(
             ranks.change(slot, value)
         touched[slot] = clock
     numbers["clock"][:] = clock
+    return source, np.array(again, np.int64).reshape(-1, 2).T
+
+
+def insert_at_once(
+    numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh
+) -> tuple[Places, Places]:
+    """Insert many levels, the best first; what goes in and comes out is as of :func:`insert`."""
+    filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
+    clock, source = int(numbers["clock"][0]), np.full(len(filled), -1)
+    numbers["clock"][:] = clock + len(keys)
+    finite = np.flatnonzero(np.isfinite(scores))[::-1]
+    if not len(finite):
+        return source, np.empty((2, 0), np.int64)
+    own, last = np.unique(keys[finite], return_index=True)  # of equal ones the last
+    new, used = finite[last], np.flatnonzero(filled)
+    place = own.searchsorted(key[used]).clip(max=len(own) - 1)
+    there = own[place] == key[used]
+    again = np.stack([used[there], new[place[there]]])
+    score[again[0]], touched[again[0]] = scores[again[1]], clock + 1 + again[1]
+    new = np.delete(new, place[there])
+    new = new[np.argsort(-scores[new], kind="stable")]
+    slots = np.flatnonzero(~filled)
+    more = min(len(new) - len(slots), len(used))
+    if more > 0:
+        by_score = Ranks(score[used], weigh, by_rank=False).shares
+        shares = _shares(by_score, clock + len(keys) - touched[used], staleness)
+        least = np.argpartition(shares, more - 1)[:more]
+        slots = np.concatenate([slots, used[least[np.argsort(shares[least], kind="stable")]]])
+    new, slots = new[: len(slots)], slots[: len(new)]
+    better = ~filled[slots] | (scores[new] > score[slots])
+    new, slots = new[better], slots[better]
+    filled[slots], key[slots], source[slots] = True, keys[new], new
+    score[slots], touched[slots] = scores[new], clock + 1 + new
     return source, again
+
+
+def _shares(by_score: Floats, age: Places, staleness: float) -> Floats:
+    """What slots are drawn by, where there is a level in each."""
+    return by_score * (1 - staleness) + age * (staleness / max(int(age.sum()), 1))

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
@@ -39,7 +38,7 @@ from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import ArgumentError, PPOSettings
+from proposer_rl.settings import PPOSettings
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -181,10 +180,7 @@ class PPO:
         self.statistics.before(rollout, level, first=first)
         steps = rollout.exclude(*self.agent.level_keys)
         for group in self._adam.param_groups:
-            if isinstance(group["lr"], Tensor):
-                group["lr"].fill_(self.learning_rate)
-            else:
-                group["lr"] = self.learning_rate
+            group["lr"] = self.learning_rate
         orders = self._minibatches.draw(generators)
         trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
         self._gradient_steps += len(trained["gradient_steps"])
@@ -245,19 +241,6 @@ class PPO:
             context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
         set_next_values(self.agent, rollout, context)
         return rollout
-
-    def prepare_for_graphs(self) -> None:
-        """Let training be recorded as a CUDA graph; without, it need not be.
-
-        Raises:
-            ArgumentError: if episodes go on, of which each step has to be asked whether it ends.
-        """
-        if self.settings.continue_episodes:
-            raise ArgumentError("continue_episodes=True: cannot be recorded as a CUDA graph")
-        if self._parameters[0].is_cuda:
-            for group in self._adam.param_groups:
-                group["capturable"] = True
-                group["lr"] = torch.tensor(group["lr"], device=self._parameters[0].device)
 
     def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.

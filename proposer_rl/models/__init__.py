@@ -10,7 +10,7 @@ from proposer_rl.models.actor_critic import (
 )
 from proposer_rl.models.maps import cell_logits, cell_maps, map_actor_critic, read_maps
 from proposer_rl.models.memory import MemoryNetwork, memory_actor_critic
-from proposer_rl.models.population import Population, available_cores
+from proposer_rl.models.population import Population, available_cores, use_device
 from proposer_rl.models.proposer import (
     MapEncoder,
     MixtureHead,
@@ -44,4 +44,5 @@ __all__ = [
     "proposer_actor_critic",
     "read_maps",
     "uniform_noise",
+    "use_device",
 ]

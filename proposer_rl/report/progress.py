@@ -31,6 +31,7 @@ from proposer_rl.runs.status import FILE, Activity, duration
 PLAN = "multirun.yaml"  # Hydra's, in a sweep's folder
 SUMMARY = "summary.json"
 GOING = 600.0  # seconds since a run that goes on has said so
+STOPPED = 128  # a greater exit code is that of a signal: the run can go on
 SEEDS = ("seed=", "seeds=")  # two runs that differ in nothing else take as long
 # What does not say what a run is; `precision=auto` goes on in whichever a run was begun in.
 ASIDE = ("+sweep=", "compute.", "logger", "hydra.", "precision=")
@@ -93,6 +94,8 @@ def _failure(folder: Path) -> str:
     if not (folder / FAILURE).is_file():
         return ""
     match small_json(folder / FAILURE):
+        case {"exit_code": int(code)} if code > STOPPED:
+            return ""
         case {"message": message}:
             return printable(str(message))[:LONGEST_TEXT]
     return f"{FAILURE} cannot be read"
@@ -153,10 +156,6 @@ def left(folder: Path, planned: Sequence[Sequence[str]]) -> Left | None:
 
     A run takes as long as the mean of the finished ones that differ from it in the seed alone, or
     else of all; of one that goes on that is the whole.
-
-    Args:
-        folder: of the sweep, with its plan.
-        planned: of each run the settings.
 
     Raises:
         UnreadableRun: if there is no such folder.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
@@ -23,6 +24,11 @@ class Interrupted(Exception):
     def __init__(self, signum: int) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name}")
         self.signum = signum
+
+    @property
+    def exit_code(self) -> int:
+        """That of a process which the signal ends, as shells have it."""
+        return 128 + self.signum
 
 
 class StopRequested(Exception):
@@ -43,6 +49,7 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
+            _shield_tracker()
             for signum in STOP_SIGNALS:
                 if signal.getsignal(signum) is not signal.SIG_IGN:
                     self._before[signum] = signal.signal(signum, self._keep)
@@ -94,3 +101,16 @@ class StopSignals:
         hint = "; once more: stop at once" if signum == signal.SIGINT else ""
         line = f"\n{signal.Signals(signum).name}: saving at the next safe point{hint}\n"
         os.write(2, line.encode())  # print is not safe to enter twice
+
+
+def _shield_tracker() -> None:
+    """Start Python's resource tracker with stop signals blocked for good, unless it runs already.
+
+    Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
+    and its successor complain in tracebacks of what it does not know.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula import Batch, Curriculum, Student, outcome_of, require
+from proposer_rl.curricula.batches import CPU, moved
 from proposer_rl.recipes import Recipe
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -23,7 +24,7 @@ from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import Segments
 from proposer_rl.teaching.spaces import LevelSpace
-from proposer_rl.teaching.tickets import OUT, RESULTS, TOLD, Block, Tickets, as_array
+from proposer_rl.teaching.tickets import OUT, RESULTS, Block, Tickets, as_array
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -41,7 +42,8 @@ class Teacher:
         ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
         teacher.tell(ticket, return_=r, success=ok)
 
-    What was told is taken in when the curriculum proposes next, at every ``block`` tickets.
+    What was told is taken in when the curriculum proposes next, at every ``block`` tickets. Replay
+    draws blocks of more than 128 levels at once, which costs a fraction of one after another.
     Whatever is refused counts nothing, and leaves the teacher as it was.
 
     Args:
@@ -89,7 +91,7 @@ class Teacher:
         students: Count = 1,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
-        block: Count = 128,
+        block: Count = 256,
         success: Success | None = None,
         student: Student | None = None,
         **can: Any,
@@ -97,10 +99,10 @@ class Teacher:
         self.space, self.device, self.block = space, torch.device(device), block
         self._seeds = [seed + copy for copy in range(students)]
         self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
-        alone = students == 1
+        self._alone = students == 1
         given = getattr(space, "given", _same)
         self.student = student or Student(
-            **{name: adapted(name, one, given) if alone else one for name, one in can.items()}
+            **{name: adapted(name, one, given) if self._alone else one for name, one in can.items()}
         )
         named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
@@ -162,7 +164,7 @@ class Teacher:
                 n -= end - start
             if len(ids) == 1:
                 return ids[0], levels[0]
-            return torch.cat(ids), torch.cat(levels, 0 if self.students == 1 else 1)
+            return torch.cat(ids), torch.cat(levels, 0 if self._alone else 1)
 
     def tell(
         self,
@@ -190,17 +192,16 @@ class Teacher:
             ArgumentError: naming the argument: a ticket that is not out, a number that is missing
                 or not finite, another shape.
         """
-        told = {
-            name: value
-            for name, value in zip(RESULTS, (return_, success, score, episodes, steps), strict=True)
-            if value is not None
-        }
+        given = (return_, success, score, episodes, steps)
+        told = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
         with self._here():
             if "rollout" in self.reads:
                 raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
-            self._require_success("success" in told, "tell it with success=")
-            if isinstance(ids, int) and self.students == 1:
-                self._tell_one(ids, told)
+            if success is None:
+                self._require_success(False, "tell it with success=")
+            if self._alone and isinstance(ids, int):
+                numbers = [(name, _number(name, value)) for name, value in told.items()]
+                self._tickets.tell_one(ids, numbers)
             else:
                 self._tell(self._ids(ids), told)
 
@@ -312,8 +313,8 @@ class Teacher:
         tickets = self._tickets
         tickets.state[ticket - tickets.first] = OUT
         if not self._rows:
-            each = [self._rows_of(levels) for levels in block.batch.levels.cpu()]
-            self._rows = each[0] if self.students == 1 else [*zip(*each, strict=True)]
+            each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU)]
+            self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
         return ticket, self._rows[ticket - block.start]
 
     def _refill(self, count: int) -> None:
@@ -336,26 +337,15 @@ class Teacher:
     def _levels(self, block: Block, which: slice) -> Any:
         """Some levels of a block, as the loop gets them."""
         if block is not self._block or self._moved is None:
-            levels = block.batch.levels.to(self.device)
-            moved = self._given(levels[0] if self.students == 1 else levels)
+            levels = moved(block.batch.levels, self.device)
+            given = self._given(levels[0] if self._alone else levels)
             if block is not self._block:
-                return moved[which] if self.students == 1 else moved[:, which]
-            self._moved = moved
-        return self._moved[which] if self.students == 1 else self._moved[:, which]
-
-    def _tell_one(self, ticket: int, told: Mapping[str, Any]) -> None:
-        tickets = self._tickets
-        place = ticket - tickets.first
-        if not (0 <= place < tickets.next - tickets.first and tickets.state[place] == OUT):
-            tickets.places(np.array([ticket]))  # says what is wrong with it
-        numbers = {name: _number(name, value) for name, value in told.items()}
-        for name, number in numbers.items():
-            tickets.results[name][0, place] = number
-        tickets.state[place] = TOLD
-        tickets.told = True
+                return given[which] if self._alone else given[:, which]
+            self._moved = given
+        return self._moved[which] if self._alone else self._moved[:, which]
 
     def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
-        shape = (len(ids),) if self.students == 1 else (self.students, len(ids))
+        shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
             name: as_array(_argument(name), value, shape).reshape(self.students, -1)
             for name, value in told.items()
@@ -392,7 +382,7 @@ class Teacher:
         self._tickets.close(place)
 
     def _of_students(self, rollout: TensorDictBase) -> TensorDictBase:
-        return rollout if self.students > 1 or rollout.ndim > 2 else rollout.unsqueeze(0)
+        return rollout if not self._alone or rollout.ndim > 2 else rollout.unsqueeze(0)
 
     def _observe(self, batch: Batch, outcome: TensorDict) -> None:
         self.curriculum.observe(self.student, batch, outcome)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ class Block:
     start: int
     batch: Batch
 
-    @property
+    @cached_property
     def end(self) -> int:
         """The ticket after its last."""
         return self.start + self.batch.count
@@ -96,6 +97,16 @@ class Tickets:
         """Note results [K, n] of tickets at places [n]."""
         for name, result in results.items():
             self.results[name][:, place] = result
+        self.state[place] = TOLD
+        self.told = True
+
+    def tell_one(self, ticket: int, results: Iterable[tuple[str, float]]) -> None:
+        """Note what came of one ticket of one student."""
+        place = ticket - self.first
+        if not (0 <= place < self.next - self.first and self.state[place] == OUT):
+            self.places(np.array([ticket]))  # says what is wrong with it
+        for name, number in results:
+            self.results[name][0, place] = number
         self.state[place] = TOLD
         self.told = True
 

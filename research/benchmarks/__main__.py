@@ -49,6 +49,11 @@ def _parser() -> argparse.ArgumentParser:
         help="an interpreter that has jaxued: view measures its maze in JAX, too, on the CPU",
     )
     parser.add_argument(
+        "--syllabus",
+        metavar="PYTHON",
+        help="an interpreter that has syllabus-rl: teacher times its calls, too",
+    )
+    parser.add_argument(
         "--runs",
         nargs="+",
         default=[],

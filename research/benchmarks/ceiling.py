@@ -12,7 +12,6 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from proposer_rl.learning.cuda_graphs import WARM_UPS
 from research.benchmarks.plain import PlainUNet
 from research.benchmarks.profiling import profile
 from research.benchmarks.results import Options, Result, Row, Spread, Table
@@ -110,7 +109,7 @@ def against_convolutions(options: Options) -> Result:
         forward, both = layer.passes(layout, dtype, options.device)
         candidates[_name(i, "forward", layout, dtype)] = forward
         candidates[_name(i, "training", layout, dtype)] = both
-    seconds = interleave(candidates, options.repeats, options.device, warmup=WARM_UPS + 1)
+    seconds = interleave(candidates, options.repeats, options.device, warmup=3)
     rows, tables = [], []
     for dtype in dtypes:
         # An update in the faster precision has to stand against the best of both.
@@ -128,7 +127,7 @@ def against_convolutions(options: Options) -> Result:
                 samples={"update": seconds[dtype], "convolutions": ceiling},
             )
         )
-        plain = Solvers(scale.task(options, f"precision={dtype}", "compute.graphs=false"))
+        plain = Solvers(scale.task(options, f"precision={dtype}"))
         for _ in range(2):
             plain.update()
         title = f"Where a Solver update goes, {dtype}"

@@ -19,10 +19,12 @@ from proposer_rl.cli.errors import SIGNALLED
 from proposer_rl.runs.folder import write_atomically
 from research.benchmarks.curricula import read_methods
 from research.benchmarks.gymnasium import ENVIRONMENTS
-from research.benchmarks.peer import require_jaxued
+from research.benchmarks.jaxued_peer import __file__ as JAXUED
+from research.benchmarks.peer import said_by
 from research.benchmarks.registry import BENCHMARKS, selected
 from research.benchmarks.report import describe, machine, summary, versions
 from research.benchmarks.results import Options, Result, Size
+from research.benchmarks.syllabus_peer import __file__ as SYLLABUS
 from research.benchmarks.worker import BenchmarkFailed, run_apart
 
 FAILED = 1
@@ -109,7 +111,14 @@ def _options(arguments: argparse.Namespace) -> Options:
         raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from error
     size: Size = "full" if arguments.full else "tiny" if arguments.tiny else "normal"
     if arguments.jaxued is not None:
-        _check_jaxued(arguments.jaxued, arguments.names, device)
+        if torch.device(device).type != "cpu":
+            raise ConfigError(
+                f"--jaxued {arguments.jaxued}: JAX is measured on the CPU; give --device cpu, not "
+                f"{device}"
+            )
+        _check_peer("jaxued", arguments.jaxued, JAXUED, "view", arguments.names)
+    if arguments.syllabus is not None:
+        _check_peer("syllabus", arguments.syllabus, SYLLABUS, "teacher", arguments.names)
     if arguments.runs:
         _check_runs(arguments.runs, arguments.names)
     unknown = [name for name in arguments.environments if name not in ENVIRONMENTS]
@@ -121,6 +130,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         device,
         size,
         arguments.jaxued,
+        arguments.syllabus,
         arguments.runs,
         arguments.seeds,
         arguments.environments,
@@ -128,20 +138,16 @@ def _options(arguments: argparse.Namespace) -> Options:
     )
 
 
-def _check_jaxued(python: str, names: list[str], device: str) -> None:
-    if names and "view" not in names:
+def _check_peer(peer: str, python: str, program: str, benchmark: str, names: list[str]) -> None:
+    if names and benchmark not in names:
         raise ConfigError(
-            f"--jaxued {python}: is for the benchmark view, not for {', '.join(names)}"
-        )
-    if torch.device(device).type != "cpu":
-        raise ConfigError(
-            f"--jaxued {python}: JAX is measured on the CPU; give --device cpu, not {device}"
+            f"--{peer} {python}: is for the benchmark {benchmark}, not for {', '.join(names)}"
         )
     try:
-        require_jaxued(python)
+        said_by(python, program)
     except ValueError as error:
         raise ConfigError(
-            f"--jaxued {python}: {error}; must be an interpreter that can import jaxued"
+            f"--{peer} {python}: {error}; must be an interpreter that can import {peer}"
         ) from error
 
 

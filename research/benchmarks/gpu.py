@@ -11,7 +11,6 @@ from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.scales import Scale, Solvers, paper, precisions
 from research.benchmarks.timing import interleave, synchronise, time_once
 
-REPLAYED = "compute.graphs=true"
 NOTHING = "There is no GPU here: none of its targets is measured."
 
 
@@ -27,12 +26,8 @@ def gpu_targets(options: Options) -> Result:
 
 
 def _update(scale: Scale, options: Options) -> list[Row]:
-    """One Solver: replayed in both precisions, and as it is; and how long the host is busy."""
-    ways = {
-        f"{options.precision}, replayed": [REPLAYED],
-        "fp32 (TF32), replayed": ["precision=fp32", REPLAYED],
-        f"{options.precision}, not replayed": [],
-    }
+    """One Solver in both precisions; and how long the host is busy."""
+    ways = {options.precision: [], "fp32 (TF32)": ["precision=fp32"]}
     updates = {name: Solvers(scale.task(options, *way)).update for name, way in ways.items()}
     seconds = interleave(updates, options.repeats, options.device)
     rows = [
@@ -46,7 +41,7 @@ def _update(scale: Scale, options: Options) -> list[Row]:
 
 def _meta_step(scale: Scale, options: Options) -> Result:
     """K Solvers: a step and its parts."""
-    env = trainer_of(scale.made(options, EVERY_UPDATE, REPLAYED)).env
+    env = trainer_of(scale.made(options, EVERY_UPDATE)).env
     seconds = step_and_parts(env, options.repeats, options.device)
     size = f"K = {scale.config.proposer.rollouts}, {options.precision}"
     row = _row("a meta-environment step", size, seconds["step"], 50e-3)
@@ -58,14 +53,14 @@ def _runs(scale: Scale, options: Options) -> list[Row]:
     schedule = scale.config.schedule
     cycles = schedule.updates // schedule.cycle_length
     target = Scale(scale.name, "target")
-    plain, made = (each.made(options, REPLAYED) for each in (target, scale))
+    plain, made = (each.made(options) for each in (target, scale))
     start = made.learner.snapshot()
 
     def one_cycle() -> None:
-        made.learner.restore(start)  # in place, so that what is recorded stays
+        made.learner.restore(start)
         scale.run(options, made, f"schedule.updates={schedule.cycle_length}")
 
-    one_cycle()  # everything is recorded here
+    one_cycle()  # PyTorch chooses its kernels here
     size = f"{schedule.updates} updates"
     whole = time_once(lambda: target.run(options, plain), options.device)
     several = cycles * time_once(one_cycle, options.device)

@@ -1,4 +1,4 @@
-"""jaxued's maze, which needs JAX, in a process of an interpreter that has it."""
+"""What others have made, in processes of interpreters that have it: jaxued's maze, Syllabus."""
 
 from __future__ import annotations
 
@@ -34,18 +34,21 @@ class Peer(NamedTuple):
     play: Callable[[str], tuple[float, float]]
 
 
-def require_jaxued(python: str) -> None:
-    """Try whether an interpreter can import jaxued.
+def said_by(python: str, program: str, *arguments: object) -> dict[str, Any]:
+    """What a program says in an interpreter; without arguments it only tries to import its peer.
 
     Raises:
-        ValueError: If it cannot, or if there is no such program; the message is one line.
+        ValueError: If it cannot, or if there is no such interpreter; the message is one line.
     """
+    command = [python, ISOLATED, program, *map(str, arguments)]
     try:
-        ended = subprocess.run([python, ISOLATED, PROGRAM], capture_output=True, text=True)
+        ended = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:
         raise ValueError(str(error.strerror)) from error
     if ended.returncode or not ended.stdout.startswith("{"):
         raise ValueError((ended.stderr.strip() or "it does not run Python").splitlines()[-1])
+    found: dict[str, Any] = json.loads(ended.stdout)
+    return found
 
 
 @contextmanager

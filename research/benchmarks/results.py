@@ -24,6 +24,7 @@ class Options:
         device: where the Solver and its levels live.
         size: ``tiny`` to see that everything runs, ``full`` for the paper's values throughout.
         jaxued: an interpreter that has jaxued, to be measured beside our view maze; None for none.
+        syllabus: an interpreter that has Syllabus, whose curricula are timed; None for none.
         runs: folders of runs, whose methods are measured in place of those that one knows.
         seeds: of what is trained in Gymnasium's environments.
         environments: of these, by name; none for all.
@@ -35,6 +36,7 @@ class Options:
     device: str = "cpu"
     size: Size = "normal"
     jaxued: str | None = None
+    syllabus: str | None = None
     runs: Sequence[str] = ()
     seeds: Sequence[int] = (100, 101, 102, 103, 104)
     environments: Sequence[str] = ()

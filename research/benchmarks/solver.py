@@ -141,9 +141,8 @@ def overhead(options: Options) -> Result:
     scale = paper(options)
     rows = []
     for precision in precisions(options):
-        # Both called as they are: on a GPU the network alone would not be replayed.
         own = f"precision={precision}"
-        solvers = Solvers(scale.task(options, own, "compute.graphs=false"))
+        solvers = Solvers(scale.task(options, own))
         agent = solvers.ppo.agent
         level = solvers.ppo.env.reset().select(*agent.level_keys)
         with torch.no_grad():

@@ -9,7 +9,9 @@ import torch
 
 from proposer_rl import curricula
 from proposer_rl.teaching import Parameters, Teacher
+from research.benchmarks.peer import said_by
 from research.benchmarks.results import Options, Result, Row, Spread
+from research.benchmarks.syllabus_peer import __file__ as SYLLABUS
 from research.benchmarks.timing import interleave, threads
 
 SLOTS, MANY = 4000, 4096
@@ -32,7 +34,7 @@ def teacher_calls(options: Options) -> Result:
     rows = [
         Row(
             f"ask and tell, PLR with {SLOTS} slots, {name}, each",
-            "a number by itself: no other library is timed",
+            "a number by itself",
             Spread.of([each / count for each in seconds[name]]),
             "ms",
             target=TARGETS[name] / 1e6,
@@ -41,7 +43,24 @@ def teacher_calls(options: Options) -> Result:
         )
         for name in TARGETS
     ]
+    if options.syllabus is not None:
+        rows += beside_syllabus(options.syllabus, 16 if options.tiny else 256, options.repeats)
     return Result(rows)
+
+
+def beside_syllabus(python: str, count: int, repeats: int) -> list[Row]:
+    """What an episode costs curricula of Syllabus with as many tasks, in its own interpreter."""
+    said = said_by(python, SYLLABUS, SLOTS, count, repeats)
+    return [
+        Row(
+            f"Syllabus {said['syllabus']}, {SLOTS} tasks, {name}, each",
+            "a sample and an update",
+            Spread.of(seconds),
+            "ms",
+            samples={name: seconds},
+        )
+        for name, seconds in said["seconds"].items()
+    ]
 
 
 def _one_by_one(teacher: Teacher, count: int) -> None:

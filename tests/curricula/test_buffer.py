@@ -149,7 +149,9 @@ def new(numbers: list[int], score: list[float], **more: Any) -> TensorDict:
 
 
 def filled(numbers: list[int], score: list[float], capacity: int, rule: ReplayRule) -> TensorDict:
-    return insert(empty_buffer(levels(0)[0, 0], 1, capacity), new(numbers, score), rule)
+    buffer = empty_buffer(levels(0)[0, 0], 1, capacity)
+    insert(buffer, new(numbers, score), rule)
+    return buffer
 
 
 class Simulation:
@@ -209,12 +211,12 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
         if plain.slots and data.draw(st.booleans()):
             generator = torch.Generator().manual_seed(step)
             marks = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-            slots, buffer = draw_slots(buffer, 3, rule, [generator.manual_seed(step)])
+            slots = draw_slots(buffer, 3, rule, [generator.manual_seed(step)])
             assert slots[0].tolist() == [plain.draw(mark) for mark in marks]
         else:
             numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
             score = [data.draw(st.integers(-4, 4)) / 4 for _ in numbers]
-            buffer = insert(buffer, new(numbers, score), rule)
+            insert(buffer, new(numbers, score), rule)
             for number, value in zip(numbers, score, strict=True):
                 plain.insert(number, value)
         n = len(plain.slots)
@@ -229,29 +231,29 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
 def test_what_is_evicted_leaves_nothing_behind() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2], [0.5, 0.1], 2, rule)
-    _, buffer = draw_slots(buffer, 5, rule, [torch.Generator().manual_seed(0)])
-    after = insert(buffer, new([3], [0.3], parent=[77], generation=[4]), rule)
-    assert after["level", "a"].tolist() == [[1, 3]]
-    row = after[0, 1]
+    draw_slots(buffer, 5, rule, [torch.Generator().manual_seed(0)])
+    insert(buffer, new([3], [0.3], parent=[77], generation=[4]), rule)
+    assert buffer["level", "a"].tolist() == [[1, 3]]
+    row = buffer[0, 1]
     assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
     assert float(row["best"]) == pytest.approx(0.3) and not bool(row["solved"])
-    assert int(row["touched"]) == int(after["clock"][0, 1]) == 2 + 5 + 1  # age 0
-    assert buffer["level", "a"].tolist() == [[1, 2]]  # what was given stays as it was
+    assert int(row["touched"]) == int(buffer["clock"][0, 1]) == 2 + 5 + 1  # age 0
 
 
 def test_what_was_reached_on_a_level_does_not_fall_when_it_comes_again() -> None:
     buffer = filled([1, 2], [0.9, 0.1], 4, RANK)
-    after = insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
-    assert after["score"][0, :2].tolist() == pytest.approx([0.2, 0.8])
-    assert after["best"][0, :2].tolist() == pytest.approx([0.9, 0.8])
-    assert after["solved"][0, :2].tolist() == [True, True]
+    insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
+    assert buffer["score"][0, :2].tolist() == pytest.approx([0.2, 0.8])
+    assert buffer["best"][0, :2].tolist() == pytest.approx([0.9, 0.8])
+    assert buffer["solved"][0, :2].tolist() == [True, True]
 
 
 def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2], [0.5, 0.1], 2, rule)
     for score in (0.1, -torch.inf, torch.nan):
-        assert insert(buffer, new([3], [score]), rule)["level", "a"].tolist() == [[1, 2]]
+        insert(buffer, new([3], [score]), rule)
+        assert buffer["level", "a"].tolist() == [[1, 2]]
 
 
 def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
@@ -268,18 +270,19 @@ def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:
     buffer = filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)
     score = torch.tensor([[1.0, 2.0, -torch.inf]])
     best, solved = torch.tensor([[-9.0, 0.7, 0.0]]), torch.tensor([[False, True, False]])
-    after = rescore(buffer, torch.tensor([[0, 0, 2]]), score, best, solved)
-    assert after["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
-    assert after["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
-    assert after["solved"].tolist() == [[True, False, False, False]]
-    again = rescore(after, torch.tensor([[0]]), score[:, :1], best[:, :1], solved[:, :1])
-    assert bool(again["solved"][0, 0])  # for ever
+    rescore(buffer, torch.tensor([[0, 0, 2]]), score, best, solved)
+    assert buffer["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
+    assert buffer["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
+    assert buffer["solved"].tolist() == [[True, False, False, False]]
+    rescore(buffer, torch.tensor([[0]]), score[:, :1], best[:, :1], solved[:, :1])
+    assert bool(buffer["solved"][0, 0])  # for ever
 
 
 def test_with_staleness_alone_every_level_comes_up() -> None:
     rule = ReplayRule(staleness=1.0)
     buffer = filled(list(range(1, 21)), [float(i) for i in range(20)], 25, rule)
-    slots, _ = draw_slots(buffer, 200, rule, [torch.Generator().manual_seed(0)])
+    generator = torch.Generator().manual_seed(0)
+    slots = torch.cat([draw_slots(buffer, 100, rule, [generator]) for _ in range(2)], 1)
     assert set(slots[0].tolist()) == set(range(20))
     for slot in range(20):
         seen = (slots[0] == slot).nonzero().flatten()
@@ -289,19 +292,67 @@ def test_with_staleness_alone_every_level_comes_up() -> None:
 def test_draws_without_staleness_follow_the_shares() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, rule)
-    slots, after = draw_slots(buffer, 20_000, rule, [torch.Generator().manual_seed(0)])
+    slots = draw_slots(buffer, 20_000, rule, [torch.Generator().manual_seed(0)])
     expected = 20_000 * torch.tensor(BY_SCORE["rank, T = 1"][1])
     counts = slots[0].bincount(minlength=5)
     assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
-    assert after["draws"][0, :5].equal(counts)
+    assert buffer["draws"][0, :5].equal(counts)
 
 
 def test_copies_do_not_see_each_other() -> None:
     both = torch.cat([filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)] * 2)
     batch = torch.cat([new([4, 5], [0.5, 0.6]), new([6, 7], [0.9, 0.05])])
-    only = insert(both, batch, RANK, wanted=torch.tensor([False, True]))
-    assert (only[0] == both[0]).all()
-    assert (insert(both[1:], batch[1:], RANK)[0] == only[1]).all()
+    only, alone = both.clone(), both[1:].clone()
+    insert(only, batch, RANK, wanted=torch.tensor([False, True]))
+    insert(alone, batch[1:], RANK)
+    assert (only[0] == both[0]).all() and (only[1] == alone[0]).all()
+    generators = [torch.Generator().manual_seed(0) for _ in range(2)]
+    slots = draw_slots(only, 3, RANK, generators, wanted=torch.tensor([False, True]))
+    assert (only[0] == both[0]).all() and int(slots[0].sum()) == 0
+    assert int(only["draws"][1].sum()) == 3
+
+
+@given(st.data())
+def test_of_many_at_once_the_best_stay(data: st.DataObject) -> None:
+    """Against a sorted list: without staleness the buffer holds the best of all it was given."""
+    capacity = data.draw(st.integers(1, 200))
+    rule, buffer = ReplayRule(staleness=0.0), empty_buffer(levels(0)[0, 0], 1, capacity)
+    known: dict[int, float] = {}
+    seed = data.draw(st.integers(0, 2**20))
+    for start in (0, 100, 300):
+        draws = torch.Generator().manual_seed(seed + start)
+        numbers = start + torch.randint(1, 250, (150,), generator=draws)
+        score = torch.rand(250 + 300 + 1, generator=draws).double()[numbers]
+        score[torch.rand(150, generator=draws) < 0.1] = -torch.inf
+        finite = score.isfinite()
+        given = dict(zip(numbers[finite].tolist(), score[finite].tolist(), strict=True))
+        insert(buffer, new(numbers.tolist(), score.tolist()), rule)
+        here = {number: given.get(number, value) for number, value in known.items()}
+        fresh = [(value, number) for number, value in given.items() if number not in known]
+        for value, number in sorted(fresh, reverse=True):
+            if len(here) == capacity:
+                least = min(here, key=here.__getitem__)
+                if value <= here[least]:
+                    break
+                del here[least]
+            here[number] = value
+        known = here
+        row = buffer[0][buffer["filled"][0]]
+        found = dict(zip(row["level", "a"].tolist(), row["score"].tolist(), strict=True))
+        assert found == pytest.approx(known)
+        assert len(row["key"].unique()) == len(row) and int(buffer["clock"][0, 0]) % 150 == 0
+        assert int(row["touched"].max()) <= int(buffer["clock"][0, 0])
+
+
+def test_many_draws_at_once_follow_scores_and_ages() -> None:
+    buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, RANK)
+    buffer["touched"][0, :5] = buffer["clock"][0, 0] - AGE
+    slots = draw_slots(buffer, 20_000, RANK, [torch.Generator().manual_seed(0)])
+    expected = 20_000 * torch.tensor(TOGETHER[1.0][0])
+    counts = slots[0].bincount(minlength=5)
+    assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
+    last = [20_000 - int(slots[0].flip(0).eq(slot).nonzero()[0]) for slot in range(5)]
+    assert (buffer["touched"][0, :5] - 5).tolist() == last
 
 
 def test_keys_tell_levels_apart() -> None:

@@ -30,7 +30,7 @@ from proposer_rl.models.maps import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from tests.graphs import NoHostReads
+from tests.host_reads import HostRead, NoHostReads
 from tests.tiny import TASK, tiny_view_task
 
 P, T = 6, 12
@@ -543,3 +543,22 @@ def test_an_exact_evaluation_stays_on_the_device(monkeypatch: pytest.MonkeyPatch
         ]
     assert crossings.count == 0
     assert {each.device.type for each in found} == {"meta"}
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda x: float(x[0]),
+        lambda x: bool(x.any()),
+        lambda x: x[x > 0],
+        lambda x: x.nonzero(),
+        lambda x: x + torch.tensor([1.0, 2.0, 3.0]),
+        lambda x: torch.equal(x, x),
+    ],
+)
+def test_what_waits_for_the_device_is_found(read) -> None:
+    x = torch.ones(3)
+    with NoHostReads():
+        x.sum() + x[torch.arange(2)].max()
+        with pytest.raises(HostRead):
+            read(x)

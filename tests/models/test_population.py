@@ -8,8 +8,9 @@ import signal
 import pytest
 import torch
 from torch import nn
+from torch.cuda._utils import _get_device_index
 
-from proposer_rl.models import Population, UNet
+from proposer_rl.models import Population, UNet, use_device
 
 
 def small_unet() -> UNet:
@@ -151,3 +152,15 @@ def test_a_network_with_one_output_gives_one_output() -> None:
 def test_refuses(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Population(*arguments)
+
+
+@pytest.mark.parametrize(("name", "current"), [("cuda:1", [1]), ("cuda", []), ("cpu", [])])
+def test_a_gpu_without_a_number_is_the_current_one(
+    name: str, current: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    # What torch.cuda.set_device does first, without a GPU.
+    monkeypatch.setattr(torch.cuda, "set_device", lambda d: made.append(_get_device_index(d)))
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", lambda _: None)
+    use_device(torch.device(name))
+    assert made == current

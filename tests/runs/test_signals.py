@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from pathlib import Path
 
 import pytest
 
 from proposer_rl.runs.signals import STOP_SIGNALS, Interrupted, StopSignals
+from tests.processes import ROOT, python
 
 
 def send(signum: int) -> None:
@@ -97,3 +99,21 @@ def test_other_threads_change_nothing() -> None:
     thread.start()
     thread.join()
     assert handlers == [[signal.getsignal(signum) for signum in STOP_SIGNALS]]
+
+
+SHIELDED = """
+import os, time
+from multiprocessing import Lock, resource_tracker
+from proposer_rl.runs.signals import STOP_SIGNALS, StopSignals
+with StopSignals():
+    Lock()
+    for signum in STOP_SIGNALS:
+        os.kill(resource_tracker._resource_tracker._pid, signum)
+    time.sleep(0.2)
+    print(os.waitpid(resource_tracker._resource_tracker._pid, os.WNOHANG))
+"""
+
+
+def test_the_resource_tracker_outlives_what_slurm_sends_to_all(tmp_path: Path) -> None:
+    ended = python(SHIELDED, path=ROOT, folder=tmp_path)
+    assert (ended.stdout, ended.stderr) == ("(0, 0)\n", "")

@@ -36,7 +36,7 @@ def test_the_table_is_that_of_the_code(row: str) -> None:
     told, functions, space = ROWS[row]
     name, _, settings = row.partition("(")
     recipe = getattr(prl.curricula, name)
-    given: Any = {"source": "episodes"} if settings else {}
+    given: Any = dict(re.findall(r'(\w+)="(\w+)"', settings))
     if name == "hand_designed":
         given = {"distributions": ["easy"], "until": []}
     teacher = prl.Teacher(recipe(**given), RANGES, student=Able())

@@ -446,3 +446,48 @@ def test_recipes_of_ones_own_and_their_settings() -> None:
         prl.Teacher(prl.curricula.plr(capacity=0), SPACE)
     with pytest.raises(AttributeError, match="there is no 'plrr'"):
         prl.Teacher("plrr", SPACE)
+
+
+def test_the_parts_of_a_curriculum_are_one_import_and_their_defaults_agree() -> None:
+    """Each option of replay by itself, too: none has a default that another one refuses."""
+    from proposer_rl.curricula import ReplayCurriculum, ReplayRule, Scorer
+
+    options: list[dict[str, Any]] = [
+        {},
+        {"rule": ReplayRule()},
+        {"train_on_new": True},
+        {"train_on_new": False},
+        {"synchronous": True},
+        {"synchronous": False},
+        {"edits": 2, "edit": SPACE.edit},
+        {"renew": True},
+        {"co_learnability": 0.5},
+    ]
+    for some in options:
+        own = ReplayCurriculum(SPACE, Scorer("regret", "episodes"), capacity=16, **some)
+        teacher = prl.Teacher(own, SPACE, block=8, play=episodes)
+        for _ in range(3):
+            ids, levels = teacher.ask(8)
+            teacher.tell(ids, solved(levels)["success"])
+        assert teacher.log()["filled"][0] >= 8, some
+
+
+def test_a_score_from_gradients_says_what_it_lacks_and_takes_a_function() -> None:
+    recipe = prl.curricula.plr(score="gradient_norm", **SMALL)
+    with pytest.raises(TypeError, match=r"plr needs a student with policy_gradient_norms: it has"):
+        prl.Teacher(recipe, SPACE)
+    seen = []
+
+    def norms(rollout: Any) -> torch.Tensor:
+        seen.append(rollout.batch_size)
+        return rollout["gravity"][..., 0]
+
+    teacher = prl.Teacher(recipe, SPACE, policy_gradient_norms=norms)
+    levels = teacher.propose(8)
+    ends = torch.ones(1, 8, 3, 1, dtype=torch.bool)
+    after = {"done": ends, "terminated": ends, "reward": torch.zeros(1, 8, 3, 1)}
+    gravity = levels["gravity"].expand(3, 1, 8).permute(1, 2, 0)
+    rollout = TensorDict({"gravity": gravity, "next": after}, [1, 8, 3])
+    teacher.observe(prl.outcome_of(rollout))
+    assert teacher.log()["mean_score"] == pytest.approx([float(levels["gravity"].mean())])
+    assert seen == [(1, 8, 3)]

@@ -10,10 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
-from proposer_rl.learning.cuda_graphs import use
 from proposer_rl.meta.copies import Trained, taken_out
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
-from proposer_rl.models import ActorCritic, uniform_noise
+from proposer_rl.models import ActorCritic, uniform_noise, use_device
 from proposer_rl.streams import Streams
 
 
@@ -72,7 +71,7 @@ MakeEnv = Callable[..., SolverTrainingEnv]
 
 def make_worker_env(make_env: MakeEnv, share: range, device: str, threads: int) -> Any:
     """The environment of a worker, computed with as many threads as in the main process."""
-    use(torch.device(device))
+    use_device(torch.device(device))
     torch.set_num_threads(threads)
     return make_env(share=share, device=device, kind=WorkerEnv)
 

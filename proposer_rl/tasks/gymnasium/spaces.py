@@ -57,7 +57,7 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
             raise ValueError(
                 f"observation space {space}: there is no network for {part}"
                 f"{f', its part {name}' if name else ''}; a wrapper can leave it out, as "
-                "task.wrappers=[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+                "wrappers=[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
             )
     images = {name: cast(spaces.Box, part) for name, part in parts.items() if is_image(part)}
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})

@@ -113,7 +113,7 @@ def _check_wrappers(
                 make.wrappers[count - 1],
                 "it keeps running statistics or the like, or draws numbers without the seed: the "
                 "same actions on the same level can end otherwise the second time. What all "
-                "environments share is normalised by solver.ppo.normalize_observations and "
+                "environments share is normalised by PPO's normalize_observations and "
                 "normalize_rewards",
             )
         warnings.warn(

@@ -27,9 +27,5 @@ __all__ = [
     "validate_levels",
 ]
 
-# By name, so that Gymnasium's environments are imported when one is made.
-register(
-    "proposer_rl/Maze-v0",
-    entry_point="proposer_rl.tasks.mazes.as_gymnasium:SingleMaze",
-    vector_entry_point="proposer_rl.tasks.mazes.as_gymnasium:VectorMaze",
-)
+# By name, so that it is imported when one is made.
+register("proposer_rl/Maze-v0", entry_point="proposer_rl.tasks.mazes.as_gymnasium:SingleMaze")

@@ -69,9 +69,6 @@ class LevelEnv(EnvBase):
     def set_levels(self, levels: Level) -> None:
         """Replaces the levels; each maze plays its new one from its own next reset on.
 
-        The new levels are copied to where the ones before them were, so that a recorded reset
-        (:mod:`proposer_rl.learning.cuda_graphs`) finds them.
-
         Args:
             levels: Levels of the environment's batch shape, grid and device.
 

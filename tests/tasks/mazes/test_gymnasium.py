@@ -11,12 +11,10 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from torchrl.envs import EnvBase, GymEnv, GymWrapper
+from torchrl.envs import EnvBase, GymEnv
 
 from proposer_rl.tasks.mazes import Level, MazeEnv
 from proposer_rl.tasks.mazes.as_gymnasium import AHEAD
@@ -30,10 +28,6 @@ UP, DOWN, LEFT, RIGHT = range(4)
 
 def make(**arguments: Any) -> gymnasium.Env:
     return gymnasium.make(ID, **arguments)
-
-
-def make_vec(count: int, mode: str = "vector_entry_point", **arguments: Any) -> Any:
-    return gymnasium.make_vec(ID, num_envs=count, vectorization_mode=mode, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -136,94 +130,26 @@ def assert_same_steps(some: list[Any], others: list[Any]) -> None:
             assert one[key].dtype == other[key].dtype
 
 
-def test_torchrl_sees_the_trajectories_of_a_batch() -> None:
-    count = 5
-    native = make_vec(count, autoreset_mode="Disabled", max_steps=6, **EASY)
-    env = GymWrapper(native, categorical_action_encoding=True)
-    assert env.batch_size == (count,)
-    state = env.reset()
-    same = MazeEnv(native.level, max_steps=6)
-    expected = same.reset()
-    for action in torch.randint(4, (30, count), generator=torch.Generator().manual_seed(0)):
-        step, state = env.step_and_maybe_reset(state.set("action", action))
-        other = same.step(expected.set("action", action))
-        assert_same_steps([step["next"]], [other["next"]])
-        same.set_levels(native.level)  # finished mazes got new ones
-        expected = same.maybe_reset(same._step_mdp(other).exclude("action"))
-        assert torch.equal(state["planes"], expected["planes"])
-        assert torch.equal(state["agent"], expected["agent"])
-
-
-@pytest.mark.parametrize("autoreset", list(AutoresetMode), ids=lambda mode: mode.value)
-@pytest.mark.parametrize("observe_agent", [False, True])
-def test_the_batch_is_gymnasiums_batch(autoreset: AutoresetMode, observe_agent: bool) -> None:
-    """Everything that SyncVectorEnv gives, over single environments, with the same seeds."""
-    count, steps = 6, 120
-    arguments = {"obstacle_fraction": [0.0, 0.3], "path_length": [1, 3], "height": 4, "width": 3}
-    arguments |= {"max_steps": 5, "observe_agent": observe_agent}
-    ours = make_vec(count, autoreset_mode=autoreset, **arguments)
-    theirs = make_vec(count, "sync", vector_kwargs={"autoreset_mode": autoreset}, **arguments)
-    assert ours.metadata == theirs.metadata
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    assert ours.single_observation_space == theirs.single_observation_space
-    random, ended = np.random.default_rng(0), 0
-    assert data_equivalence(ours.reset(seed=5), theirs.reset(seed=5), exact=True)
-    for _ in range(steps):
-        actions = random.integers(4, size=count)
-        got, expected = ours.step(actions), theirs.step(actions)
-        assert data_equivalence(got, expected, exact=True)
-        over = got[2] | got[3]
-        ended += over.sum()
-        if autoreset is AutoresetMode.DISABLED and over.any():
-            seeds = [None, 3, None, None, 4, None]
-            masked = [e.reset(seed=seeds, options={"reset_mask": over}) for e in (ours, theirs)]
-            assert data_equivalence(*masked, exact=True)
-    assert ended > count * AHEAD  # the levels drawn ahead were used up
-
-
-def test_what_is_returned_is_not_changed_later() -> None:
-    envs = make_vec(3, **EASY)
-    kept = [envs.reset(seed=0)[0]]
-    kept += [envs.step(np.full(3, action))[0] for action in (UP, DOWN, LEFT, RIGHT)]
-    copies = [{key: value.copy() for key, value in each.items()} for each in kept]
-    for _ in range(60):
-        envs.step(np.full(3, RIGHT))
-    assert data_equivalence(kept, copies, exact=True)
-
-
-def test_levels_given_to_a_batch() -> None:
-    envs = make_vec(2, height=2, width=3, path_length=2, obstacle_fraction=0.0, render_mode="ansi")
-    envs.reset(options={"level": ROOM})
-    assert envs.render() == ("A.#\n..G",) * 2
-    envs.reset(options={"level": [ROOM, "G..\n..S"]})
-    assert envs.render() == ("A.#\n..G", "G..\n..A")
-    envs.reset(options={"level": ["..S\nG..", ROOM], "reset_mask": np.array([False, True])})
-    assert envs.render() == ("A.#\n..G", "A.#\n..G")
-    assert envs.level.to_text() == [ROOM, ROOM]
-
-
 def test_pictures() -> None:
     env = make(render_mode="rgb_array", **EASY)
     env.reset(seed=0)
     picture = env.render()
     assert (picture.shape, picture.dtype) == ((65, 81, 3), np.uint8)
     assert np.array_equal(picture, MazeEnv(env.unwrapped.level).render().numpy())
-    envs = make_vec(2, render_mode="rgb_array", **EASY)
-    envs.reset(seed=0)
-    pictures = envs.render()
-    assert isinstance(pictures, tuple) and np.array_equal(pictures[0], picture)
-    assert make_vec(1, **EASY).render() is None and make(**EASY).unwrapped.render() is None
+    assert make(**EASY).unwrapped.render() is None
 
 
-def test_gymnasiums_wrappers_take_the_batch() -> None:
-    envs = RecordEpisodeStatistics(make_vec(4, max_steps=5, **EASY))
-    envs.reset(seed=0)
-    lengths = []
-    for _ in range(12):
-        info = envs.step(np.full(4, UP))[4]
-        lengths += info["episode"]["l"][info["_episode"]].tolist() if "episode" in info else []
-    assert len(lengths) >= 4 and max(lengths) <= 5
+def test_gymnasium_makes_a_vector_of_them() -> None:
+    """What comes out is each maze's own, and is not changed by later steps."""
+    envs = gymnasium.make_vec(ID, num_envs=3, max_steps=5, **EASY)
+    kept = [envs.reset(seed=5)[0]]
+    kept += [envs.step(np.full(3, action))[0] for action in (UP, DOWN, LEFT, RIGHT) * 3]
+    alone = make(max_steps=5, **EASY)
+    assert np.array_equal(kept[0]["planes"][2], alone.reset(seed=7)[0]["planes"])
+    copies = [{key: value.copy() for key, value in each.items()} for each in kept]
+    for _ in range(20):
+        envs.step(np.full(3, RIGHT))
+    assert data_equivalence(kept, copies, exact=True)
 
 
 @pytest.mark.parametrize(
@@ -246,8 +172,6 @@ def test_gymnasiums_wrappers_take_the_batch() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**arguments)
-    with pytest.raises(ValueError, match=message):
-        make_vec(2, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -256,33 +180,21 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> N
         ({"lvl": ROOM}, r"options must be among \['level'.*\], got 'lvl'"),
         ({"level": ROOM}, "must be of the environment's grid 4x5, got 2x3"),
         ({"level": "S.X"}, "a level holds only"),
-        ({"level": 5}, r"options\['level'\] must be a Level or drawings, got 5"),
+        ({"level": 5}, r"options\['level'\] must be a Level or its drawing, got 5"),
         ({"level": ["S...G\n.....\n.....\n....."] * 3}, r"got batch shape \[3\]"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
-    for env in (make(**EASY), make_vec(2, **EASY)):
-        with pytest.raises(ValueError, match=message):
-            env.reset(options=options)
+    with pytest.raises(ValueError, match=message):
+        make(**EASY).reset(options=options)
 
 
-def test_bad_calls_of_a_batch_are_refused() -> None:
-    envs = make_vec(2, autoreset_mode=AutoresetMode.DISABLED, max_steps=3, **EASY)
-    with pytest.raises(ResetNeeded, match="2 of 2"):
-        envs.step(np.array([0, 0]))
-    envs.reset(seed=0)
-    for actions in ([0], [0, 4], [0.5, 1.0], [[0, 1]]):
-        with pytest.raises(ValueError, match="actions must be 2 whole numbers from 0 to 3"):
-            envs.step(np.array(actions))
-    with pytest.raises(ValueError, match="seed must be one or 2 of them, got 3"):
-        envs.reset(seed=[1, 2, 3])
-    for mask in ([False, False], [True], [1, 0]):
-        with pytest.raises(ValueError, match="must be 2 bools, not all False"):
-            envs.reset(options={"reset_mask": np.array(mask)})
-    with pytest.raises(ValueError, match="autoreset_mode='Later': input should be 'NextStep'"):
-        make_vec(2, autoreset_mode="Later")
-    with pytest.raises(ValueError, match="num_envs=0: input should be greater"):
-        make_vec(0)
+@pytest.mark.parametrize("action", [4, -1, 0.5])
+def test_bad_actions_are_refused(action: Any) -> None:
+    env = make(disable_env_checker=True, **EASY)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be a whole number below 4"):
+        env.unwrapped.step(action)
 
 
 @pytest.mark.slow

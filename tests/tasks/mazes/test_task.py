@@ -24,7 +24,7 @@ from proposer_rl.tasks.mazes.settings import (
     SpaceSettings,
 )
 from proposer_rl.tasks.mazes.task import MazeTask, faster_precision
-from tests.graphs import NoHostReads
+from tests.host_reads import NoHostReads
 from tests.tiny import TASK, evaluate, learners, tiny_task
 
 SMALL = ProposerSettings(
