@@ -120,7 +120,7 @@ def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> Non
 
 def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path) -> None:
     for method in ("domain_randomization", "perf_gain"):
-        few = ["+scale=smoke", "schedule.updates=1", "proposer.meta_episode_length=1"]
+        few = ["+scale=smoke", "schedule.updates=1"]
         assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0
     publish([Path("runs")], Path("study"))
     assert bench("curricula", "--runs", "study", "--repeats", "1", "--threads", "1") == 0
