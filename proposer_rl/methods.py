@@ -119,11 +119,6 @@ def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculu
 def modelled(curriculum: Curriculum, task: Any, config: ModelSettings | None) -> Curriculum:
     """A curriculum that asks a model of outcomes wherever it would ask about performance.
 
-    Args:
-        curriculum: any.
-        task: whose levels have the features, or a space of levels alone.
-        config: of the model; None to leave the curriculum as it is.
-
     Raises:
         ArgumentError: if the task's levels have no features.
     """

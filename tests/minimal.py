@@ -125,6 +125,7 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
+        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, "task.levels=2")
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
         yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from proposer_rl.cli.config import methods
-from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.recipes import available
 from tests import minimal
 from tests.processes import python
 
@@ -89,7 +89,7 @@ def test_every_method_task_and_command_is_called() -> None:
     words = {word for command in called for word in command}
     assert {f"+method={method}" for method in methods()} <= words
     # Of view mazes the smallest; task=gymnasium is what the others are made of; task=maze is given.
-    tasks = set(names(CONFIG_FOLDER, "task"))
+    tasks = set(available("task"))
     tasks -= {"maze", "gymnasium", "view_maze", "view_maze_quick"}
     assert {f"task={task}" for task in tasks} <= words
     assert {f"proposer-{name}" for name, *_ in called} == PROJECT["scripts"].keys()

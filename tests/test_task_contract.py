@@ -16,7 +16,7 @@ from PIL import Image
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
 from tests.tasks.gymnasium.toys import walk_task
-from tests.tiny import mountain_cars, sledges, tiny_task, tiny_view_task
+from tests.tiny import mountain_cars, point_masses, sledges, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5
 
@@ -27,6 +27,7 @@ TASKS = {
     "sledges": sledges,
     "walk": walk_task,
     "views": tiny_view_task,
+    "gates": point_masses,
 }
 
 

@@ -19,6 +19,7 @@ from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
+from proposer_rl.tasks.gymnasium.settings import NetworkSettings as GateNetworkSettings
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.settings import (
@@ -29,6 +30,8 @@ from proposer_rl.tasks.mazes.settings import (
     SpaceSettings,
 )
 from proposer_rl.tasks.mazes.task import MazeTask
+from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
+from proposer_rl.tasks.ranges import RangeSettings
 from proposer_rl.tasks.view_mazes.settings import EvaluationSettings as ViewEvaluationSettings
 from proposer_rl.tasks.view_mazes.settings import (
     PerfectSettings,
@@ -76,6 +79,24 @@ def example_task(module: str, name: str) -> Task:
 
 mountain_cars = partial(example_task, "mountain_car", "MountainCarTask")
 sledges = partial(example_task, "own_task", "SledgeTask")
+
+
+def point_masses(**changed: Any) -> PointMassTask:
+    """SPDL's gates, in 8 x 5 x 2 bins, before which episodes are short."""
+    position = {"distribution": "norm", "loc": 2.5, "scale": 0.004}
+    parts: dict[str, Any] = dict(
+        max_steps=8,
+        parameters=GateSettings(
+            position=RangeSettings(low=-4.0, high=4.0, bins=8, target=position),
+            width=RangeSettings(low=0.5, high=8.0, bins=5, target=0.5),
+            friction=RangeSettings(low=0.0, high=4.0, bins=2, target=0.0),
+        ),
+        network=GateNetworkSettings(hidden=[8], scale=0.25),
+        levels=8,
+        solver=SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2)),
+        context=ComputeContext(),
+    )
+    return PointMassTask(**{**parts, **changed})
 
 
 def tiny_view_task(**changed: Any) -> ViewMazeTask:

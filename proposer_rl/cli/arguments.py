@@ -14,13 +14,7 @@ Number = TypeVar("Number", int, float)
 def number(
     kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf
 ) -> Callable[[str], Number]:
-    """The type of an argument that is a finite number in a range, for argparse.
-
-    Args:
-        kind: ``int`` or ``float``.
-        least: the lowest that is allowed.
-        most: the highest.
-    """
+    """The type of an argument that is a finite number in a range, for argparse."""
     allowed = "a whole number" if kind is int else "a number"
     if math.isfinite(most):
         allowed += f" from {least:,} to {most:,}"

@@ -39,11 +39,6 @@ class Made(NamedTuple):
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
     """Task, Solvers and curriculum of an experiment; nothing is written yet.
 
-    Args:
-        config: the run's settings.
-        signals: which may interrupt a curriculum's long work.
-        status: which is told of its parts.
-
     Raises:
         ConfigError: if settings that are each valid do not go together.
     """

@@ -19,16 +19,19 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
-from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
+from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER
+from proposer_rl.cli.settings import (
+    ComputeSettings,
+    HandDesignedSettings,
+    LoggerSettings,
+    PoolSettings,
+)
+from proposer_rl.recipes import available
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ArgumentError,
-    ComputeSettings,
     FilterSettings,
-    HandDesignedSettings,
-    LoggerSettings,
     ModelSettings,
-    PoolSettings,
     ProposerSettings,
     ScheduleSettings,
     SolverSettings,
@@ -192,10 +195,6 @@ def saved_config(folder: Path) -> RunConfig:
 def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Settings as a run stored them; where it is computed is left to choice.
 
-    Args:
-        values: as read, such as those of a run of a study.
-        file: where they stand, for the error.
-
     Raises:
         ConfigError: if they are of another version.
     """
@@ -230,16 +229,13 @@ def overrides() -> list[str]:
 def check_groups(given: Sequence[str]) -> None:
     """Refuse groups of which one would undo another, since later ones win, or that do not fit.
 
-    Args:
-        given: overrides as they stand on the command line.
-
     Raises:
         ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them, or a
             scale of ours is of another of our tasks.
     """
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
-    if task in names(CONFIG_FOLDER, "task") and scale in names(CONFIG_FOLDER, "scale"):
+    if task in available("task") and scale in available("scale"):
         defaults: Any = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
         scaled = next(group["task"] for group in defaults if "task" in group)
         if task != scaled:
@@ -257,9 +253,6 @@ def check_groups(given: Sequence[str]) -> None:
 
 def check_packages(config: DictConfig) -> None:
     """Refuse a file of one's own that Hydra has put below its group, for want of its first line.
-
-    Args:
-        config: as composed by Hydra.
 
     Raises:
         ConfigError: naming the file.
@@ -281,7 +274,7 @@ def check_packages(config: DictConfig) -> None:
 
 def methods() -> list[str]:
     """Names of the methods in the configuration folder."""
-    return names(CONFIG_FOLDER, "method")
+    return available("method")
 
 
 def _why_not_found(error: BaseException) -> str:

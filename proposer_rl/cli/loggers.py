@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.settings import LoggerSettings
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.report.records import numbers, picture
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.settings import LoggerSettings
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 ID = "wandb_id.txt"
@@ -56,14 +56,7 @@ def require_logger(settings: LoggerSettings) -> None:
 def logger(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Write | None]:
-    """What writes to a logger of an installed package; None where the run's folder is enough.
-
-    Args:
-        settings: which logger.
-        path: the run's folder, where files of the logger go.
-        name: of the run.
-        config: the run's settings.
-    """
+    """What writes to a logger of an installed package; None where the run's folder is enough."""
     if settings.type == "tensorboard":
         with _tensorboard(path / name, config) as write:
             yield write

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import shlex
 from contextlib import suppress
 from importlib.metadata import version
@@ -23,6 +22,7 @@ from proposer_rl.cli.config import RunConfig, overrides
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
+from proposer_rl.recipes import override_value
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.records import level_text
 from proposer_rl.report.terminal import screen
@@ -81,9 +81,7 @@ def quoted(path: str) -> str:
     with suppress(HydraException):
         if OverridesParser.create().parse_override(f"hydra.run.dir={path}").value() == path:
             return path
-    # Backslashes count before a quote only, where each stands for itself if doubled.
-    escaped = re.sub(r"(\\*)('|$)", lambda end: 2 * end[1] + end[2].replace("'", r"\'"), path)
-    return f"'{escaped}'"
+    return override_value(path)
 
 
 def _about(config: RunConfig) -> dict[str, str]:

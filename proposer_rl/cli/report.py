@@ -38,13 +38,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
+    from proposer_rl.report.records import printable
 
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
     if options.publish is not None:
         from proposer_rl.report.publish import publish
 
         written, left_out = publish(options.folder, options.publish)
-        print(*left_out, f"Runs: {written} in {options.publish}", sep="\n")
+        said = [*left_out, f"Runs: {written} in {options.publish}"]
+        print(*map(printable, said), sep="\n")
         return
     from proposer_rl.report.build import write_report
 
@@ -56,7 +58,7 @@ def _run(options: argparse.Namespace) -> None:
         progress=not options.quiet,
         meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
-    print(f"Report: {page}")
+    print(printable(f"Report: {page}"))
 
 
 def _parser() -> argparse.ArgumentParser:

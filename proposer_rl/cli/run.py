@@ -55,10 +55,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
 def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 
-    Args:
-        config: the run's settings.
-        path: the run's folder.
-        signals: which may ask the run to stop; inside their context.
+    It is called inside the context of the signals that may ask the run to stop.
 
     Returns:
         The headline measurement at the end.

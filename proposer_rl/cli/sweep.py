@@ -108,12 +108,6 @@ def record_failure(folder: Path, error: Exception, message: str, exit_code: int)
 
     Of a run that another process is working on nothing is recorded: the folder is not ours.
 
-    Args:
-        folder: of the run.
-        error: what happened.
-        message: in one line.
-        exit_code: of the sweep; 2 for bad input, whose traceback tells nothing.
-
     Returns:
         NaN, for the run's value.
     """

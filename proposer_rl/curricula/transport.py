@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 
 MOST_BINS = 4096
 NOTHING = 1e-6  # a share that is rounding of the solver's
+SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself
 
 
 class TransportCurriculum(BinCurriculum):
@@ -186,17 +187,20 @@ def step_towards(
         ]
     )
     cost_a, cost_b = (costs[np.ix_(rows, columns)].ravel() for columns in (to, fro))
-    result = linprog(
-        np.concatenate([cost_a, np.zeros_like(cost_b)]),
-        A_ub=np.concatenate([np.zeros_like(cost_a), cost_b])[None],
-        b_ub=[max(reach**2, nearest)],
-        A_eq=equal.tocsr(),
-        b_eq=np.concatenate([target[to], now[fro], np.zeros(count)]),
-        method="highs",
-        # Presolving takes what the shares are off by, 1e-16 in their sums, for a contradiction.
-        options={"presolve": False},
-    )
-    if result.x is None:
+    for slack in (0.0, SLACK):
+        result = linprog(
+            np.concatenate([cost_a, np.zeros_like(cost_b)]),
+            A_ub=np.concatenate([np.zeros_like(cost_a), cost_b])[None],
+            b_ub=[max(reach**2, nearest * (1 + slack))],
+            A_eq=equal.tocsr(),
+            b_eq=np.concatenate([target[to], now[fro], np.zeros(count)]),
+            method="highs",
+            # Presolving takes what the shares are off by, 1e-16 in their sums, for a contradiction.
+            options={"presolve": False},
+        )
+        if result.x is not None:
+            break
+    else:
         raise RuntimeError(f"the transport to the target cannot be computed: {result.message}")
     p = np.zeros_like(target)
     p[rows] = result.x[: cost_a.size].reshape(shape_a).sum(1).clip(0)

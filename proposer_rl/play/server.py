@@ -53,12 +53,7 @@ HEADERS = {
 
 
 def application(session: Session, token: str) -> Starlette:
-    """The page and what it asks, all below ``/TOKEN/``.
-
-    Args:
-        session: the run that is shown.
-        token: the secret part of the address.
-    """
+    """The page and what it asks, all below ``/TOKEN/``."""
     asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {
         "examine": (Examine, session.examine),
         "levels": (Source, session.levels),
@@ -118,10 +113,7 @@ class Guard:
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on the loopback address.
-
-    Args:
-        port: its port; 0 for a free one.
+    """A socket on the loopback address, at port 0 on a free one.
 
     Raises:
         OSError: if it cannot be had.

@@ -38,12 +38,7 @@ def answer(study: Study) -> tuple[str, str]:
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
-    """What a method does, in a line: as its runs recorded it, or else as the caller knows it.
-
-    Args:
-        group: of the method, perhaps with an ablation.
-        meanings: for runs that recorded none.
-    """
+    """What a method does, in a line: as its runs recorded it, or else as the caller knows it."""
     run = group.runs[0]
     about = run.facts.get("about")
     own = about if isinstance(about, Mapping) else {}

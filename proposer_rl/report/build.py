@@ -20,7 +20,7 @@ from proposer_rl.report import (
 from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
-from proposer_rl.report.records import words
+from proposer_rl.report.records import encoded, words
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
@@ -116,12 +116,12 @@ def write_report(
     html = page.render(title=title, command=command, sections=sections, notes=notes)
     parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
     parts += [page.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)]
-    files["report.md"] = page.document(parts, command, notes).encode()
+    files["report.md"] = encoded(page.document(parts, command, notes))
     for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         path.mkdir(parents=True)
-    for name, content in {**files, PAGE: html.encode()}.items():
+    for name, content in {**files, PAGE: encoded(html)}.items():
         write_atomically(output / name, content)
     return output / PAGE
 
@@ -149,8 +149,8 @@ def _section(
     methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
     for table in (methods, *tables):
-        files[f"{TABLES}/{prefix}{table.name}.csv"] = table.to_csv().encode()
-        files[f"{TABLES}/{prefix}{table.name}.md"] = table.to_markdown().encode()
+        files[f"{TABLES}/{prefix}{table.name}.csv"] = encoded(table.to_csv())
+        files[f"{TABLES}/{prefix}{table.name}.md"] = encoded(table.to_markdown())
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = tidy.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}

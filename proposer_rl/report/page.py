@@ -207,12 +207,7 @@ def _distinct(runs: Sequence[Run], text: Any) -> str:
 
 
 def section(study: Study, figures: str) -> str:
-    """What was compared, the answer, and the tables.
-
-    Args:
-        study: the runs.
-        figures: how the addresses of its figures begin.
-    """
+    """What was compared, the answer, and the tables."""
     about = facts(study) + origin(study)
     if short := incomplete(study):
         text = f"Not finished, or shorter than {study.horizon} updates"

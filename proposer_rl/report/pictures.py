@@ -108,10 +108,6 @@ def _in_rows(
 def draw_run(folder: Path, title: str) -> Path:
     """One picture of a run: what was measured on every distribution, and levels trained on.
 
-    Args:
-        folder: a run's folder.
-        title: of the picture.
-
     Returns:
         The file, ``run.png`` in the folder.
     """

@@ -157,10 +157,6 @@ def left(folder: Path, planned: Sequence[Sequence[str]]) -> Left | None:
     A run takes as long as the mean of the finished ones that differ from it in the seed alone, or
     else of all; of one that goes on that is the whole.
 
-    Args:
-        folder: of the sweep, with its plan.
-        planned: of each run the settings.
-
     Raises:
         UnreadableRun: if there is no such folder.
     """

@@ -11,7 +11,7 @@ from typing import Any
 
 from proposer_rl.report.page import document, report_command, section
 from proposer_rl.report.reading import OutputError, find_runs, read_run
-from proposer_rl.report.records import anywhere
+from proposer_rl.report.records import anywhere, encoded
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tidy import STUDY, write_study
@@ -83,10 +83,7 @@ def write_page(folder: Path) -> None:
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
     command = report_command("bin/report", [folder], None, None)
     said = above.strip() or f"{title}\n\n{DATA}"
-    text = document([said, MARK, *parts], command, [])
-    write_atomically(
-        file, text.replace("It is written by", "The whole report is drawn by").encode()
-    )
+    write_atomically(file, encoded(document([said, MARK, *parts], command, [])))
 
 
 def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:

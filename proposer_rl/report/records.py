@@ -137,6 +137,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
 
 
+def encoded(text: str) -> bytes:
+    """A text as UTF-8; what has no encoding, as half of a pair in a folder's name, becomes ?."""
+    return text.encode("utf-8", "replace")
+
+
 def anywhere(text: str) -> str:
     """Text without the folders of the machine it comes from: of a whole path the last part."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)

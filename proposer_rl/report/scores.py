@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from proposer_rl.report.comparisons import Outcome, at_the_end
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.records import number, printable, words
+from proposer_rl.report.records import encoded, number, printable, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
@@ -50,7 +50,7 @@ class Score(NamedTuple):
 
 def write_scores(scores: Iterable[Score]) -> bytes:
     """Scores as CSV."""
-    return to_csv(Score._fields, [list(score) for score in scores]).encode()
+    return encoded(to_csv(Score._fields, [list(score) for score in scores]))
 
 
 def read_scores(file: Path) -> list[Score]:

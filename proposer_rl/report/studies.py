@@ -158,11 +158,6 @@ def read_studies(
 ) -> tuple[list[Study], list[str]]:
     """Read runs and sort them into studies.
 
-    Args:
-        folders: of runs.
-        threshold: in place of the runs' own.
-        baseline: label of what the others are measured against, where it is there.
-
     Returns:
         The studies, the largest first, and a line for each folder that was left out.
 

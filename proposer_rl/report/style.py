@@ -126,16 +126,7 @@ def axes_of(figure: FigureBase) -> Axes:
 def finish(
     axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
 ) -> None:
-    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge.
-
-    Args:
-        axes: where they are drawn.
-        x: name of the abscissa.
-        y: name of the ordinate.
-        means: of all methods.
-        rate: whether the ordinate goes from 0 to 1.
-        zero: whether it begins at zero, where nothing is less.
-    """
+    """Name the axes and limit the ordinate to the means: intervals of few runs can be huge."""
     axes.set(xlabel=x, ylabel=y)
     axes.margins(x=0.01)
     values = np.concatenate([[], *means])

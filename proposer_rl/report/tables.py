@@ -85,12 +85,7 @@ def from_csv(text: str) -> str:
 
 
 def write(cell: Cell, digits: int | None = None) -> str:
-    """A cell as a reader sees it.
-
-    Args:
-        cell: text, a number, or an estimate with its interval.
-        digits: decimals of a number; None for as many as its size asks for.
-    """
+    """A cell as a reader sees it; where no digits are given, with what its size asks for."""
     if isinstance(cell, Interval):
         if digits is None:
             digits = 1 if max(map(abs, cell)) >= 2 else 3

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from proposer_rl.report.records import encoded
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import read_bounded, write_atomically
 
@@ -65,16 +66,11 @@ def to_csv(table: pd.DataFrame) -> bytes:
     text: str = table.to_csv(
         index=False, lineterminator="\n", float_format=lambda x: repr(float(x)).removesuffix(".0")
     )
-    return text.encode()
+    return encoded(text)
 
 
 def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
-    """Write the tables of a study; those of a former one are replaced.
-
-    Args:
-        folder: of the study.
-        runs: each with its name, for all seeds of a folder the same.
-    """
+    """Write the tables of a study; those of a former one are replaced."""
     listed = [
         {
             "run": name,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,7 +18,8 @@ STEP = 0.1  # standard deviation of an edit, as a share of a range
 MOST_BINS = 256  # along an axis; readers of runs take no more
 
 
-class Bins(NamedTuple):
+@dataclass(frozen=True)
+class Bins:
     """Parts of a parameter's line that are equally likely.
 
     Attributes:
@@ -70,24 +71,65 @@ class Bins(NamedTuple):
             return (old + noise * STEP * (high - low)).clamp(low, high)
         return (old + _one_at_least(noise, float(high - low))).clamp(low, high)
 
+    def scaled(self, values: Tensor) -> Tensor:
+        """Where values float64 [*B] lie: the first part's middle at -1, the last one's at 1.
+
+        Of a single part its ends, and a single value at 0.
+        """
+        ends = (self.low + self.high).double() / 2
+        if len(ends) == 1:
+            ends = torch.cat([self.low, self.high]).double()
+        first, reach = ends[0], ends[-1] - ends[0]
+        return 2 * (values - first) / reach - 1 if reach > 0 else 0 * values
+
+    def below(self, ends: Tensor) -> Tensor:
+        """The probability of a value of at most each of some ends, float64 [n]."""
+        low, high = self.low.double(), self.high.double()
+        if self.wide and not self.low.is_floating_point():  # a whole number is an interval of one
+            low, high = low - 0.5, high + 0.5
+        beyond = ends.double().unsqueeze(-1) - low
+        inside = (beyond / (high - low)).clamp(0, 1)
+        return torch.where(high > low, inside, (beyond >= 0).double()).mean(-1)
+
     def shares(self, of: Bins) -> Tensor:
         """Which of these parts values of other parts lie in, float64 [n].
 
         What lies beyond the first or the last part, or between single values, counts for the
         nearest part.
         """
-        total = torch.zeros(len(self.low), dtype=torch.float64)
-        if self.wide and not self.low.is_floating_point():  # a whole number is an interval of one
-            return Bins(self.low - 0.5, self.high + 0.5).shares(Bins(of.low - 0.5, of.high + 0.5))
-        for low, high in zip(of.low, of.high, strict=True):
-            if high == low:
-                apart = torch.maximum(self.low - low, low - self.high).clamp_min(0)
-                total[apart.argmin()] += 1
-            else:
-                inner = self.high[:-1].clamp(low, high)
-                ends = torch.cat([low.view(1), inner, high.view(1)])
-                total += ends.diff() / (high - low)
-        return total / len(of.low)
+        ends = of.below((self.high[:-1] + self.low[1:]) / 2)
+        return torch.cat([torch.zeros(1), ends, torch.ones(1)]).diff()
+
+    def __str__(self) -> str:
+        ends = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        return " or ".join(f"{a:g}" if a == b else f"{a:g} to {b:g}" for a, b in ends)
+
+
+@dataclass(frozen=True)
+class Law(Bins):
+    """Any distribution on a part of a parameter's line.
+
+    Attributes:
+        quantile: values [n] that a draw is below with some probabilities, float64 [n].
+        cumulative: the probabilities float64 [n] of at most some values.
+        name: of the distribution.
+    """
+
+    quantile: Callable[[Tensor], Tensor]
+    cumulative: Callable[[Tensor], Tensor]
+    name: str
+
+    def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
+        """Values [P]; what would lie beyond the ends lies there."""
+        share = torch.rand(len(index), generator=generator, dtype=torch.float64)
+        return self.quantile(share).clamp(self.low, self.high)
+
+    def below(self, ends: Tensor) -> Tensor:
+        """The probability of a value of at most each of some ends, float64 [n]."""
+        return self.cumulative(ends)
+
+    def __str__(self) -> str:
+        return self.name
 
 
 def points(values: Sequence[Number], key: str = "values") -> Bins:
@@ -125,6 +167,7 @@ class ParameterSpace:
         bins: of each parameter, by name.
         seeded: whether levels have seeds.
         seeds: that they are drawn from.
+        device: of the levels.
 
     Example:
         >>> space = ParameterSpace({"gravity": points([5, 10]), "force": intervals(2.0, 18.0, 4)})
@@ -133,23 +176,31 @@ class ParameterSpace:
     """
 
     def __init__(
-        self, bins: Mapping[str, Bins], seeded: bool = True, seeds: range = range(LARGEST_SEED)
+        self,
+        bins: Mapping[str, Bins],
+        seeded: bool = True,
+        seeds: range = range(LARGEST_SEED),
+        device: torch.device | str = "cpu",
     ) -> None:
         self.bins, self._seeded, self._seeds = dict(bins), seeded, seeds
+        self._device = torch.device(device)
         self.axes = {name: part.middles for name, part in self.bins.items()}
         self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
 
     @property
     def coordinates(self) -> Tensor:
         """Of each bin, from -1 to 1 along every axis (0 along one of a single bin): [N, D]."""
-        lines = [_scaled(values) for values in self.axes.values()]
+        lines = [part.scaled((part.low + part.high).double() / 2) for part in self.bins.values()]
         if not lines:
             return torch.zeros(1, 0)
         return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
 
     def locate(self, levels: TensorDictBase) -> Tensor:
-        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, D] on the CPU."""
-        lines = [_scaled(values, levels[name].cpu()) for name, values in self.axes.items()]
+        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, D] on the CPU.
+
+        Along the only bin of an axis from -1 to 1.
+        """
+        lines = [part.scaled(levels[name].cpu().double()) for name, part in self.bins.items()]
         return torch.stack(lines, -1).float()
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
@@ -173,7 +224,8 @@ class ParameterSpace:
             name: part.draw(place, generator)
             for (name, part), place in zip(self.bins.items(), places, strict=True)
         }
-        return TensorDict({**level, **self._drawn_seeds(choices.shape, generator)}, choices.shape)
+        seeds = self._drawn_seeds(choices.shape, generator)
+        return TensorDict({**level, **seeds}, choices.shape, device=self._device)
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Levels [K, P] at points of the box [-1, 1]^D that the whole ranges span.
@@ -188,7 +240,7 @@ class ParameterSpace:
         level = {name: part.at(shares[..., i]) for i, (name, part) in enumerate(self.bins.items())}
         seeds = [self._drawn_seeds(points.shape[1:2], g) for g in generators]
         drawn = {key: torch.stack([one[key] for one in seeds]) for key in seeds[0]}
-        return TensorDict({**level, **drawn}, points.shape[:2])
+        return TensorDict({**level, **drawn}, points.shape[:2], device=self._device)
 
     def edit(
         self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]
@@ -203,14 +255,14 @@ class ParameterSpace:
         )
 
     def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
-        levels, shape = levels.clone(), levels.batch_size
+        levels, shape = levels.cpu().clone(), levels.batch_size
         for _ in range(count):
             which = torch.randint(len(self.bins), shape, generator=generator)
             noise = torch.randn(shape, generator=generator, dtype=torch.float64)
             for i, name in enumerate(self.bins):
                 old = levels[name]
                 levels[name] = self._moved(name, old, noise).where(which == i, old)
-        return levels
+        return levels.to(self._device)
 
     def _moved(self, name: str, old: Tensor, noise: Tensor) -> Tensor:
         """Values [n] of a parameter moved by normal noise, float64 [n]."""
@@ -227,10 +279,3 @@ def _one_at_least(noise: Tensor, reach: float) -> Tensor:
     """Whole steps, int64 [n]: a tenth of a reach times noise, and one at least."""
     steps = (noise * max(STEP * reach, 1)).round()
     return steps.where(steps != 0, noise.sign()).long()
-
-
-def _scaled(values: Sequence[Number], points: Tensor | None = None) -> Tensor:
-    """Points of an axis, by default its values, which go from -1 to 1."""
-    known = torch.tensor(values, dtype=torch.float64)
-    points, reach = known if points is None else points.double(), known[-1] - known[0]
-    return 2 * (points - known[0]) / reach - 1 if reach > 0 else 0 * points

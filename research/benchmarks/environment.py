@@ -7,11 +7,13 @@ from functools import partial
 
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, successors
-from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import cell_index
+from proposer_rl.tasks.point_masses.env import LEVEL, PointMassEnv
 from research.benchmarks.plain_env import PlainMaze
 from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.timing import interleave, rate, ratio
@@ -67,7 +69,26 @@ def environment_steps(options: Options) -> Result:
                 "x",
             ),
         ]
-    return Result(rows)
+    return Result([*rows, point_masses(4 if options.tiny else 16384, options)])
+
+
+def point_masses(batch: int, options: Options) -> Row:
+    """Point masses before gates of all kinds, pushed at random and begun again."""
+    device = options.device
+    spread = torch.linspace(0, 1, batch)
+    env = PointMassEnv(TensorDict({name: 4 * spread for name in LEVEL}, [batch]), device=device)
+    actions = torch.rand(20, batch, 2, device=device) * 2 - 1
+    seconds = interleave(
+        {"TorchRL": partial(through_torchrl, env, actions)}, options.repeats, device
+    )
+    return Row(
+        f"PointMassEnv through TorchRL, batch {batch:,}",
+        "random actions and resets",
+        rate(batch * len(actions), seconds["TorchRL"]),
+        "/s",
+        target=1e6,
+        samples=seconds,
+    )
 
 
 def draw_actions(steps: int, batch: int, device: str) -> Tensor:
@@ -82,8 +103,8 @@ def _playing(
 
 
 @torch.no_grad()
-def through_torchrl(env: LevelEnv, actions: Tensor) -> Tensor:
-    """Play actions [T, N]; returns the sum of all rewards."""
+def through_torchrl(env: EnvBase, actions: Tensor) -> Tensor:
+    """Play actions [T, N, ...]; returns the sum of all rewards."""
     state = env.reset()
     total = torch.zeros(env.batch_size.numel(), 1, device=actions.device)
     for action in actions:

@@ -18,6 +18,7 @@ from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
+from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task
 
@@ -200,3 +201,21 @@ def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
     parts = Components(SimpleNamespace(), ProposerSettings(), [0])
     with pytest.raises(TypeError, match="SimpleNamespace must define target_shares"):
         currot(parts)
+
+
+@pytest.mark.parametrize("seed", [46, 105, 164])
+def test_the_nearest_distribution_is_found_where_the_solver_needs_slack(seed: int) -> None:
+    """On a plane of bins few of which are allowed; without slack HiGHS ends in an unknown state."""
+    plane = ParameterSpace({"a": intervals(0, 1, 8), "b": intervals(0, 1, 5)})
+    places = plane.coordinates.double()
+    costs = torch.cdist(places, places).square().numpy()
+    draw, size = np.random.default_rng(seed), len(places)
+    allowed = np.zeros(size, bool)
+    allowed[draw.permutation(size)[: draw.integers(1, size)]] = True
+    even, target = np.full(size, 1 / size), np.eye(size)[30]
+    p, left = step_towards(target, even, costs, allowed, 0.3)
+    assert p.sum() == pytest.approx(1) and (p[~allowed] == 0).all()
+    # No worse than if all mass goes to its nearest allowed bin, of several to the target's nearest.
+    nearest = np.where(allowed, costs, np.inf)
+    tied = nearest == nearest.min(1, keepdims=True)
+    assert left <= (even * np.where(tied, costs[30], np.inf).min(1)).sum() + 1e-6

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import html
 import json
+import os
 import re
 import subprocess
 import sys
@@ -60,7 +61,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         told = {"levels": [0.1, 0.5, 0.25 * seed]}
         write_run(runs / f"p{seed}", "perf_gain", [seed], cycles=cycles, copies=600, **told)
         write_run(runs / f"t{seed}", "target", [seed], finished=seed == 0, **told)
-    write_run(runs / "hostile", HOSTILE, cycles=cycles, ablation="../../up", **told)
+    cycles[2]["\ud800"] = 1.0  # half of a pair: there is no such character
+    half = runs / os.fsdecode(b"hostile\xff")
+    facts = {"machine": "\ud800"}
+    write_run(half, HOSTILE, cycles=cycles, ablation="../../up", facts=facts, **told)
     write_run(runs / "large", "target", task={**TASK, "title": "5×5 mazes", "measured": 5})
     return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
 

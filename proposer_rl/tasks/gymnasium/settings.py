@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
-import torch
-from annotated_types import Ge, Gt, Le, Len
+from annotated_types import Ge, Gt, Len
 
 from proposer_rl.settings import settings
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, flag
-from proposer_rl.tasks.parameters import MOST_BINS, Bins, Number, intervals, points
+from proposer_rl.tasks.ranges import RangeSettings
 
 # The dotted name of a function or class, or that with its further arguments by name.
 WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
@@ -18,11 +17,8 @@ Widths = list[Annotated[int, Ge(1)]]
 
 
 @settings
-class ParameterSettings:
+class ParameterSettings(RangeSettings):
     """A number of the environment that differs between levels.
-
-    Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
-    parts, within which it is drawn uniformly; without ``bins`` in one.
 
     Attributes:
         set: how it gets into the environment, before each reset: as an attribute, as an argument
@@ -31,57 +27,15 @@ class ParameterSettings:
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
             argument, option or function (which must be given), or of several that all get the
             value; None for the parameter's own name.
-        values: rising; whole numbers, if all are.
-        low, high, bins: of a range.
-        target: what is to be mastered: a number; of ``values`` also several, equally likely; of a
-            range also [from, to].
     """
 
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
     name: str | Annotated[list[str], Len(1)] | None = None
-    values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
-    low: float | None = None
-    high: float | None = None
-    bins: Annotated[int, Ge(1), Le(MOST_BINS)] | None = None
-    target: Number | Annotated[list[Number], Len(1)]
-
-    def space_bins(self) -> Bins:
-        """The bins of the parameter.
-
-        Raises:
-            ValueError: if it has neither values nor a range, both, or they do not rise.
-        """
-        low, high, bins = self.low, self.high, self.bins
-        if self.values is not None:
-            if (low, high, bins) != (None, None, None):
-                raise ValueError("either values, or low, high and bins")
-            return points(self.values)
-        if low is None or high is None:
-            raise ValueError("needs values, or low, high and perhaps bins")
-        return intervals(low, high, bins or 1)
 
     def names(self, own: str) -> list[str]:
         """Where the value of the parameter, whose own name this is, goes."""
         name = own if self.name is None else self.name
         return [name] if isinstance(name, str) else name
-
-    def target_bins(self) -> Bins:
-        """What of the parameter the Solver is to master.
-
-        Raises:
-            ValueError: if it is no part of a line.
-        """
-        target = self.target if isinstance(self.target, list) else [self.target]
-        kind = self.space_bins().low.dtype
-        if self.values is not None or len(target) == 1:
-            single = points(target, "target")
-            if kind == torch.int64 and single.low.dtype != kind:
-                raise ValueError(f"target={target} must be whole, as values={self.values} are")
-            return Bins(*(end.to(kind) for end in single))
-        if len(target) > 2 or not target[0] < target[1]:
-            raise ValueError(f"target={target} must be a number or [from, to]")
-        low, high = torch.tensor(target, dtype=kind)
-        return Bins(low.view(1), high.view(1))
 
 
 class Step(NamedTuple):

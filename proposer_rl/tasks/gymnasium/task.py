@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
@@ -40,10 +39,7 @@ from proposer_rl.tasks.gymnasium.settings import (
 from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, spaces_of
 from proposer_rl.tasks.gymnasium.trial import tried
 from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
-
-# Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
-OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
-RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
+from proposer_rl.tasks.ranges import spaces
 
 
 class GymnasiumTask(Task):
@@ -109,12 +105,12 @@ class GymnasiumTask(Task):
         self._transforms = _checked_transforms(transforms or [])
         self._envs: dict[torch.Size, EnvBase] = {}
         train = range(LARGEST_SEED) if train_seeds is None else range(train_seeds)
-        space, target = _spaces(parameters, train)
+        space, target = spaces(parameters, seeds=train)
         self._test: Mapping[str, ParameterSpace] = {}
         distributions = {"target": target, "all": space}
         if train_seeds is not None:
             distributions["train"] = space
-            both = _spaces(parameters, range(train_seeds, LARGEST_SEED))
+            both = spaces(parameters, seeds=range(train_seeds, LARGEST_SEED))
             self._test = dict(zip(("all", "target"), both, strict=True))
         if parameters:
             self.edit = space.edit
@@ -163,10 +159,7 @@ class GymnasiumTask(Task):
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
-            "Target": "; ".join(
-                f"{name} {' or '.join(_range(*ends) for ends in zip(*bins, strict=True))}"
-                for name, bins in self.target.bins.items()
-            )
+            "Target": "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
             or "any level",
             "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
             f"all bins; {evaluation.episodes} episode(s) on each, with "
@@ -271,23 +264,6 @@ def _checked_transforms(transforms: list[Any]) -> list[Transform]:
     return list(transforms)
 
 
-def _spaces(
-    parameters: Mapping[str, ParameterSettings], seeds: range
-) -> tuple[ParameterSpace, ParameterSpace]:
-    """The Proposer's space and the target."""
-    bins, target = {}, {}
-    for name, settings in parameters.items():
-        try:
-            if name in RESERVED or name.startswith("loss_"):
-                raise ValueError("is a column of training.csv; choose another name")
-            if not re.fullmatch(r"\w[\w .-]*", name):
-                raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
-            bins[name], target[name] = settings.space_bins(), settings.target_bins()
-        except ValueError as error:
-            raise ValueError(f"parameters.{name}: {error}") from error
-    return ParameterSpace(bins, seeds=seeds), ParameterSpace(target, seeds=seeds)
-
-
 @contextmanager
 def _named(env_id: str, extra: str | None) -> Iterator[None]:
     """Say in one line what is wrong with an environment that cannot be made."""
@@ -308,7 +284,3 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
         raise ValueError(
             line if line.startswith("success.") else f"env_id={env_id}: {line}"
         ) from error
-
-
-def _range(low: Tensor, high: Tensor) -> str:
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
@@ -15,6 +18,9 @@ from tests.tasks.gymnasium.toys import PARAMETERS
 BINS = {name: settings.space_bins() for name, settings in PARAMETERS.items()}
 TARGET = {name: settings.target_bins() for name, settings in PARAMETERS.items()}
 SPACE = ParameterSpace(BINS)
+
+
+RANGE = {"low": 0.0, "high": 3.0}
 
 
 def test_bins_stand_for_their_middles_and_the_last_parameter_runs_fastest() -> None:
@@ -80,6 +86,45 @@ def test_a_range_is_divided_among_the_bins_that_it_covers(
     torch.testing.assert_close(shares, counted.double(), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize(
+    ("range_", "target", "mass"),
+    [
+        (
+            {"low": -4.0, "high": 4.0, "bins": 4},
+            {"distribution": "norm", "loc": 1.0, "scale": 2.0},
+            lambda a, b: norm_mass(a, b, 1.0, 2.0),
+        ),
+        (
+            {"low": -4.0, "high": 4.0, "bins": 4},
+            {"values": [-3.0, -2.5, 3.0], "weights": [1.0, 2.0, 5.0]},
+            lambda a, b: {-4.0: 3 / 8, 2.0: 5 / 8}.get(a, 0.0),
+        ),
+        (
+            {"values": [1, 2, 4]},
+            {"values": [1, 4], "weights": [3, 1]},
+            lambda a, b: {1: 3 / 4, 4: 1 / 4}.get(a, 0.0),
+        ),
+    ],
+)
+def test_a_target_may_be_any_distribution(range_: dict, target: dict, mass: Any) -> None:
+    settings = ParameterSettings(**range_, target=target)
+    bins, law = settings.space_bins(), settings.target_bins()
+    shares, ends = bins.shares(law), list(zip(bins.low.tolist(), bins.high.tolist(), strict=True))
+    assert shares.tolist() == pytest.approx([mass(a, b) for a, b in ends])
+    drawn = law.draw(torch.zeros(4000, dtype=torch.int64), Streams(0).generator())
+    assert drawn.dtype == bins.low.dtype and bins.low[0] <= drawn.min() <= drawn.max()
+    assert drawn.max() <= bins.high[-1]
+    for share, (low, high) in zip(shares.tolist(), ends, strict=True):
+        counted = float(((low <= drawn) & (drawn <= high)).double().mean())
+        assert counted == pytest.approx(share, abs=0.04)
+
+
+def norm_mass(low: float, high: float, loc: float, scale: float) -> float:
+    """Of a normal distribution that is cut off at -4 and 4, where what is beyond lies."""
+    below = [0.5 + 0.5 * math.erf((end - loc) / scale / 2**0.5) for end in (low, high)]
+    return (1.0 if high == 4.0 else below[1]) - (0.0 if low == -4.0 else below[0])
+
+
 def test_shares_of_several_parameters_multiply() -> None:
     shares = SPACE.shares(ParameterSpace(TARGET))
     drawn = ParameterSpace(TARGET).sample(200, Streams(0).generator())
@@ -107,6 +152,15 @@ def test_a_single_bin_lies_in_the_middle() -> None:
         ({"target": 1.5, "values": [1, 2]}, r"target=\[1.5\] must be whole"),
         ({"target": [2.0, 1.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
         ({"target": [0.0, 1.0, 2.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
+        ({"target": {"distribution": "gauss"}, **RANGE}, "gauss: must be a continuous distrib"),
+        ({"target": {"distribution": "norm", "scale": -1}, **RANGE}, r"norm\(scale=-1\) is no"),
+        ({"target": {"distribution": "norm", "skale": 1}, **RANGE}, "target: norm of scipy.stats"),
+        ({"target": {"distribution": "norm"}, "values": [1.0]}, "distribution: of a range only"),
+        ({"target": {"values": [1.0]}, **RANGE}, "target.weights: missing"),
+        ({"target": {"values": [1.0], "weights": [1, 2]}, **RANGE}, "must be one for each of 1"),
+        ({"target": {"values": [1.0], "weights": [0]}, **RANGE}, "target.weights.0=0: input shou"),
+        ({"target": {"vals": [1.0], "weights": [1]}, **RANGE}, "target.vals: unknown; there are"),
+        ({"target": {"values": [1.5], "weights": [1]}, "values": [1, 2]}, "must be whole"),
     ],
 )
 def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
@@ -141,3 +195,11 @@ def test_edits_are_gaussian_steps_along_one_parameter() -> None:
     assert torch.equal(edited["seed"], levels["seed"][0])
     far = space.edit(levels, 100, [Streams(1).generator()])[0]
     assert 0.0 <= far["mass"].min() < 0.5 < 9.5 < far["mass"].max() <= 10.0
+
+
+def test_the_only_bin_of_a_range_is_located_between_its_ends() -> None:
+    """What models of outcomes see of a range that has no bins."""
+    space = ParameterSpace({"mass": ParameterSettings(low=2.0, high=6.0, target=2.0).space_bins()})
+    levels = space.at(torch.tensor([[[-1.0], [0.5], [1.0]]]), [Streams(0).generator()])
+    assert space.locate(levels).flatten().tolist() == [-1.0, 0.5, 1.0]
+    assert space.coordinates.tolist() == [[0.0]]

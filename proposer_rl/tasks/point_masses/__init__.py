@@ -1,0 +1,1 @@
+"""The point mass before a gate of SPDL and CurrOT."""

@@ -1,0 +1,86 @@
+"""The point mass as a task: its levels, pictures, runs, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from proposer_rl.runs.folder import read_csv
+from proposer_rl.streams import Streams
+from tests.same_run import assert_same_run
+from tests.tiny import point_masses
+
+TINY = [
+    "task=point_mass", "compute.progress=false", "task.max_steps=6", "task.levels=4",
+    "solver.batch_size=4", "solver.ppo.horizon=6", "solver.ppo.epochs=1",
+    "solver.ppo.minibatches=2", "solver.ppo.anneal_updates=null", "schedule.updates=4",
+    "schedule.evaluate_every=2",
+    "proposer.rollouts=2", "proposer.meta_episode_length=2", "proposer.validation_levels=4",
+    "proposer.probe_levels=2", "pool.capacity=8", "pool.candidates=8", "pool.keep=4",
+]  # fmt: skip
+
+
+def test_the_target_is_where_it_is_said_to_be() -> None:
+    task: Any = point_masses()
+    levels = task.target.sample(500, Streams(0).generator())
+    assert float(levels["position"].mean()) == pytest.approx(2.5, abs=1e-3)
+    assert float(levels["position"].std()) == pytest.approx(0.004, abs=1e-3)
+    assert set(levels["width"].tolist()) == {0.5} and set(levels["friction"].tolist()) == {0.0}
+    (bin_,) = (task.target_shares > 0.5).nonzero().flatten().tolist()
+    place = [part.item() for part in torch.unravel_index(torch.tensor(bin_), (8, 5, 2))]
+    assert place == [6, 0, 0]
+
+
+def test_pictures_show_the_wall_and_the_way() -> None:
+    task: Any = point_masses()
+    learner = task.learner([Streams(0)])
+    levels = task.space.sample(4, Streams(0).generator()).unsqueeze(0)
+    learner.env.set_levels(levels)
+    rollout = learner.update([Streams(0).generator()]).rollout
+    still, moved = task.pictures(levels[0], None), task.pictures(levels[0], rollout[0])
+    for level, picture, way in zip(levels[0], still, moved, strict=True):
+        ends = [level["position"] - level["width"] / 2, level["position"] + level["width"] / 2]
+        dark = picture[60, :, 0] < 100
+        for column in range(120):
+            x = (column + 0.5) / 15 - 4
+            if min(abs(x - float(end)) for end in ends) > 0.2:
+                assert dark[column] == (not ends[0] < x < ends[1])
+        assert not np.array_equal(picture, way)
+
+
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize(
+    "method",
+    [["+method=accel"], ["+method=alp_gmm", "curriculum.rounded=false", "curriculum.warmup=4",
+     "curriculum.refit=4", "curriculum.components=2"], ["+method=model_transport"]],
+)  # fmt: skip
+def test_runs_resume_with_the_same_bytes(method: list[str], train: Any) -> None:
+    whole, parts = Path("whole"), Path("parts")
+    assert train(*TINY, *method, f"hydra.run.dir={whole}") == 0
+    for updates in (2, 4):
+        words = [*TINY, *method, f"schedule.updates={updates}", f"hydra.run.dir={parts}"]
+        assert train(*words, "schedule.checkpoint_every=2") == 0
+    assert read_csv(whole / "metrics.csv")[-1]["updates"] == 4
+    assert_same_run(whole, parts)
+
+
+@pytest.mark.usefixtures("own_folder")
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("task.parameters.width.low=-1.0", "parameters.width: -1 to"),
+        ("task.parameters.friction.target=-0.1", "parameters.friction: -0.1 goes below zero"),
+        ("+task.parameters.mass={values: [1], target: 1}", "task.parameters.mass: unknown"),
+        ("task.parameters.position.target.distribution=gauss", "must be a continuous distribution"),
+    ],
+)
+def test_what_no_mass_can_be_before_is_refused(
+    word: str, said: str, train: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(*TINY, "+method=target", word, "hydra.run.dir=run") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert said in line and not Path("run").exists()
