@@ -1,6 +1,7 @@
 """A curriculum of prompts in TRL's GRPOTrainer: sums of digits, half of them out of reach.
 
-One-token answers. With the extra prompts: ``python examples/taught_prompts.py [steps] [seed]``
+``python examples/taught_prompts.py 150 SEED``, with the extra prompts. Seeds 0 to 2: replay draws
+76 to 79 % within reach, uniform sampling 55 to 57 %. No gain yet: 7 to 10 sums solved, against 10.
 """
 
 from __future__ import annotations

@@ -14,9 +14,6 @@ def install_command(extra: str) -> str:
 
     Of a checkout, with the versions that its commands pin. Elsewhere the package is installed
     already, so that no index is asked for it.
-
-    Args:
-        extra: one of ``project.optional-dependencies`` in ``pyproject.toml``.
     """
     what = [f"proposer_rl[{extra}]"]
     constraints = ROOT / "constraints.txt"

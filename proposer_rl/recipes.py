@@ -84,9 +84,9 @@ def own_recipe(
     return Recipe(group, make.__name__, settings, name)
 
 
-def available(group: str) -> list[str]:
-    """The names of the files of a group."""
-    return sorted(file.stem for file in (CONFIG_FOLDER / group).glob("*.yaml"))
+def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
+    """The names of the files of a group such as ``method``, in a folder of configurations."""
+    return sorted(file.stem for file in (folder / group).glob("*.yaml"))
 
 
 def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:

@@ -232,7 +232,6 @@ def cancel(folder: Path, whole: Path, check: Checks) -> None:
     until(lambda: over(job), "the job's end")
     log = (folder / f"{job}.log").read_text()
     check("scancel: saved first, without a traceback", "is saved" in log and LOST not in log)
-    print(log)
 
 
 PARTS = {part.__name__: part for part in (sweep, timeout, preemption, cancel)}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import os
 
 # Before anything imports pyplot: tests draw into files, also where there is no display.
@@ -17,9 +18,12 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
+from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.defaults_list import DefaultsList, create_defaults_list
 from hydra._internal.hydra import Hydra
 from hydra.core.default_element import ResultDefault
+from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
@@ -30,7 +34,7 @@ from tests.commands import call
 from tests.processes import Processes
 
 # A busy machine makes an example slow, not wrong.
-hypothesis.settings.register_profile("proposer_rl", deadline=None, max_examples=40)
+hypothesis.settings.register_profile("proposer_rl", deadline=None, max_examples=25)
 hypothesis.settings.load_profile("proposer_rl")
 
 
@@ -60,14 +64,45 @@ def load_once(file: Any) -> Any:
 
 OmegaConf.load = staticmethod(load_once)  # type: ignore[method-assign,assignment]
 
+
+def only_ours(repo: Any) -> bool:
+    """Whether all files are the package's, and none of those that tests write."""
+    sources = [source.path for source in repo.get_sources() if source.path]
+    return all(path in (str(CONFIG_FOLDER), "hydra.conf") for path in sources)
+
+
+listed: dict[str, bytes] = {}
+
+
+def list_once(
+    repo: Any, config_name: str, overrides_list: list[Override], *how: bool, **named: bool
+) -> DefaultsList:
+    """Which files those are depends on the groups that are chosen, and on no other values."""
+    given: dict[bool, list[Override]] = {True: [], False: []}
+    for override in overrides_list:
+        if not override.is_sweep_override():
+            is_value = isinstance(override.value(), dict)
+            given[not is_value and repo.group_exists(override.key_or_group)].append(override)
+    make = partial(create_defaults_list, repo, config_name)
+    if not only_ours(repo):
+        return make(overrides_list, *how, **named)
+    key = repr((config_name, [override.input_line for override in given[True]], how, named))
+    if key not in listed:
+        listed[key] = pickle.dumps(make(given[True], *how, **named))
+    found: DefaultsList = pickle.loads(listed[key])
+    found.config_overrides = given[False]
+    return found
+
+
+config_loader_impl.create_defaults_list = list_once
+
 compose = ConfigLoaderImpl._compose_config_from_defaults_list
 composed: dict[str, bytes] = {}
 
 
 def compose_once(self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: Any) -> DictConfig:
-    """The same files, one merged into the other, are the same; but those that tests write."""
-    sources = [source.path for source in repo.get_sources() if source.path]
-    if not all(path in (str(CONFIG_FOLDER), "hydra.conf") for path in sources):
+    """The same files, one merged into the other, are the same."""
+    if not only_ours(repo):
         return compose(self, defaults, repo)
     key = repr([(default, default.override_key) for default in defaults])
     if key not in composed:
@@ -92,10 +127,17 @@ Hydra.get_mode = mode_at_once  # type: ignore[method-assign]
 torch.set_num_threads(1)
 
 
+def pytest_collection_finish() -> None:
+    """What was imported stays: no need to look for garbage in it again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     """TorchRL's distributions draw from the global generator."""
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)  # torch.manual_seed takes a millisecond for all devices
 
 
 @pytest.fixture(autouse=True)

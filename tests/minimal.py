@@ -1,40 +1,51 @@
 """An environment that holds what pip installs of a wheel, and nothing of the tests' tools.
 
 It is made offline and in a second: the wheel is unpacked, and of what it requires, as installed
-here, the files are linked. Run as a program in such an environment, this file calls commands.
+here, the files are linked; what an extra requires besides, in a folder of its own. Run as a program
+in such an environment, this file imports what commands need, which takes seconds, and then calls
+commands in forks of itself: each of its lines names an extra, the extra's folder and where to work.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import sys
+import traceback
 import venv
 import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 
-def make_environment(folder: Path, wheel: Path, extra: str) -> Path:
+def make_environment(folder: Path, wheel: Path, extras: list[str]) -> dict[str, Path]:
     """Make a virtual environment of a wheel and what it requires.
 
     Args:
         folder: where it goes.
         wheel: of this project.
-        extra: one of its extras; empty for none.
+        extras: of this project; the empty one is none.
 
     Returns:
-        Its interpreter.
+        Of each extra the folder with all that is installed without it, or with what it adds.
     """
     venv.create(folder, with_pip=False, symlinks=True)
     (site,) = folder.glob("lib/python*/site-packages")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
     (project,) = metadata.distributions(path=[str(site)])
-    required = {name: metadata.distribution(name) for name in closure(project, extra)}
-    _link(required, site)
-    return folder / "bin" / "python"
+    always = closure(project, "")
+    sites = {}
+    for extra in extras:
+        sites[extra] = folder / extra if extra else site
+        sites[extra].mkdir(exist_ok=True)
+        names = closure(project, extra) - always if extra else always
+        _link({name: metadata.distribution(name) for name in names}, sites[extra])
+    return sites
 
 
 def closure(project: metadata.Distribution, extra: str) -> set[str]:
@@ -61,8 +72,9 @@ def closure(project: metadata.Distribution, extra: str) -> set[str]:
     return {name for name, _ in found}
 
 
-def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
-    """Link whole folders that are only theirs, and file by file those that others write into."""
+@cache
+def _installed() -> tuple[dict[str, list[str]], dict[str, set[str]]]:
+    """The files of each distribution, and which of them have files below each first part."""
     from packaging.utils import canonicalize_name
 
     owners: dict[str, set[str]] = defaultdict(set)
@@ -74,6 +86,12 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
         files[name] = [line.split(",")[0].strip('"') for line in record]
         for top in {file.split("/")[0] for file in files[name]}:
             owners[top].add(name)
+    return files, owners
+
+
+def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
+    """Link whole folders that are only theirs, and file by file those that others write into."""
+    files, owners = _installed()
     for name, distribution in required.items():
         assert files[name], f"{name} is installed without a list of its files"
         places = {
@@ -91,8 +109,9 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 RUN = "runs"
 SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
 GYMNASIUM = [
-    *SMALL, "task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=64",
-    "solver.ppo.minibatches=2", "proposer.validation_levels=2", "proposer.probe_levels=2",
+    *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
+    "solver.ppo.horizon=16", "solver.ppo.minibatches=2",
+    "proposer.validation_levels=2", "proposer.probe_levels=2",
 ]  # fmt: skip
 TASKS = {
     "box2d": ["lunar_lander", "bipedal_stumps"],
@@ -101,7 +120,8 @@ TASKS = {
 }
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
-FEW = [*SMOKE, "schedule.evaluate_every=6", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
+FEW = [*SMOKE, "schedule.evaluate_every=4", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
+FEW += ["schedule.updates=4", "proposer.meta_episode_length=2"]
 
 
 def _trained(name: str, *arguments: str) -> list[str]:
@@ -121,14 +141,14 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
             if method not in others:
                 yield _trained(method, f"+method={method}", *FEW)
         # A run goes on; a Proposer that has learnt is taken over.
-        yield _trained("perf_gain", "+method=perf_gain", *FEW, "schedule.updates=9")
+        yield _trained("perf_gain", "+method=perf_gain", *FEW, "schedule.updates=6")
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
         yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, "task.levels=2")
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
-        yield from (["eval", f"{RUN}/{name}"] for name in ("target", "views"))
+        yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
     elif extra == "alp-gmm":
         # More than 250 episodes, after which a mixture is fitted for the first time.
         yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
@@ -153,24 +173,24 @@ def _call(command: Callable[..., Any], name: str, arguments: list[str]) -> None:
         assert not end.code, f"{sys.argv} ended with {end.code}"
 
 
-def _play(arguments: list[str]) -> None:
+def _play(command: Callable[..., Any], arguments: list[str]) -> None:
     """Open the page that the command serves, and end it."""
     import signal
-    import subprocess
     import urllib.request
 
-    command = [sys.executable, "-m", "proposer_rl.cli.play", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
-        assert served.stdout is not None
-        address = served.stdout.readline().split()[1]
-        with urllib.request.urlopen(address) as page:
-            assert b"<html" in page.read()
-        served.send_signal(signal.SIGINT)
-        served.communicate()  # it says that it has ended
-    assert served.returncode == 0
+    said, says = os.pipe()
+    server = os.fork()
+    if server == 0:
+        os.dup2(says, 1)
+        _end_with(_call, command, "play", arguments)
+    address = os.fdopen(said).readline().split()[1]
+    with urllib.request.urlopen(address) as page:
+        assert b"<html" in page.read()
+    os.kill(server, signal.SIGINT)
+    assert os.waitpid(server, 0)[1] == 0
 
 
-def _main(extra: str) -> None:
+def _run(extra: str) -> None:
     from proposer_rl.cli import run
     from proposer_rl.cli.config import methods
 
@@ -178,12 +198,47 @@ def _main(extra: str) -> None:
     for name, *arguments in commands(extra, methods()):
         command = scripts[f"proposer-{name}"].load()
         if name == "play":
-            _play(arguments)
+            _play(command, arguments)
         else:
             _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
         run.draw_run = lambda folder, title: folder / "run.png"  # one picture is enough
+    if extra == "":
+        import gymnasium
+
+        gymnasium.make("proposer_rl.tasks.mazes:proposer_rl/Maze-v0")
+
+
+def _end_with(function: Callable[..., None], *given: Any) -> None:
+    """End this process with whether that has gone well."""
+    code = 1
+    try:
+        function(*given)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _main() -> None:
+    import proposer_rl.cli.run  # noqa: F401
+
+    assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
+    for line in sys.stdin:
+        extra, site, folder = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            os.chdir(folder)
+            output = os.open("output", os.O_CREAT | os.O_WRONLY)
+            os.dup2(output, 1)
+            os.dup2(output, 2)
+            if extra:
+                sys.path.append(site)
+            _end_with(_run, extra)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":
-    _main(*sys.argv[1:])
+    _main()

@@ -7,6 +7,7 @@ It knows no autocast, pinned memory, streams or graphs.
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 import traceback
@@ -163,6 +164,7 @@ def main() -> None:
     """Read runs, a line each, and write for each how it went, a line each, in JSON."""
     register()
     torch.set_num_threads(1)
+    gc.freeze()
     for line in sys.stdin:
         folder, *overrides = json.loads(line)
         said = ""

@@ -8,6 +8,7 @@ since threads do not survive a fork.
 from __future__ import annotations
 
 import ctypes
+import gc
 import json
 import os
 import resource
@@ -126,6 +127,7 @@ def serve() -> None:
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
     for module in ("proposer_rl.cli.run", "proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
+    gc.freeze()  # a child that looks for garbage would copy all that memory
 
     for line in sys.stdin:
         values = json.loads(line)

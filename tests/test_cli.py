@@ -9,8 +9,6 @@ import re
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -260,11 +258,3 @@ def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, cap
     assert train("-m", "+method=target", "solver.ppo.epochs=0,1", *FEW) == 2
     assert "solver.ppo.epochs=0: input should be" in capsys.readouterr().err
     assert len(list(Path().glob("multirun/*/*/summary.json"))) == 1
-
-
-def test_the_module_runs_as_a_program() -> None:
-    command = [sys.executable, "-m", "proposer_rl.cli.start", "+method=target", *FEW]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "outputs/target/" in result.stdout
-    shutil.rmtree("outputs")

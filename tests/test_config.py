@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from proposer_rl.cli.build import build, parts
+from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import (
     CONFIG_FOLDER,
     ConfigError,
@@ -502,6 +502,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder.path
 
 
+@pytest.fixture(scope="module")
+def made() -> Made:
+    """What a run of these settings is made of; none is trained."""
+    return parts(composed("+method=target", *SMOKE), StopSignals())
+
+
 class At(StopSignals):
     """A signal that has come before the run has begun."""
 
@@ -599,11 +605,13 @@ def test_a_state_that_lacks_a_part_is_refused(finished: Path, train, capsys) -> 
     ],
     ids=str,
 )
-def test_a_state_of_wrong_types_is_refused(wrong: dict, finished: Path, train, capsys) -> None:
-    folder = copy_of(finished)
+def test_a_state_of_wrong_types_is_refused(wrong: dict, finished: Path, made: Made) -> None:
+    folder = RunFolder(copy_of(finished))
     number, state = load_latest(finished / "checkpoints")
-    save_checkpoint(folder / "checkpoints", number, {**state, **wrong})
-    assert "does not fit this run: " in refused(train, capsys)
+    save_checkpoint(folder.path / "checkpoints", number, {**state, **wrong})
+    with pytest.raises(Exception, match="does not fit this run: ") as error:
+        build(composed("+method=target", *SMOKE), made, folder, StopSignals()).run()
+    assert exit_code(error.value) == BAD_INPUT
 
 
 def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) -> None:

@@ -24,13 +24,13 @@ from tests.tasks.gymnasium.toys import TINY
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
 SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5", "task.evaluation.levels=2"]
 QUIET = ["+scale=smoke", *FEW, *SHORT, "task.network.channels=[8,8]"]
+SEEDS = ["+method=target", "seeds=[0,1]", *QUIET]
 FITTED = ["curriculum.warmup=4", "curriculum.refit=4", "curriculum.components=2"]
 CALLED = {
     **{method: [f"+method={method}", *QUIET] for method in ("plr", "perf_gain")},
     "alp_gmm": ["+method=alp_gmm", *QUIET, *FITTED],
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET],
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
-    "two_seeds": ["+method=target", "seeds=[0,1]", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
 }
@@ -78,8 +78,8 @@ def test_what_is_computed_there_is_what_is_computed_here(
     run_there: Run, train: Callable[..., int], tmp_path: Path
 ) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
-    assert train(*CALLED["two_seeds"], f"hydra.run.dir={here}") == 0
-    assert run_there(there, *CALLED["two_seeds"]) == ""
+    assert train(*SEEDS, f"hydra.run.dir={here}") == 0
+    assert run_there(there, *SEEDS) == ""
     for name in ("metrics.csv", "training.csv"):
         for one, other in zip(read_csv(here / name), read_csv(there / name), strict=True):
             assert {**one, "seconds": 0} == pytest.approx({**other, "seconds": 0}, abs=1e-5)
@@ -98,7 +98,5 @@ def careless(parts: Components, **_: Any) -> Curriculum:
 
 
 def test_what_mixes_devices_is_refused(run_there: Run, tmp_path: Path) -> None:
-    said = run_there(
-        tmp_path, *CALLED["two_seeds"], "curriculum._target_=tests.test_devices.careless"
-    )
+    said = run_there(tmp_path, *SEEDS, "curriculum._target_=tests.test_devices.careless")
     assert "on the CPU, others on the device" in said and "in observe" in said

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.loggers import log_of, logger, require_logger
-from proposer_rl.settings import LoggerSettings
+from proposer_rl.cli.settings import LoggerSettings
 from tests.report.folders import LEVEL, PIXELS, cycle, write_run
 
 SMOKE = ["+method=target", "+scale=smoke", "compute.progress=false", "hydra.run.dir=run"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -18,9 +20,8 @@ import pytest
 import yaml
 
 from proposer_rl.cli.config import methods
-from proposer_rl.cli.places import CONFIG_FOLDER, names
+from proposer_rl.recipes import available
 from tests import minimal
-from tests.processes import python
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -63,24 +64,43 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
 NAMED = ["", "alp-gmm", "box2d", "minigrid", "mujoco", "play", "tensorboard"]
 
 
+@pytest.fixture(scope="module")
+def call_there(
+    built: Built, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[[str, Path], int]]:
+    """Calls the commands with an extra, in a folder; returns the exit code."""
+    environment = tmp_path_factory.mktemp("environment")
+    sites = minimal.make_environment(environment, built.wheel, NAMED)
+    kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
+    with subprocess.Popen(
+        [environment / "bin" / "python", "-I", minimal.__file__],
+        cwd=environment,
+        env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        asked, answers = process.stdin, process.stdout
+
+        def there(extra: str, folder: Path) -> int:
+            asked.write(json.dumps([extra, str(sites[extra]), str(folder)]) + "\n")
+            asked.flush()
+            return int(answers.readline())
+
+        yield there
+        asked.close()
+
+
 @pytest.mark.parametrize("extra", NAMED, ids=[extra or "none" for extra in NAMED])
 def test_everything_runs_where_only_what_it_requires_is_installed(
-    built: Built, extra: str, tmp_path: Path
+    extra: str, call_there: Callable[[str, Path], int], tmp_path: Path
 ) -> None:
     """The tests' tools are not there: what imports one of them, or expects it, fails here alone."""
-    python = minimal.make_environment(tmp_path / "environment", built.wheel, extra)
-    (tmp_path / "work").mkdir()
-    kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
-    process = subprocess.run(
-        [str(python), "-I", minimal.__file__, extra],
-        cwd=tmp_path / "work",
-        env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert process.returncode == 0, process.stdout[-1000:] + process.stderr[-4000:]
-    done = [line.split()[1:] for line in process.stdout.splitlines() if line.startswith("DID ")]
+    code = call_there(extra, tmp_path)
+    said = (tmp_path / "output").read_text(encoding="utf-8")
+    assert code == 0, said[-5000:]
+    done = [line.split()[1:] for line in said.splitlines() if line.startswith("DID ")]
     assert done == list(minimal.commands(extra, methods()))
 
 
@@ -89,7 +109,7 @@ def test_every_method_task_and_command_is_called() -> None:
     words = {word for command in called for word in command}
     assert {f"+method={method}" for method in methods()} <= words
     # Of view mazes the smallest; task=gymnasium is what the others are made of; task=maze is given.
-    tasks = set(names(CONFIG_FOLDER, "task"))
+    tasks = set(available("task"))
     tasks -= {"maze", "gymnasium", "view_maze", "view_maze_quick"}
     assert {f"task={task}" for task in tasks} <= words
     assert {f"proposer-{name}" for name, *_ in called} == PROJECT["scripts"].keys()
@@ -141,10 +161,3 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert citation["title"] == PROJECT["name"]
     headings = re.findall(r"^## \[([^]]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == version
-
-
-def test_the_gymnasium_environment_comes_along(built: Built, tmp_path: Path) -> None:
-    code = "import gymnasium; print(gymnasium.make('proposer_rl.tasks.mazes:proposer_rl/Maze-v0'))"
-    process = python(code, path=built.site, folder=tmp_path)
-    assert process.returncode == 0, process.stderr
-    assert "proposer_rl/Maze-v0" in process.stdout

@@ -11,10 +11,10 @@ import pytest
 
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import CONFIG_FOLDER
+from proposer_rl.cli.settings import ComputeSettings
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.settings import (
-    ComputeSettings,
     MixtureSettings,
     ProblemSettings,
     ProposerSettings,

@@ -19,16 +19,19 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
-from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER, names
+from proposer_rl.cli.places import CHANGING, CONFIG_FOLDER
+from proposer_rl.cli.settings import (
+    ComputeSettings,
+    HandDesignedSettings,
+    LoggerSettings,
+    PoolSettings,
+)
+from proposer_rl.recipes import available
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import (
     ArgumentError,
-    ComputeSettings,
     FilterSettings,
-    HandDesignedSettings,
-    LoggerSettings,
     ModelSettings,
-    PoolSettings,
     ProposerSettings,
     ScheduleSettings,
     SolverSettings,
@@ -232,7 +235,7 @@ def check_groups(given: Sequence[str]) -> None:
     """
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
-    if task in names(CONFIG_FOLDER, "task") and scale in names(CONFIG_FOLDER, "scale"):
+    if task in available("task") and scale in available("scale"):
         defaults: Any = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
         scaled = next(group["task"] for group in defaults if "task" in group)
         if task != scaled:
@@ -271,7 +274,7 @@ def check_packages(config: DictConfig) -> None:
 
 def methods() -> list[str]:
     """Names of the methods in the configuration folder."""
-    return names(CONFIG_FOLDER, "method")
+    return available("method")
 
 
 def _why_not_found(error: BaseException) -> str:

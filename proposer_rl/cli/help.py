@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from proposer_rl.cli.places import CONFIG_FOLDER, GROUPS, names
+from proposer_rl.cli.places import CONFIG_FOLDER, GROUPS
+from proposer_rl.recipes import available
 
 USAGE = """\
 Train a Solver on a curriculum.
@@ -50,7 +51,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for folder in folders:
-        for name in names(folder, group):
+        for name in available(group, folder):
             found.setdefault(name, _first_comment(folder / group / f"{name}.yaml"))
     return dict(sorted(found.items()))
 
@@ -59,7 +60,7 @@ def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
     """What methods need, by name, where their files have a line ``# Needs:``."""
     found: dict[str, list[str]] = {}
     for folder in folders:
-        for name in names(folder, "method"):
+        for name in available("method", folder):
             lines = _comments(folder / "method" / f"{name}.yaml")
             said = (line.removeprefix(NEEDS) for line in lines if line.startswith(NEEDS))
             for text in map(str.strip, said):

@@ -11,8 +11,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from proposer_rl.cli.errors import one_line
 from proposer_rl.cli.help import own_folders
-from proposer_rl.cli.places import ADDED, CONFIG_FOLDER, names
+from proposer_rl.cli.places import ADDED
 from proposer_rl.extras import install_command
+from proposer_rl.recipes import available
 
 LAUNCHERS = [f"hydra/launcher/{name}" for name in ("joblib", "submitit_local", "submitit_slurm")]
 _NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
@@ -29,7 +30,7 @@ def explained(error: Exception) -> str:
         return _no_such_key(cause)
     not_chosen = _NOT_CHOSEN.match(str(error))
     if not_chosen and not_chosen[1] in ADDED:
-        group, known = not_chosen[1], ", ".join(names(CONFIG_FOLDER, not_chosen[1]))
+        group, known = not_chosen[1], ", ".join(available(not_chosen[1]))
         return f"{group}: choose one with +{group}=NAME, NAME one of: {known}"
     if isinstance(error, OverrideParseException):
         said = one_line(error).partition(" See https:")[0]

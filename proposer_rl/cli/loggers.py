@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from proposer_rl.cli.config import ConfigError
 from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.settings import LoggerSettings
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.report.records import numbers, picture
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.settings import LoggerSettings
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 ID = "wandb_id.txt"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from proposer_rl.recipes import CONFIG_FOLDER as CONFIG_FOLDER
 from proposer_rl.recipes import PACKAGE as PACKAGE
 
@@ -23,8 +21,3 @@ GROUPS = {
 ADDED = [group.strip("+=") for group in GROUPS if group.startswith("+")]
 # And these change a method or a scale, which therefore come before them.
 CHANGING = [f"+{group}" for group in ADDED if group not in ("method", "scale", "sweep")]
-
-
-def names(folder: Path, group: str) -> list[str]:
-    """What a configuration folder has to choose from in a group such as ``method``."""
-    return sorted(file.stem for file in (folder / group).glob("*.yaml"))

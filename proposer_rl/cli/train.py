@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 import sys
 from argparse import ArgumentParser
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
@@ -49,9 +47,10 @@ def main() -> None:
 def _compose_and_run() -> None:
     _refuse_pickles(sys.argv)
     BEGUN.clear()
+    if sys.version_info >= (3, 14):  # it refuses a help text of Hydra's (to 1.3.8), no string
+        ArgumentParser._check_help = lambda self, action: None
     try:
-        with _unchecked_help():
-            _main()
+        _main()
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         remove_traces()
         raise ConfigError(explained(error)) from error
@@ -71,20 +70,6 @@ def _compose_and_run() -> None:
         if isinstance(error.__cause__, OSError):  # of the file that logging cannot open
             refuse(error.__cause__)
         raise ConfigError(one_line(error)) from error  # of an override such as +method=3
-
-
-@contextmanager
-def _unchecked_help() -> Iterator[None]:
-    """Hydra gives one help text that is no string (up to 1.3.8), which Python 3.14 refuses."""
-    if sys.version_info < (3, 14):
-        yield
-        return
-    checked = ArgumentParser._check_help
-    ArgumentParser._check_help = lambda self, action: None
-    try:
-        yield
-    finally:
-        ArgumentParser._check_help = checked
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")

@@ -22,6 +22,7 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Literal
 
 import torch
@@ -115,7 +116,7 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
     exists = rank <= count
     counted = exists if rule.best is None else exists & (rank <= rule.best)
     if rule.prioritization == "rank":
-        weight = rank.double() ** (-1 / rule.temperature)
+        weight = _by_rank(len(rank), rule.temperature)
     elif rule.prioritization == "proportional":
         # Divided by the largest, so that no power of it is infinite.
         largest = falling[..., :1].clamp_min(torch.finfo(falling.dtype).tiny)
@@ -127,6 +128,12 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
     lowest = falling.gather(-1, (count - 1).clamp_min(0))
     alike = (falling[..., :1] == lowest) | (weight.sum(-1, keepdim=True) == 0)
     return _shares(weight.where(~alike, exists.double()))
+
+
+@lru_cache(8)
+def _by_rank(count: int, temperature: float) -> Tensor:
+    """r^(-1/T) of ranks r = 1 to so many, float64; not to be changed."""
+    return torch.arange(1, count + 1).double() ** (-1 / temperature)
 
 
 def staleness_weights(age: Tensor, filled: Tensor) -> Tensor:

@@ -37,9 +37,6 @@ Value = Callable[[ActorCritic, int, Tensor], Tensor]
 def squared_gradients(task: ExactTask) -> Callable[[PPO, Levels], Tensor]:
     """Makes the function that scores levels by the gradient of their exact return.
 
-    Args:
-        task: of the Solvers and levels.
-
     Returns:
         A function of a learner of K Solvers, which it leaves as it is, and levels [K, n], each to
         be scored for its Solver: float [K, n], without gradients.
@@ -64,9 +61,6 @@ def squared_policy_gradients(
     The estimate of a level's gradient has the length of its noise, too: short rollouts score higher
     than the exact gradient by its variance.
 
-    Args:
-        task: of the Solvers.
-
     Returns:
         A function of a learner of K Solvers, a rollout [K, n, T] of theirs and its advantages,
         float [K, n, T]: float [K, n], the squared length of the gradient of the mean over the steps
@@ -90,9 +84,6 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
     The population has :data:`AT_ONCE` Solvers. All of them become copies of one whose levels are to
     be scored, and each gets one level of its own. So the sum of their values, differentiated once,
     gives each the gradient of its level.
-
-    Args:
-        task: that makes Solvers.
 
     Returns:
         A function of a learner of K Solvers, the value of a level, K, and the number n of levels

@@ -46,10 +46,7 @@ class SolverView:
     def performance(self, agent: ActorCritic, *place: int) -> TensorDictBase:
         """What K Solvers reach on the validation levels, a tensordict [K, E].
 
-        Args:
-            agent: K Solvers.
-            place: what distinguishes this evaluation from others of the cycle, for a task that
-                plays episodes.
+        The place distinguishes evaluations of a cycle, for a task that plays episodes.
         """
         generator = self.streams.generator("evaluation", *place)
         return self.task.performance(agent, self.validation, generator)

@@ -15,22 +15,16 @@ from proposer_rl.models.population import Population
 AT_ONCE = 2**17  # cells of grids that go through a network together
 
 
-def map_actor_critic(
-    network: nn.Module,
-    *,
-    per_step: bool = False,
-    planes_key: str = "planes",
-    agent_key: str = "agent",
-) -> ActorCritic:
+def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCritic:
     """Actor-critic of a network that maps planes [*B, C, H, W] to action and value maps.
+
+    It reads ``planes``, and the agent's row and column in ``agent``, int64 [*B, 2].
 
     Args:
         network: returns logits [*B, A, H, W] and values [*B, 1, H, W]; a
             :class:`~proposer_rl.models.Population` of such networks takes B = [K, ...].
         per_step: True if the planes change from step to step (the agent is drawn on one of them);
             False if they belong to the level, which then costs one forward pass per rollout.
-        planes_key: entry of the planes.
-        agent_key: entry of the agent's row and column, int64 [*B, 2].
 
     Example:
         >>> from proposer_rl import UNet
@@ -39,9 +33,9 @@ def map_actor_critic(
         >>> agent(state)["logits"].shape
         torch.Size([5, 4])
     """
-    maps = TensorDictModule(network, [planes_key], ["policy_map", "value_map"])
+    maps = TensorDictModule(network, ["planes"], ["policy_map", "value_map"])
     head = TensorDictModule(
-        read_maps, ["policy_map", "value_map", agent_key], ["logits", "state_value"]
+        read_maps, ["policy_map", "value_map", "agent"], ["logits", "state_value"]
     )
     copies = network.copies if isinstance(network, Population) else None
     build = partial(ActorCritic, distribution_class=categorical, copies=copies)

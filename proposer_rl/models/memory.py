@@ -80,7 +80,6 @@ def memory_actor_critic(
     observed: Sequence[str],
     memory: int,
     *,
-    begins_key: str = "is_init",
     distribution_class: Callable[..., Distribution] = categorical,
 ) -> ActorCritic:
     """Actor-critic of K networks with memory.
@@ -88,16 +87,15 @@ def memory_actor_critic(
     As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` says that the
     last batch dimension is time: the memory then goes through it from what stands at the first
     step. Otherwise every element is a step of its own with the memory that stands there. Both write
-    the memory after each step below ``next``.
+    the memory after each step below ``next``. ``is_init``, bool [*B, 1], says where episodes begin.
 
     Args:
         population: of K networks such as :class:`MemoryNetwork`.
         observed: entries that the networks' encoder takes, in order.
         memory: width M of their memory.
-        begins_key: entry that says where an episode begins, bool [*B, 1].
         distribution_class: builds the action's distribution from ``logits=``.
     """
-    head = _MemoryHead(population, observed, begins_key)
+    head = _MemoryHead(population, observed)
     return ActorCritic(
         head,
         distribution_class=distribution_class,
@@ -109,10 +107,10 @@ def memory_actor_critic(
 class _MemoryHead(TensorDictModuleBase):
     """Lays tensordicts [K, *B] out as K batches of sequences."""
 
-    def __init__(self, population: Population, observed: Sequence[str], begins_key: str) -> None:
+    def __init__(self, population: Population, observed: Sequence[str]) -> None:
         super().__init__()
         self.population = population
-        self.in_keys = [begins_key, *MEMORY, *observed]
+        self.in_keys = ["is_init", *MEMORY, *observed]
         self.out_keys = ["logits", "state_value", *(("next", key) for key in MEMORY)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -4,9 +4,10 @@
 and REPEATS also the ``seconds`` of an episode in each repetition, by the calls that it makes. It
 imports nothing of ours.
 
-Of prioritized level replay the calls are those of its sampler, below the storage of rollouts: a
-draw from all tasks, each of which has a score, and a new score. ``sample`` itself needs an
-evaluator then.
+Syllabus 0.7 as shipped asks for matplotlib and SciPy without saying so. Of prioritized level replay
+the calls are those of its sampler, below the storage of rollouts: a draw from tasks all of which
+have a score, and a new score; its ``sample`` fails then without an evaluator. TeachMyAgent, the
+other one with such calls, is in no package index and needs Python 3.6 or 3.7: it is not timed.
 """
 
 from __future__ import annotations

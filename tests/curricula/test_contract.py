@@ -165,7 +165,7 @@ def test_it_asks_for_what_it_says_whatever_the_size_and_tells_what_came_back(mak
     if isinstance(curriculum, LearnedCurriculum):
         curriculum.improve(student, [Streams(0)])
     before = learner.snapshot()
-    counts = [P, 1, 3, 2 * P]
+    counts = [1, P + 2]
     for number, count in enumerate(counts):
         batch = curriculum.propose(student, count, [Streams(0, number)])
         assert batch.levels.batch_size == (1, count) and batch.count == count

@@ -30,10 +30,7 @@ class WorkerEnv(SolverTrainingEnv):
     def fork(self, solver: TensorDictBase, streams: Streams, count: Tensor | None = None) -> None:
         """See :meth:`SolverTrainingEnv.fork`.
 
-        Args:
-            solver: as there.
-            streams: as there.
-            count: int64 [], to be filled with the number of updates that the episode has had.
+        ``count``, int64 [], is filled with the number of updates that the episode has had.
         """
         self.diverged = None
         if count is not None:
@@ -92,13 +89,7 @@ class WorkerPolicy(RolloutPolicy):
         self.shape = shape
 
     def start(self, weights: TensorDictBase, streams: Streams, share: range) -> None:
-        """Expect a rollout.
-
-        Args:
-            weights: of the Proposer, by name.
-            streams: of the cycle.
-            share: the replicas whose episodes it acts in.
-        """
+        """Expect a rollout."""
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():
             parameter.data.copy_(weights[name])

@@ -12,8 +12,8 @@ from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv
 from tests.processes import Processes
 
-COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=3", "compute.progress=false"]
-MULTIPROCESS = ["compute.collector=multiprocess", "compute.workers=2"]
+COMMAND = ["+method=perf_gain", "+scale=smoke", "proposer.rollouts=2", "compute.progress=false"]
+MULTIPROCESS = ["compute.collector=multiprocess", "compute.workers=1"]
 
 
 def working_in(folder: Path) -> list[str]:
@@ -29,7 +29,7 @@ def working_in(folder: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_killed_with_its_workers_and_resumed_it_is_the_run_that_was_not(
+def test_killed_with_its_worker_and_resumed_it_is_the_run_that_was_not(
     processes: Processes, tmp_path: Path
 ) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
@@ -44,7 +44,7 @@ def test_killed_with_its_workers_and_resumed_it_is_the_run_that_was_not(
         *COMMAND, *MULTIPROCESS, run, signal_at={at: int(SIGKILL)}, folder=str(folder)
     )
     assert killed.code == -SIGKILL, killed.output
-    # Nobody can tell its workers: they see it for themselves, and end.
+    # Nobody can tell its worker: it sees it for itself, and ends.
     while working_in(folder):
         time.sleep(0.2)
     latest = load_latest(tmp_path / "run" / "checkpoints")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from signal import SIGKILL, SIGTERM, getsignal, signal
@@ -23,6 +25,16 @@ LENGTH = 3  # updates of an episode at smoke scale
 
 
 Came = tuple[list[Any], list[float]]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Processes are forks of one that has imported everything; ``test_command`` starts others."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_forkserver_preload(["proposer_rl.cli.build"])
+    multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +63,9 @@ def lethal(fuse: Path) -> Reward:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["multiprocess", "ray"])
 def test_workers_give_the_numbers_of_one_process_also_where_they_die(
-    engine: str, here: Came, tmp_path: Path
+    engine: str, here: Came, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else 15: where others compute, none starts
     fuse = tmp_path / "fuse"
     fuse.touch()
     told: list[int] = []

@@ -44,7 +44,7 @@ def kinds(before: Level, after: Level) -> list[str]:
     return found
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     size=SIZES,
     fraction=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
@@ -65,7 +65,7 @@ def test_edited_levels_are_valid_and_differ_by_no_more_than_the_edits(
         assert len(flipped) + start + goal <= count
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(size=SIZES, fraction=st.sampled_from([0.3, 1.0]), seed=st.integers(0, 10_000))
 def test_an_edit_changes_nothing_only_where_its_operator_is_impossible(
     size: tuple[int, int], fraction: float, seed: int

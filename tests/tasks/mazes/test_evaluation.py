@@ -203,7 +203,7 @@ def best_play(level: Level, max_steps: int, step_penalty: float) -> float:
     return best
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     size=st.tuples(st.integers(1, 4), st.integers(2, 4)),
     fraction=st.sampled_from([0.0, 0.3, 0.6]),

@@ -79,7 +79,7 @@ def level_sets(draw: st.DrawFn) -> dict[str, Level]:
     return found
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(level_sets())
 def test_round_trips(levels: dict[str, Level]) -> None:
     if levels:
