@@ -596,6 +596,18 @@ def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) 
             raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
 
 
+def refuse_single_bin(space: Space) -> None:
+    """Refuse a space in which there is nothing to choose.
+
+    Raises:
+        ArgumentError: if it has one bin.
+    """
+    if space.size < 2:
+        raise ArgumentError(
+            "space: has a single bin, so there is nothing to choose among; give its axes bins"
+        )
+
+
 def named(key: str, make: Any, *arguments: Any) -> Any:
     """Make something, naming the key in whatever is wrong with its value."""
     try:

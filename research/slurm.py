@@ -21,6 +21,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import read_csv
@@ -29,9 +30,9 @@ START = [sys.executable, "-m", "proposer_rl.cli.start"]
 SMALL = ["+scale=smoke", "compute.threads=1", "compute.progress=false"]
 WORKERS = ["compute.collector=multiprocess", "compute.workers=2"]
 SUBMIT = ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=2"]
-LONG = ["updates=500", "evaluate_every=20", "checkpoint_every=10"]
-LONG = [f"schedule.{word}" for word in LONG]
 LOST = "Traceback"
+SPARSE = ["schedule.evaluate_every=20", "schedule.checkpoint_every=10"]
+TRIED = 50  # updates, to see how long they take
 PATIENCE = 1800.0  # seconds
 
 CONF = """
@@ -62,7 +63,7 @@ SCRIPT = """#!/bin/bash
 #SBATCH --exclusive --requeue --open-mode=append
 srun {run}
 code=$?
-echo "ended with $code"
+if [ $code -gt 128 ]; then scontrol requeue $SLURM_JOB_ID; fi
 exit $code
 """
 
@@ -151,6 +152,11 @@ def run(folder: Path, *settings: str) -> list[str]:
     return [*START, *SMALL, f"hydra.run.dir={folder}", *settings]
 
 
+def finish(words: Sequence[str]) -> None:
+    """Carry a run out without Slurm."""
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+
+
 def submit(folder: Path, partition: str, words: Sequence[str]) -> str:
     """Send a job script of one's own; returns the job's number."""
     script = folder / f"{partition}.sh"
@@ -182,7 +188,7 @@ def same(one: Path, other: Path) -> bool:
     return repr(tables[0]) == repr(tables[1])
 
 
-def sweep(folder: Path, whole: Path, check: Checks) -> None:
+def sweep(folder: Path, long: Sequence[str], check: Checks) -> None:
     """Four runs as four jobs; the same command again has nothing to do."""
     words = ["-m", "+method=target,domain_randomization", "seed=0,1", *SMALL, *SUBMIT]
     words = [*START, *words, f"hydra.sweep.dir={folder}/sweep"]
@@ -192,9 +198,9 @@ def sweep(folder: Path, whole: Path, check: Checks) -> None:
     check("the same command again finds them finished", again.returncode == 0)
 
 
-def timeout(folder: Path, whole: Path, check: Checks) -> None:
+def timeout(folder: Path, long: Sequence[str], check: Checks) -> None:
     """A limit of two minutes is too short: interrupted, or queued again until the run is done."""
-    words = ["-m", "+method=target", *SMALL, *SUBMIT, *LONG, "hydra.launcher.signal_delay_s=30"]
+    words = ["-m", "+method=target", *SMALL, *SUBMIT, *long, "hydra.launcher.signal_delay_s=30"]
     words = [*START, *words, f"hydra.sweep.dir={folder}/timeout"]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     text = ended.stdout + ended.stderr
@@ -205,13 +211,13 @@ def timeout(folder: Path, whole: Path, check: Checks) -> None:
     again = [*words, "hydra.launcher.max_num_timeout=50"]
     ended = subprocess.run(again, capture_output=True, text=True, check=False)
     check("queued again it finishes", ended.returncode == 0)
-    check(f"... from update {before} on, to the same bytes", same(place, whole))
+    check(f"... from update {before} on, to the same bytes", same(place, folder / "whole"))
 
 
-def preemption(folder: Path, whole: Path, check: Checks) -> None:
+def preemption(folder: Path, long: Sequence[str], check: Checks) -> None:
     """A job of higher priority takes the node; the run goes on after it."""
     mine = folder / "preempted"
-    job = submit(folder, "low", run(mine, "+method=target", *LONG))
+    job = submit(folder, "low", run(mine, "+method=target", *long))
     until(lambda: updates(mine), "a checkpoint")
     other = submit(folder, "high", ["sleep", "5"])
     until(lambda: over(other), "the other job's end")
@@ -219,13 +225,13 @@ def preemption(folder: Path, whole: Path, check: Checks) -> None:
     until(lambda: over(job), "the run's end")
     log = (folder / f"{job}.log").read_text()
     check("preemption: saved first, without a traceback", "is saved" in log and LOST not in log)
-    check(f"... from update {before} on, to the same bytes", same(mine, whole))
+    check(f"... from update {before} on, to the same bytes", same(mine, folder / "whole"))
 
 
-def cancel(folder: Path, whole: Path, check: Checks) -> None:
+def cancel(folder: Path, long: Sequence[str], check: Checks) -> None:
     """``scancel`` signals every process of the step, workers too."""
     mine = folder / "cancelled"
-    words = run(mine, "+method=perf_gain", *LONG, *WORKERS)
+    words = run(mine, "+method=perf_gain", *long, *WORKERS)
     job = submit(folder, "low", words)
     until(lambda: updates(mine), "a checkpoint")
     said("scancel", job)
@@ -242,22 +248,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bin/research slurm", description=__doc__)
     parser.add_argument("folder", type=Path, help="a new one; Slurm's and the runs' files")
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="default: all")
+    parser.add_argument("--seconds", type=number(float, 1), default=150.0, help="of a run (150)")
     options = parser.parse_args()
-    command(lambda: _answer(options.folder.resolve(), options.parts or list(PARTS)))
+    parts = options.parts or list(PARTS)
+    command(lambda: _answer(options.folder.resolve(), parts, options.seconds))
 
 
-def _answer(folder: Path, parts: Sequence[str]) -> None:
+def _answer(folder: Path, parts: Sequence[str], seconds: float) -> None:
     missing = [name for name in ("munged", "slurmctld", "slurmd") if not shutil.which(name)]
     if missing or os.getuid():
         sys.exit("error: needs root, and Slurm: apt-get install slurm-wlm munge")
     check = Checks()
-    whole = folder / "whole"
     with cluster(folder):
-        subprocess.run(run(whole, "+method=target", *LONG), check=True, stdout=subprocess.DEVNULL)
+        long = _taking(folder / "tried", seconds)
+        finish(run(folder / "whole", "+method=target", *long))
         for name in parts:
-            PARTS[name](folder, whole, check)
+            PARTS[name](folder, long, check)
     if check.failed:
         sys.exit(1)
+
+
+def _taking(folder: Path, seconds: float) -> list[str]:
+    """The settings of a run that takes about so long on this machine."""
+    finish(run(folder, "+method=target", f"schedule.updates={TRIED}"))
+    first, *_, last = read_csv(folder / "metrics.csv")
+    each = (last["seconds"] - first["seconds"]) / TRIED
+    updates = 20 * round(seconds / each / 20)
+    return [f"schedule.updates={updates}", *SPARSE]
 
 
 if __name__ == "__main__":

@@ -118,7 +118,10 @@ def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> Non
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_methods_of_runs_are_timed_in_turns(bench, train, capsys, tmp_path: Path) -> None:
+def test_methods_of_runs_are_timed_in_turns(
+    bench, train, capsys, monkeypatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("proposer_rl.report.publish.write_page", lambda _: None)  # its pictures
     for method in ("domain_randomization", "perf_gain"):
         few = ["+scale=smoke", "schedule.updates=1"]
         assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0

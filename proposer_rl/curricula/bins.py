@@ -13,9 +13,9 @@ from torch import Tensor
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
-from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space
+from proposer_rl.task import Space, refuse_single_bin
 
 
 class BinCounts:
@@ -64,10 +64,7 @@ class BinCurriculum(Curriculum):
 
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:
-        if space.size < 2:
-            raise ArgumentError(
-                "space: has a single bin, so there is nothing to choose among; give its axes bins"
-            )
+        refuse_single_bin(space)
         self.space, self._every = space, every
         self._proposed = 0
         self._counts = BinCounts(space)

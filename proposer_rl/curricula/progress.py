@@ -66,7 +66,8 @@ class LearningProgressCurriculum(BinCurriculum):
         super().__init__(space, every=every)
         self.needs = ("performance",) if source == "exact" else ()
         self.reads = ("success",) if (source, measure) == ("episodes", "success") else ()
-        self._source, self._probes = source, Probes(space, probes, measure)
+        probed = probes if source == "exact" else 0
+        self._source, self._probes = source, Probes(space, probed, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration
         # Sum and number of what came of each bin since the last scoring pass, [K, N].
         self._episodes: list[Tensor] = []

@@ -76,13 +76,13 @@ class TransportCurriculum(BinCurriculum):
                 f"target_shares={list(target_shares.shape)}: must be one for each of {space.size} "
                 "bins"
             )
-        self._delta, self._epsilon = delta, epsilon
-        self._probes = Probes(space, probes, measure)
         if space.size > MOST_BINS:
             raise ArgumentError(
                 f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares a linear "
                 "program is made; give its axes fewer"
             )
+        self._delta, self._epsilon = delta, epsilon
+        self._probes = Probes(space, probes, measure)
         target = target_shares.double()
         self._target = (target / target.sum()).numpy()
         places = space.coordinates.double()

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space
+from proposer_rl.task import Space, refuse_single_bin
 
 
 class Actions(ABC):
@@ -22,9 +22,13 @@ class Actions(ABC):
 
     Args:
         space: the bins, and the levels in them.
+
+    Raises:
+        ArgumentError: if there is one bin only.
     """
 
     def __init__(self, space: Space) -> None:
+        refuse_single_bin(space)
         self.space = space
         self.bins = space.size
 

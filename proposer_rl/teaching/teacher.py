@@ -55,7 +55,7 @@ class Teacher:
             levels and results then have a dimension [K] before the others.
         device: where levels and tickets are given.
         filter: of the proposed levels, as of :func:`proposer_rl.train`.
-        block: tickets that the curriculum proposes at once.
+        block: tickets that the curriculum proposes at once; fewer where episodes are few.
         success: what in a rollout is a success where it has no such entry: ``"terminated"``,
             ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
         student: what the curriculum may ask of; None for one that can do what ``can`` says.
@@ -91,7 +91,7 @@ class Teacher:
         students: Count = 1,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
-        block: Count = 256,
+        block: Count = 384,
         success: Success | None = None,
         student: Student | None = None,
         **can: Any,

@@ -140,9 +140,10 @@ class Tickets:
         outcome = {}
         for name, entry in self.results.items():
             result = entry[:, place]
+            missing = np.isnan(result)
             if name in ("episodes", "steps"):
-                outcome[name] = torch.from_numpy(np.nan_to_num(result, nan=1).astype(np.int64))
-            elif not np.isnan(result).any():
+                outcome[name] = torch.from_numpy(np.where(missing, 1, result).astype(np.int64))
+            elif not missing.any():
                 outcome[name] = torch.from_numpy(result.astype(np.float32))
         return TensorDict(outcome, outcome["return"].shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -26,6 +27,7 @@ from proposer_rl.curricula import (
     SomeBins,
     TransportCurriculum,
 )
+from proposer_rl.meta.actions import Mixture
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay, selection
@@ -127,7 +129,12 @@ def test_what_bins_cost_or_lack_is_told_first() -> None:
     one, many = (ParameterSpace({"x": intervals(0.0, 1.0, count)}) for count in (1, 5000))
     with pytest.raises(ArgumentError, match="single bin, so there is nothing to choose"):
         LearningProgressCurriculum(one)
+    with pytest.raises(ArgumentError, match="single bin, so there is nothing to choose"):
+        Mixture(one)
     with pytest.raises(ArgumentError, match="5,000 bins: at most 4,096"):
         TransportCurriculum(many, torch.ones(5000))
     with pytest.warns(UserWarning, match="5,000 bins with 16 probes each: 80,000 levels"):
         LearningProgressCurriculum(many)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LearningProgressCurriculum(many, source="episodes")  # which plays none for it

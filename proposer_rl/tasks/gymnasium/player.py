@@ -207,12 +207,15 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                     raise self._refused(self._play, error) from error
 
     def _built(self, play: Play) -> gymnasium.Env[Any, Any]:
+        arguments = self._named("argument", play)
         try:
-            env = self._make(**self._named("argument", play))
-        except (ImportError, gymnasium.error.Error, WrapperError):
+            env = self._make(**arguments)
+        except (ImportError, gymnasium.error.Error, WrapperError, UnfitEnvironmentError):
             raise
         except Exception as error:
-            raise self._refused(play, error) from error
+            if arguments:
+                raise self._refused(play, error) from error
+            raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
         self._answers = _answers(env)
         return env
 

@@ -14,6 +14,8 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
 from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec
 
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+
 Seen = spaces.Box | spaces.Dict
 Acts = spaces.Discrete | spaces.MultiDiscrete | spaces.Box
 Array = NDArray[Any]
@@ -36,7 +38,7 @@ def plain(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     1; what is beyond a bound is clipped.
 
     Raises:
-        ValueError: for spaces that no network is for, saying what there is one for.
+        UnfitEnvironmentError: for spaces that no network is for, saying what there is one for.
     """
     acts = _actions(env.action_space)
     if acts is not None:
@@ -54,10 +56,14 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
         if not isinstance(
             part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
         ):
-            raise ValueError(
-                f"observation space {space}: there is no network for {part}"
-                f"{f', its part {name}' if name else ''}; a wrapper can leave it out, as "
-                "wrappers=[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+            way = "; a wrapper can make numbers of it"
+            if name:
+                way = (
+                    f", its part {name}; a wrapper can leave it out, as "
+                    "wrappers=[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+                )
+            raise UnfitEnvironmentError(
+                f"observation space {space}: there is no network for {part}{way}"
             )
     images = {name: cast(spaces.Box, part) for name, part in parts.items() if is_image(part)}
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
@@ -167,7 +173,7 @@ def _actions(space: spaces.Space[Any]) -> Change | None:
         sizes = [len(part) for part in options]
         read = [partial(_chosen, part) for part in parts.values()]
     else:
-        raise ValueError(
+        raise UnfitEnvironmentError(
             f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
             "MultiBinary one, for a Box of floats, and for dictionaries and tuples of either; a "
             "wrapper can make it one"

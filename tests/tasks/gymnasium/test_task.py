@@ -83,6 +83,10 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
         ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
         (
+            {"arguments": {"foo": 1}, "parameters": {}},
+            "env_id=.*: it cannot be made: TypeError: .*unexpected keyword",
+        ),
+        (
             {
                 "env_id": "tests.tasks.gymnasium.test_task:Grown-v0",
                 "parameters": {"size": ParameterSettings(set="argument", values=[3, 5], target=3)},

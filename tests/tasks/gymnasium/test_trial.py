@@ -77,6 +77,10 @@ def line_task(env_id: str, **changed: Any) -> Any:
             showing(spaces.Dict({"a": spaces.Text(3)}), {"a": "abc"}),
             "no network for Text.*its part a; .*FilterObservation",
         ),
+        (
+            showing(spaces.Sequence(spaces.Discrete(2)), (1,)),
+            "env_id=Odd.*no network for Sequence.*; a wrapper can make numbers of it",
+        ),
         ({"action_space": spaces.Text(3)}, "action space Text.*there is a policy for"),
         (
             {"action_space": spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,))))},
