@@ -600,11 +600,11 @@ def refuse_single_bin(space: Space) -> None:
     """Refuse a space in which there is nothing to choose.
 
     Raises:
-        ArgumentError: if it has one bin.
+        ValueError: if it has one bin.
     """
     if space.size < 2:
-        raise ArgumentError(
-            "space: has a single bin, so there is nothing to choose among; give its axes bins"
+        raise ValueError(
+            "the space has a single bin, so there is nothing to choose among; give its axes bins"
         )
 
 
