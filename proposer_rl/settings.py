@@ -284,6 +284,7 @@ class PPOSettings(LearningSettings):
             standardised advantages) each; 1 for the batch as it is.
         anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
             after so many; None for a constant one.
+        anneal_clip: whether ``clip_epsilon`` falls with the learning rate.
         clip_value: how far a value may move from that of the rollout before its error counts as if
             it had not come back (the larger of both errors); None for the plain squared error.
     """
@@ -294,6 +295,7 @@ class PPOSettings(LearningSettings):
     normalize_rewards: bool = False
     minibatches: Annotated[int, Ge(1)] = 1
     anneal_updates: Annotated[int, Ge(1)] | None = None
+    anneal_clip: bool = False
     clip_value: Annotated[float, Gt(0)] | None = None
 
 

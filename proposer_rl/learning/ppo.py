@@ -38,7 +38,7 @@ from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import PPOSettings
+from proposer_rl.settings import ArgumentError, PPOSettings
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -68,6 +68,7 @@ class PPO:
     Raises:
         ValueError: if the environment's first dimension is not the agent's number of replicas, or
             the loss reduces what belongs to different replicas.
+        ArgumentError: if ``anneal_clip`` has nothing to anneal.
 
     Example:
         A linear policy and value for one environment of Gymnasium's:
@@ -116,6 +117,9 @@ class PPO:
             clip_value=settings.clip_value,
         )
         self._loss = make_loss(loss or clipped, agent)
+        annealed = settings.anneal_updates is not None and hasattr(self._loss, "clip_epsilon")
+        if settings.anneal_clip and not annealed:
+            raise ArgumentError("anneal_clip=True: needs anneal_updates, and PPO's own loss")
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
         self._gradient_steps = 0
@@ -149,14 +153,18 @@ class PPO:
         return self.collector.collect(generators)
 
     @property
-    def learning_rate(self) -> float:
-        """Of the next update."""
+    def left(self) -> float:
+        """What annealing leaves of the learning rate in the next update, from 1 to 0."""
         settings = self.settings
         if settings.anneal_updates is None:
-            return settings.learning_rate
+            return 1.0
         each = settings.updates * settings.epochs * settings.minibatches
-        done = self._gradient_steps / each / settings.anneal_updates
-        return settings.learning_rate * max(0.0, 1 - done)
+        return max(0.0, 1 - self._gradient_steps / each / settings.anneal_updates)
+
+    @property
+    def learning_rate(self) -> float:
+        """Of the next update."""
+        return self.settings.learning_rate * self.left
 
     def optimise(
         self, rollout: TensorDictBase, generators: list[torch.Generator] | None = None
@@ -181,6 +189,8 @@ class PPO:
         steps = rollout.exclude(*self.agent.level_keys)
         for group in self._adam.param_groups:
             group["lr"] = self.learning_rate
+        if self.settings.anneal_clip:
+            self._loss.clip_epsilon.fill_(self.settings.clip_epsilon * self.left)
         orders = self._minibatches.draw(generators)
         trained = self.train(TensorDict({"steps": steps, "level": level, **orders}))
         self._gradient_steps += len(trained["gradient_steps"])

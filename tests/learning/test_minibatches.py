@@ -127,6 +127,28 @@ def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
         assert torch.equal(entry["value"], before[name, "value"])
 
 
+def test_the_clip_falls_with_the_learning_rate() -> None:
+    settings = replace(SETTINGS, anneal_updates=4, clip_epsilon=0.01, learning_rate=0.1)
+    annealed = of_maze(replace(settings, anneal_clip=True), True)
+    annealed.update(generators())
+    halved = of_maze(replace(settings, clip_epsilon=0.0075), True)
+    halved.restore(annealed.snapshot())
+    kept = of_maze(settings, True)
+    kept.restore(annealed.snapshot())
+    weights = []
+    for ppo in (annealed, halved, kept):
+        ppo.update(generators())
+        weights.append(ppo.snapshot())
+    for name, entry in weights[0].items():
+        torch.testing.assert_close(entry["value"], weights[1][name, "value"])
+    assert any(not torch.equal(e["value"], weights[2][n, "value"]) for n, e in weights[0].items())
+
+
+def test_a_clip_that_nothing_anneals_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"^anneal_clip=True: needs anneal_updates"):
+        of_maze(replace(SETTINGS, anneal_clip=True), False)
+
+
 def test_a_clipped_value_loss_is_the_larger_error() -> None:
     """Of the value, and of the value moved from the old one by at most a little."""
     bound = 1e-3
