@@ -191,7 +191,7 @@ def same(one: Path, other: Path) -> bool:
 def sweep(folder: Path, long: Sequence[str], check: Checks) -> None:
     """Four runs as four jobs; the same command again has nothing to do."""
     words = ["-m", "+method=target,domain_randomization", "seed=0,1", *SMALL, *SUBMIT]
-    words = [*START, *words, f"hydra.sweep.dir={folder}/sweep"]
+    words = [*START, *words, "hydra.launcher.timeout_min=30", f"hydra.sweep.dir={folder}/sweep"]
     first = subprocess.run(words, capture_output=True, text=True, check=False)
     check("a sweep: four runs finish", first.returncode == 0 and "4 finished" in first.stdout)
     again = subprocess.run(words, capture_output=True, text=True, check=False)
