@@ -113,7 +113,7 @@ def _beats(
         f"{f' ({decision.reason})' * (number == 0)}"
         for number, outcome in enumerate(outcomes(study)[:3])
     )
-    costs = [np.mean([r.total_frames.iloc[-1] / max(r.updates, 1) for r in g.runs]) for g in groups]
+    costs = [np.mean([r.total_frames[-1] / max(r.updates, 1) for r in g.runs]) for g in groups]
     ratio = costs[0] / costs[1] if costs[1] else math.nan
     return verdict, f"{text}; frames: {ratio:.1f} times as many"
 
@@ -399,7 +399,7 @@ def _against(study: Study, one: Group, other: Group, decision: Decision) -> str:
 
 def _frames(one: Group, others: Sequence[Group]) -> str:
     own, *rest = (
-        float(np.mean([r.total_frames.iloc[-1] for r in g.runs])) / 1e6 for g in (one, *others)
+        float(np.mean([r.total_frames[-1] for r in g.runs])) / 1e6 for g in (one, *others)
     )
     return f"cost: {write(own)} million frames, theirs {write(min(rest))} to {write(max(rest))}"
 

@@ -76,7 +76,7 @@ def budgets(study: Study) -> Mapping[str, Outcome]:
     name, whole = study.headline, [run for group in study.compared for run in group.runs]
     found = {"updates": primary(study)}
     for axis, cost in COSTS.items():
-        budget = min(float(cost(run).iloc[-1]) for run in whole)
+        budget = min(float(cost(run)[-1]) for run in whole)
         value = partial(Run.mean_until, measurement=name, budget=budget, cost=cost)
         text = f"{float(f'{budget:.2g}'):,g}"  # 370, where .2g alone says 3.7e+02
         found[axis] = Outcome(f"{words(name)}, mean over {text} {UNITS[axis]}", value)
@@ -90,7 +90,7 @@ def spread(study: Study, scarce: str) -> float:
     """
     if scarce not in COSTS:
         return 1.0
-    spent = [[float(COSTS[scarce](run).iloc[-1]) for run in group.runs] for group in study.compared]
+    spent = [[float(COSTS[scarce](run)[-1]) for run in group.runs] for group in study.compared]
     return max((max(each) / min(each) for each in spent if min(each) > 0), default=1.0)
 
 
@@ -204,9 +204,9 @@ def ranking(study: Study, needs: Needs) -> Table:
         for outcome in ranked.values():
             row[outcome.name] = outcome.median(group)
         last = [run.last("evaluations") for run in group.runs]
-        row["frames (M)"] = float(np.mean([run.total_frames.iloc[-1] for run in group.runs]) / 1e6)
+        row["frames (M)"] = float(np.mean([run.total_frames[-1] for run in group.runs]) / 1e6)
         row["evaluations"] = int(np.mean(last))
-        row["seconds"] = float(np.mean([run.own_seconds.iloc[-1] for run in group.runs]))
+        row["seconds"] = float(np.mean([run.own_seconds[-1] for run in group.runs]))
         rows.append(row)
     note = (
         f"{INTERVALS} Frames, evaluations of "

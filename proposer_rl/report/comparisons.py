@@ -117,7 +117,10 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
     Runs of the same seed begin with the same weights and draw the same numbers: where both groups
     have the same seeds, each once, they are compared in pairs.
     """
-    known = [outcome.known(group) for group in (one, other)]
+    return _difference(outcome.known(one), outcome.known(other))
+
+
+def _difference(*known: list[tuple[int, float]]) -> Estimate:
     seeds, others = ([seed for seed, _ in pairs] for pairs in known)
     paired = seeds == others and len(set(seeds)) == len(seeds)
     a, b = ([value for _, value in pairs] for pairs in known)
@@ -144,26 +147,28 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
         study: the groups.
         outcome: of which more is better; None for the primary one.
     """
-    pairs = list(combinations(study.compared, 2))
     outcome = outcome or primary(study)
-    found = [difference(outcome, *pair) for pair in pairs]
+    known = {group.label: outcome.known(group) for group in study.compared}
+    pairs = list(combinations(study.compared, 2))
+    found = [_difference(known[one.label], known[other.label]) for one, other in pairs]
     corrected = holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
     return {
-        (one.label, other.label): _decide(study, outcome, (one, other), estimate, p, count)
+        (one.label, other.label): _decide(study, (one, other), known, estimate, p, count)
         for (one, other), estimate, p in zip(pairs, found, corrected, strict=True)
     }
 
 
 def _decide(
     study: Study,
-    outcome: Outcome,
     pair: tuple[Group, Group],
+    known: Mapping[str, list[tuple[int, float]]],
     estimate: Estimate,
     p: float,
     count: int,
 ) -> Decision:
-    runs = [len(outcome.known(group)) for group in pair]
+    values = [[value for _, value in known[group.label]] for group in pair]
+    runs = [len(own) for own in values]
     if min(runs) < FEWEST:
         text = f"{runs[0]} and {runs[1]} seeds, and it takes {FEWEST} of each"
         return Decision(None, TOO_FEW, p, text)
@@ -172,7 +177,7 @@ def _decide(
     text = f"p = {p:.2g} after correction for {count} comparisons"
     if p > ERROR:
         if runs[0] != runs[1]:
-            estimate = balanced(*map(outcome.values, pair))
+            estimate = balanced(*values)
         needed = seeds_needed(estimate, min(runs), ERROR / count)
         more = f", about {needed:,} seeds each would decide it" if needed else ""
         return Decision(None, UNDECIDED, p, text + more, needed)

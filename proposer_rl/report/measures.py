@@ -26,9 +26,9 @@ from proposer_rl.runs.columns import is_rate
 
 UPDATES = "Solver updates"
 # What training cost beside updates: in words, and of a run at each of its evaluations.
-COSTS: Mapping[str, Callable[[Run], pd.Series]] = {
+COSTS: Mapping[str, Callable[[Run], Column]] = {
     "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
-    "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds.iloc[0],
+    "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
 }
 GRID_POINTS = 100
 SHARES = np.geomspace(0.01, 1.0, 61)  # of the levels, the worst
@@ -170,7 +170,7 @@ def over_updates(group: Group, name: str, table: str = "metrics") -> Series | No
     return _aligned({s: (own["updates"], own[name]) for s, own in tables.items() if name in own})
 
 
-def over_cost(group: Group, name: str, cost: Callable[[Run], pd.Series]) -> Series | None:
+def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series | None:
     """A measurement against a cost; None where no run has it.
 
     Runs stand at different costs when they are measured, so they are interpolated in between.
@@ -178,7 +178,7 @@ def over_cost(group: Group, name: str, cost: Callable[[Run], pd.Series]) -> Seri
     runs = [run for run in group.runs if name in run.metrics]
     if not runs:
         return None
-    x = np.linspace(0, max(cost(run).iloc[-1] for run in runs), GRID_POINTS)
+    x = np.linspace(0, max(cost(run)[-1] for run in runs), GRID_POINTS)
     rows = [np.interp(x, cost(r), r.metrics[name], left=np.nan, right=np.nan) for r in runs]
     return pd.DataFrame(rows, [run.seed for run in runs], x)
 

@@ -113,9 +113,9 @@ def group_table(study: Study) -> Table:
             row[title] = at_the_end(study, worst, title).median(whole)
         cost: dict[str, Callable[[Run], float]] = {
             "frames (M)": lambda run: run.last("frames") / MILLION,
-            "with the curriculum's (M)": lambda run: run.total_frames.iloc[-1] / MILLION,
+            "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
             "evaluations": lambda run: run.last("evaluations"),
-            "seconds per run": lambda run: run.own_seconds.iloc[-1],
+            "seconds per run": lambda run: run.own_seconds[-1],
         }
         row |= {
             name: float(np.mean([spent(run) for run in runs or group.runs]))
@@ -174,7 +174,7 @@ def run_table(study: Study) -> Table:
                     "frames": int(run.last("frames")),
                     "the curriculum's frames": int(run.last("curriculum_frames")),
                     "evaluations": int(run.last("evaluations")),
-                    "seconds": float(run.own_seconds.iloc[-1]),
+                    "seconds": float(run.own_seconds[-1]),
                 }
             )
     return Table("runs", "Runs", "Measurements are the run's last.", rows)

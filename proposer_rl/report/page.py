@@ -104,7 +104,7 @@ def origin(study: Study) -> list[tuple[str, str]]:
     """With which versions, where, and for how much."""
     runs = study.runs
     own, spent, evaluations = (sum(run.last(name) for run in runs) for name in COST[1:4])
-    seconds = sum(run.own_seconds.iloc[-1] for run in runs)
+    seconds = sum(run.own_seconds[-1] for run in runs)
     return [
         ("Versions", _distinct(runs, _versions)),
         ("Hardware", _distinct(runs, _hardware)),

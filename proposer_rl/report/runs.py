@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -105,15 +106,20 @@ class Run:
         value = self.facts.get("planned_updates", self.facts.get("updates"))
         return value if isinstance(value, int) else None
 
-    @property
-    def total_frames(self) -> pd.Series:
-        """Environment frames at each evaluation, those that the curriculum spent included."""
-        return self.metrics["frames"] + self.metrics["curriculum_frames"]
+    @cached_property
+    def columns(self) -> Mapping[str, Column]:
+        """The columns of the measurements: statistics over many pairs read them often."""
+        return {name: column.to_numpy() for name, column in self.metrics.items()}
 
-    @property
-    def own_seconds(self) -> pd.Series:
+    @cached_property
+    def total_frames(self) -> Column:
+        """Environment frames at each evaluation, those that the curriculum spent included."""
+        return self.columns["frames"] + self.columns["curriculum_frames"]
+
+    @cached_property
+    def own_seconds(self) -> Column:
         """Wall seconds at each evaluation: an even share where seeds were trained together."""
-        return self.metrics["seconds"] / self.shared_by
+        return self.columns["seconds"] / self.shared_by
 
     def last(self, name: str) -> float:
         """The last value of a column of the measurements."""
@@ -157,11 +163,12 @@ class Run:
 
     def at(self, measurement: str, updates: float) -> float:
         """A measurement after exactly that many updates; NaN where there was none."""
-        row = self.metrics[self.metrics["updates"] == updates]
-        return float(row[measurement].iloc[0]) if len(row) and measurement in row else math.nan
+        (rows,) = np.nonzero(self.columns["updates"] == updates)
+        known = len(rows) and measurement in self.columns
+        return float(self.columns[measurement][rows[0]]) if known else math.nan
 
     def mean_until(
-        self, measurement: str, budget: float, cost: Callable[[Run], pd.Series] | None = None
+        self, measurement: str, budget: float, cost: Callable[[Run], Column] | None = None
     ) -> float:
         """Mean of a measurement along training; NaN for a run that did not spend the budget.
 
@@ -170,8 +177,8 @@ class Run:
             budget: of what is on the axis.
             cost: of the run at each evaluation, the axis; None for updates.
         """
-        axis = self.metrics["updates"] if cost is None else cost(self)
-        x, y = axis.to_numpy(), self.metrics[measurement].to_numpy()
+        x = self.columns["updates"] if cost is None else cost(self)
+        y = self.columns[measurement]
         if x[-1] < budget:
             return math.nan
         end = float(np.interp(budget, x, y))
