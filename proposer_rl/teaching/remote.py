@@ -9,8 +9,6 @@ from multiprocessing.connection import Client, Connection, Listener
 from threading import Lock, Thread
 from typing import Any
 
-CALLS = ("ask", "tell", "drop", "log")
-
 
 class TeacherClient:
     """A teacher as another process has it; made by :meth:`Teacher.client`, and sent there.

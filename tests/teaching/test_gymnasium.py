@@ -63,7 +63,8 @@ def test_levels_may_be_options_of_a_reset() -> None:
     assert env.unwrapped.options == {"more": 1, **info["level"]}
 
 
-@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.filterwarnings("ignore:This process")
+@pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
 def test_all_environments_of_a_vector_have_one_teacher(kind: Any) -> None:
     curriculum = Counting("success")
     teacher = prl.Teacher(curriculum, ITEMS, block=3)

@@ -105,7 +105,7 @@ def test_environments_in_other_processes_have_one_teacher() -> None:
     make = partial(taught, teacher.client(), None)
     with pytest.raises(TypeError, match=r"give that process teacher\.client"):
         ParallelEnv(2, partial(taught, teacher, None)).rollout(2)
-    env = ParallelEnv(2, make)
+    env = ParallelEnv(2, make, mp_start_method="fork")
     rollout = env.rollout(12, break_when_any_done=False)
     env.close()
     collector = MultiSyncCollector(
