@@ -281,10 +281,12 @@ def _rounded(name: str, values: Column) -> Column:
 def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
     if not len(table):
         return table
-    own = table[table["seed"] == seed].drop(columns="seed").astype(float)
-    names = [checked(Name, name, "the name of a column") for name in own]
-    known = own.where(own.abs() < LARGEST)
-    return pd.DataFrame({name: _rounded(name, known[name].to_numpy()) for name in names})
+    own, found = table["seed"].to_numpy() == seed, {}
+    for name in table.columns.drop("seed"):
+        values = table[name].to_numpy(float)[own]
+        known = np.where(np.abs(values) < LARGEST, values, np.nan)
+        found[checked(Name, name, "the name of a column")] = _rounded(name, known)
+    return pd.DataFrame(found)
 
 
 def _check_metrics(run: Run) -> None:
