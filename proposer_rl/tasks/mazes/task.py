@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
-from proposer_rl.task import ComputeContext, EpisodeLaw, ExactTask, LevelResult, for_copies
+from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
@@ -52,7 +52,7 @@ WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
 
 
-class MazeTask(GridTask, ExactTask):
+class MazeTask(GridTask):
     """Mazes, and a U-Net that learns to solve them.
 
     Args:
