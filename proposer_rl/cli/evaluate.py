@@ -51,14 +51,7 @@ COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
 
 
 class Evaluation(NamedTuple):
-    """The results of Solvers on a set of levels.
-
-    Attributes:
-        run: of the Solvers.
-        updates: that they have made.
-        levels: what was evaluated on.
-        results: one for each level and Solver.
-    """
+    """The results of Solvers on a set of levels."""
 
     run: StoredRun
     updates: int
@@ -242,11 +235,7 @@ def _summed(evaluation: Evaluation, name: str, digest: str) -> list[RunScore]:
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
-    """The Solvers of a run's newest checkpoint, or of the one that is given.
-
-    Raises:
-        ConfigError, CheckpointError: if there is no such run, or its checkpoint cannot be used.
-    """
+    """The Solvers of a run's newest checkpoint, or of the one that is given."""
     run = stored_run(checkpoint)
     return run, run.stage(checkpoint if checkpoint.is_file() else None)
 
@@ -260,10 +249,6 @@ def evaluate(
         loaded: as :func:`load` returns them.
         name: of levels that the run's task knows; None for what it takes by default.
         max_steps: step limit of every level; None for the task's choice.
-
-    Raises:
-        ValueError: if there are no such levels, or they are none for this Solver.
-        OSError: if a file cannot be read.
     """
     run, stage = loaded
     name = name or run.task.default_levels

@@ -56,15 +56,9 @@ class MazeTask(GridTask):
     """Mazes, and a U-Net that learns to solve them.
 
     Args:
-        maze: the inner environment.
-        distributions: by name.
-        target: the name of the one that the Solver is to master.
-        space: the Proposer's bins.
         network: of the Solver.
-        encoder_channels: of the convolutions with which a Proposer reads a probe.
-        evaluation: how the Solver is measured.
-        solver: the Solver's training.
-        context: device, precision and cores.
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+            :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
         make_network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
             ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
             of the settings.
