@@ -2,7 +2,7 @@
 
 A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs;
 :class:`~proposer_rl.tasks.mazes.evaluation.ExactEvaluator` asks it for one number, these for all
-of them. The first two take one level, batch shape [], and action probabilities, float ``[4, H, W]``.
+of them. The first two take one level ``[]`` and action probabilities, float ``[4, H, W]``.
 """
 
 from __future__ import annotations
