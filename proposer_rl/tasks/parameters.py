@@ -215,7 +215,8 @@ class ParameterSpace:
     def shares(self, other: ParameterSpace) -> Tensor:
         """Which of these bins the levels of another distribution lie in, float [N]."""
         parts = [self.bins[name].shares(bins) for name, bins in other.bins.items()]
-        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts).float()
+        none = torch.ones(1, dtype=torch.float64)
+        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts, none).float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
         sizes = [len(values) for values in self.axes.values()]
