@@ -148,6 +148,10 @@ def test_what_bins_cost_or_lack_is_told_first() -> None:
         TransportCurriculum(many, torch.ones(5000))
     with pytest.warns(UserWarning, match="5,000 bins with 16 probes each: 80,000 levels"):
         LearningProgressCurriculum(many)
+    with pytest.warns(UserWarning, match="5,000 bins with 8 candidates each: 40,000 levels"):
+        FirstOrderCurriculum(many, many)
+    with pytest.raises(ValueError, match=r"parameters: .* combinations of their bins"):
+        ParameterSpace({str(axis): intervals(0.0, 1.0, 256) for axis in range(8)})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         LearningProgressCurriculum(many, source="episodes")  # which plays none for it
