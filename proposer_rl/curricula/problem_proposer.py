@@ -18,7 +18,6 @@ from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning.divergence import located, require_finite
 from proposer_rl.learning.settings import PPOSettings
-from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
@@ -72,8 +71,8 @@ class ProblemProposer(Curriculum):
         ).to(device_of(target.sample(1, torch.Generator())))  # its numbers are tensors
         self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
         self._parameters = [p for p in agent.parameters() if p.requires_grad]
-        self._adam = complete_adam(
-            self._parameters, settings.learning_rate, settings.adam_eps, fused=False
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
         self._inbox = Inbox()
         self._counts = BinCounts(space)
@@ -142,13 +141,31 @@ class ProblemProposer(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's state, too."""
-        learnt = {"proposer": take_snapshot(self.agent, self._adam).to_dict()}
-        return super().state_dict() | learnt | {"observed": self.agent.in_keys}
+        moments = {
+            name: self._adam.state[parameter]
+            for name, parameter in self.agent.named_parameters()
+            if parameter in self._adam.state
+        }
+        return super().state_dict() | {
+            "proposer": {
+                name: {"value": parameter.detach().clone()}
+                | {key: value.clone() for key, value in moments.get(name, {}).items()}
+                for name, parameter in self.agent.named_parameters()
+            },
+            "observed": self.agent.in_keys,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with them."""
         super().load_state_dict(state)
-        restore_snapshot(self.agent, self._adam, TensorDict(state["proposer"]))
+        for name, parameter in self.agent.named_parameters():
+            entry = dict(state["proposer"][name])
+            parameter.data.copy_(entry.pop("value"))
+            # Adam counts its steps on the CPU, whatever the device.
+            self._adam.state[parameter] = {
+                key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
+                for key, value in entry.items()
+            }
 
     def _take_in(self) -> None:
         """Take in what came of the levels; here, nothing."""

@@ -12,15 +12,12 @@ from torch.optim import Adam
 from proposer_rl.models import ActorCritic
 
 
-def complete_adam(
-    parameters: Sequence[nn.Parameter], learning_rate: float, eps: float, *, fused: bool = True
-) -> Adam:
+def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
     """Torch's Adam whose state, usually made at the first step, is there from the beginning."""
-    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=fused)
+    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=True)
     for parameter in parameters:
         adam.state[parameter] = {
-            # Only where it is fused does it count its steps on the device.
-            "step": torch.zeros((), device=parameter.device if fused else "cpu"),
+            "step": torch.zeros((), device=parameter.device),
             "exp_avg": torch.zeros_like(parameter),
             "exp_avg_sq": torch.zeros_like(parameter),
         }
