@@ -152,17 +152,21 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
 
 def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
     """Refuse a return above what the environment says, warn of one above what it seems to pay."""
-    _, highest = getattr(player.unwrapped, "reward_range", (0, np.inf))  # as in Gymnasium before 1
+    match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
+        case (_, int() | float() as highest):
+            pass
+        case _:
+            highest = np.inf
     if max(rewards) <= highest and least > max(highest, highest * limit):
         raise ValueError(
             f"success.least={least:g}: is never reached: the environment's reward_range ends at "
             f"{highest:g}, and an episode after {limit} steps"
         )
-    paid = rewards[0]
-    if paid > 0 and min(rewards) == max(rewards) and least > paid * limit:
+    reward = rewards[0]
+    if reward > 0 and min(rewards) == max(rewards) and least > reward * limit:
         warnings.warn(
-            f"success.least={least:g}: can it be reached? Each step of an episode has paid "
-            f"{paid:g}, and there are {limit} steps at most",
+            f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
+            f"{reward:g}, and there are {limit} steps at most",
             stacklevel=2,
         )
 
