@@ -31,6 +31,10 @@ PARAMETERS = "  parameters:\n"
         ((FIRST + FILE).encode("utf-8-sig"), "byte-order mark hides it: save the file as UTF-8"),
         (("# a note\n" + FIRST + FILE).encode(), "line.yaml must be '# @package _global_'"),
         (("# Größe\n" + FIRST + FILE).encode("latin-1"), "line.yaml: is not encoded in UTF-8"),
+        (
+            (FIRST + FILE.replace("defaults: [gymnasium, _self_]", "")).encode(),
+            "task._target_: missing: the class that makes the task; a file of one's own has it",
+        ),
         ((FIRST + FILE).encode("utf-16"), "line.yaml: is not encoded in UTF-8"),
         ((FIRST + FILE).encode("utf-16-le"), "line.yaml"),
         ((FIRST + FILE.replace("  env_id", "\tenv_id")).encode(), "line.yaml"),

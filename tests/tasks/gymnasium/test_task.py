@@ -82,6 +82,10 @@ def picture(record: dict[str, Any]) -> np.ndarray:
             {"wrappers": ["tests.tasks.gymnasium.test_task.with_whole_actions"]},
             r"action space Box.*int64\): there is a policy for .* a Box of floats",
         ),
+        (
+            {"env_id": "tests.tasks.gymnasium.broken:Walk-v0"},
+            r"env_id=.*: its module cannot be imported: ZeroDiv.* \(broken.py, line \d+\)$",
+        ),
         ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
         ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
         ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
