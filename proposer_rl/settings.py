@@ -129,6 +129,7 @@ def arguments(
         NameError: if the annotations name what cannot be found.
 
     Example:
+        >>> from typing import Literal
         >>> def learn(rate: Positive, source: Literal["exact", "episodes"] = "exact"): ...
         >>> arguments(learn, {"rate": 1})
         {'rate': 1.0}

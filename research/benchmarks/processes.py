@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from proposer_rl.models import available_cores
-from proposer_rl.tasks.gymnasium.env import GymnasiumEnv
+from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.gymnasium.settings import SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
@@ -45,7 +45,7 @@ class Costly(gymnasium.Env[Any, Any]):
         return np.zeros(24, np.float32), 0.0, False, False, {}
 
 
-gymnasium.register("Costly-v0", Costly, max_episode_steps=10**6)
+gymnasium.register("Costly-v0", f"{__name__}:Costly", max_episode_steps=10**6)
 
 
 def in_processes(options: Options) -> Result:
@@ -56,12 +56,12 @@ def in_processes(options: Options) -> Result:
         actions = torch.zeros(2 if options.tiny else steps, BATCH, 4)
         make = MakeEnvironment(f"{__name__}:Costly-v0", {"milliseconds": cost})
         rule = SuccessSettings(kind="survived")
+        how: tuple[Vectorization, ...] = ("sync", "async")
         envs = {
-            how: GymnasiumEnv(levels, make, {}, success=rule, vectorization=how)  # type: ignore
-            for how in ("sync", "async")
+            name: GymnasiumEnv(levels, make, {}, success=rule, vectorization=name) for name in how
         }
         seconds = interleave(
-            {how: partial(through_torchrl, env, actions) for how, env in envs.items()},
+            {name: partial(through_torchrl, env, actions) for name, env in envs.items()},
             options.repeats,
         )
         for env in envs.values():

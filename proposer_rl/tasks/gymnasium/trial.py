@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -56,6 +57,7 @@ def tried(
             is not as the environment's spaces and Gymnasium's interface say.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
+    _check_module(make.env_id)
     _check_functions(make, parameters)
     _check_wrappers(make, parameters, target)
     _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
@@ -70,6 +72,17 @@ def tried(
         _check_ends(player, name, [Play(values, target.seed) for values in ends])
     player.close()
     return limit
+
+
+def _check_module(env_id: str) -> None:
+    module, colon, _ = env_id.partition(":")
+    try:
+        if colon:
+            import_module(module)
+    except ImportError:
+        raise
+    except Exception as error:  # whatever somebody's module may raise
+        raise UnfitEnvironmentError(f"its module cannot be imported: {told(error)}") from error
 
 
 def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
@@ -152,17 +165,21 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
 
 def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
     """Refuse a return above what the environment says, warn of one above what it seems to pay."""
-    _, highest = getattr(player.unwrapped, "reward_range", (0, np.inf))  # as in Gymnasium before 1
+    match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
+        case (_, int() | float() as highest):
+            pass
+        case _:
+            highest = np.inf
     if max(rewards) <= highest and least > max(highest, highest * limit):
         raise ValueError(
             f"success.least={least:g}: is never reached: the environment's reward_range ends at "
             f"{highest:g}, and an episode after {limit} steps"
         )
-    paid = rewards[0]
-    if paid > 0 and min(rewards) == max(rewards) and least > paid * limit:
+    reward = rewards[0]
+    if reward > 0 and min(rewards) == max(rewards) and least > reward * limit:
         warnings.warn(
-            f"success.least={least:g}: can it be reached? Each step of an episode has paid "
-            f"{paid:g}, and there are {limit} steps at most",
+            f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
+            f"{reward:g}, and there are {limit} steps at most",
             stacklevel=2,
         )
 
