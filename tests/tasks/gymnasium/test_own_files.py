@@ -62,9 +62,7 @@ def test_a_file_that_would_be_misread_is_refused(
     folder = Path("conf/task")
     folder.mkdir(parents=True)
     (folder / "line.yaml").write_bytes(content)
-    changed = (
-        [] if b"target: 2.0" in content and b"defaults" not in content else TINY
-    )  # of nothing there is nothing to change
+    changed = TINY if b"defaults" in content else []  # what is not there cannot be changed
     run = ["--config-dir=conf", "task=line", "+method=target", *changed, "hydra.run.dir=run"]
     assert train(*run) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
