@@ -19,7 +19,7 @@ task:
     width: {set: argument, values: [1.0, 2.0], target: 2.0}
   success: {kind: terminated}
 """
-AXES = "".join(f"    p{i}: {{name: wind, values: [0], target: 0}}\n" for i in range(9))
+AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(9))
 PARAMETERS = "  parameters:\n"
 
 
