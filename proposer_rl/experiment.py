@@ -9,7 +9,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge
+from annotated_types import Ge, Gt
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
@@ -28,7 +28,7 @@ from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, settings
+from proposer_rl.settings import ArgumentError, NotNegative, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -36,6 +36,32 @@ Log = Callable[[str, Mapping[str, Any], int], None]
 
 RECORDED_LEVELS = 8
 MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
+
+
+@settings
+class ScheduleSettings:
+    """How long a run is, and what happens how often; all in Solver updates.
+
+    Attributes:
+        updates: length of the run.
+        cycle_length: updates between two improvements of the curriculum.
+        evaluate_every: updates between two rows of metrics.
+        checkpoint_every: updates between two checkpoints; one more follows every improvement.
+        checkpoint_seconds: time after which a checkpoint is due at the next update; None for no
+            such limit.
+        keep_checkpoints: how many of the newest checkpoints stay.
+        headline: the measurement that the run is summed up by.
+        threshold: sample efficiency is the first update at which the headline reaches this.
+    """
+
+    updates: Annotated[int, Ge(1)] = 750
+    cycle_length: Annotated[int, Ge(1)] = 50
+    evaluate_every: Annotated[int, Ge(1)] = 10
+    checkpoint_every: Annotated[int, Ge(1)] = 50
+    checkpoint_seconds: Annotated[float, Gt(0)] | None = 600.0
+    keep_checkpoints: Annotated[int, Ge(1)] = 2
+    headline: str = "id_success"
+    threshold: float = 0.8
 
 
 @settings

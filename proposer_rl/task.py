@@ -30,6 +30,7 @@ from torchrl.envs import EnvBase
 from proposer_rl.learning import PPO, first_episode_return, first_episode_success
 from proposer_rl.learning.episodes import mean_performance
 from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import (
     ActorCritic,
     Population,
@@ -38,7 +39,7 @@ from proposer_rl.models import (
     normal,
 )
 from proposer_rl.runs.pictures import pixels, png, written
-from proposer_rl.settings import ArgumentError, SolverSettings
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams, each_from
 
 Levels = Any

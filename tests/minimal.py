@@ -193,10 +193,10 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
 
 def _run(extra: str) -> None:
     from proposer_rl.cli import run
-    from proposer_rl.cli.config import methods
+    from proposer_rl.recipes import available
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
-    for name, *arguments in commands(extra, methods()):
+    for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
         if name == "play":
             _play(command, arguments)

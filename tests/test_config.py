@@ -23,17 +23,19 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import (
-    CONFIG_FOLDER,
+from proposer_rl.cli.config import read_config, saved_config
+from proposer_rl.cli.errors import (
+    BAD_INPUT,
+    UNFORESEEN,
     ConfigError,
-    methods,
-    read_config,
-    saved_config,
+    exit_code,
+    lacks_memory,
+    one_line,
 )
-from proposer_rl.cli.errors import BAD_INPUT, UNFORESEEN, exit_code, lacks_memory, one_line
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
+from proposer_rl.recipes import CONFIG_FOLDER, available
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import Interrupted, StopSignals
@@ -262,7 +264,7 @@ WRONG_COMMANDS = [
     (["+method=3"], "Config group override must be a string or a list. Got int"),
     (
         ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
-        "curriculum: proposer.action.ratio=joint: here each draw is rewarded by itself",
+        "proposer.action.ratio=joint: here each draw is rewarded by itself",
     ),
     (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
     (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: medium, paper, quick, smoke"),
@@ -708,7 +710,7 @@ def keys_of(values: Any, place: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
 @pytest.fixture(scope="module")
 def smoke() -> dict[str, Any]:
     found = {}
-    for method in methods():
+    for method in available("method"):
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
             config = compose("train", [f"+method={method}", *SMOKE])
@@ -764,7 +766,7 @@ def little_memory() -> Iterator[None]:
 def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
     smoke: dict[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    values = copy.deepcopy(smoke[data.draw(st.sampled_from(methods()))])
+    values = copy.deepcopy(smoke[data.draw(st.sampled_from(available("method")))])
     for _ in range(data.draw(st.integers(1, 3))):
         *folder, key = data.draw(st.sampled_from(keys_of(values)))
         holder = values

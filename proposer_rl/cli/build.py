@@ -9,21 +9,21 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import ConfigError, RunConfig, curriculum_maker, key, task_maker
-from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.config import RunConfig, curriculum_maker, task_maker
+from proposer_rl.cli.errors import ConfigError, key, one_line
 from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Components, Workers, filtered, modelled
+from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
 from proposer_rl.models import available_cores, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -126,7 +126,10 @@ def _curriculum(
 
     workers = _workers(config, task, tell)
     components = Components(task, config.proposer, config.seeds, on_update, workers)
-    with key("curriculum", "curriculum: ", (TypeError, ValueError)):
+    with (
+        key("curriculum", "curriculum: ", (TypeError, ValueError)),
+        key("proposer", kinds=(ProposerError,)),
+    ):
         curriculum = curriculum_maker(config.curriculum)(components)
         if not isinstance(curriculum, Curriculum):
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
@@ -138,9 +141,13 @@ def _curriculum(
         )
     if config.proposer.advance != "train":
         _check_cycle(config)
-    with key("filter"):
-        curriculum = filtered(curriculum, config.filter)
-    return modelled(curriculum, task, config.model)
+    if config.filter is not None:
+        with key("filter"):
+            curriculum = filtered(curriculum, **config.filter)
+    if config.model is not None:
+        with key("model"):
+            curriculum = modelled(curriculum, task, **config.model)
+    return curriculum
 
 
 def _check_cycle(config: RunConfig) -> None:

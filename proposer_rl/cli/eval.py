@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.cli.config import ConfigError
+    from proposer_rl.cli.errors import ConfigError
 
     for option, suffixes in SUFFIXES.items():
         file: Path | None = getattr(options, option)

@@ -24,7 +24,7 @@ from rich.table import Table
 from rich.text import Text
 from tqdm import tqdm
 
-from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 from proposer_rl.report.reading import UnreadableRun, begun, find_runs
 from proposer_rl.report.runs import Run

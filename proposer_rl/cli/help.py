@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from proposer_rl.cli.places import CONFIG_FOLDER, GROUPS
-from proposer_rl.recipes import available
+from proposer_rl.recipes import CONFIG_FOLDER, available
 
 USAGE = """\
 Train a Solver on a curriculum.
@@ -20,6 +19,18 @@ Examples:
   bin/train +method=perf_gain +scale=quick --cfg job   # every setting; nothing is run
 
 -m runs every combination; --hydra-help lists the other options, all of them Hydra's."""
+# In the order in which they are given on the command line, and what each decides.
+GROUPS = {
+    "task=": "what is to be learnt",
+    "+method=": "what the Solver trains on",
+    "+scale=": "how much is computed",
+    "+as=": "the numbers of another library, for methods that keep levels",
+    "+score=": "where the scores of levels come from",
+    "+filter=": "which of more levels are trained on",
+    "+source=": "what knows the Solver's performance",
+    "+ablation=": "what is changed of a method",
+    "+sweep=": "many runs",
+}
 PACKAGE_LINE = "# @package"
 NEEDS, NOTHING = "Needs: ", "nothing."
 

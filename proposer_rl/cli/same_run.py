@@ -6,7 +6,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
+from proposer_rl.cli.config import RunConfig, stored_config
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.runs.folder import RunFolder
 
 # What may differ: where it is computed and shown, and a longer schedule.

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from tensordict import TensorDict
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
+from proposer_rl.cli.config import RunConfig, saved_config
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import (
     CheckpointError,

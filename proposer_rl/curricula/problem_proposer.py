@@ -17,8 +17,8 @@ from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning.divergence import located, require_finite
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic, draw
-from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 

@@ -14,7 +14,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl import curricula
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
@@ -28,6 +27,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.student import ABILITIES
 from proposer_rl.learning import PPO
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
 from tests.curricula.living import Lived, live, solvers
 from tests.curricula.made import LEARNED, MADE, SPACE, Make, P, replay

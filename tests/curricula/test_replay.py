@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import ReplayCurriculum, Scorer, TaskStudent, outcome_of
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from proposer_rl.extras import install_command
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task, distribution_of
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import RolloutPolicy
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
