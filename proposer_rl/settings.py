@@ -41,6 +41,8 @@ NotNegative = Annotated[float, Ge(0)]
 """Zero, or a number above it."""
 
 
+SHOULD = "input should be "  # as pydantic begins most of its lines
+
 BY_KIND = Discriminator("kind")
 """Of a union of settings, each of which has an entry ``kind`` of its own."""
 
@@ -127,6 +129,7 @@ def arguments(
         NameError: if the annotations name what cannot be found.
 
     Example:
+        >>> from typing import Literal
         >>> def learn(rate: Positive, source: Literal["exact", "episodes"] = "exact"): ...
         >>> arguments(learn, {"rate": 1})
         {'rate': 1.0}
@@ -201,19 +204,15 @@ def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
 
 
 def _first_line(error: ValidationError, name: str, value: Any) -> str:
-    details = error.errors()[0]
-    # Where it stands in the value: a union's member is named in the place, too, and is no key.
-    loc: list[int | str] = []
-    folder = inner = value
-    for part in details["loc"]:
-        try:
-            folder, inner = inner, inner[part]
-        except (LookupError, TypeError):
-            if details["type"] != "missing":
-                continue
-        loc.append(part)
+    # The first that is wrong; of a union each member says something, and those that went deepest
+    # into the value know most of it.
+    all_ = [(details, *_place(details, value)) for details in error.errors()]
+    within = [one for one in all_ if one[1][: len(all_[0][1])] == all_[0][1]]
+    details, loc, folder = max(within, key=lambda one: len(one[1]))
     key = ".".join(map(str, [name, *loc]))
-    message = details["msg"].removeprefix("Value error, ")
+    lines = [one["msg"].removeprefix("Value error, ") for one, place, _ in within if place == loc]
+    message, *others = dict.fromkeys(f"{line[0].lower()}{line[1:]}" for line in lines)
+    message += "".join(f", or {other.removeprefix(SHOULD)}" for other in others)
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = ", ".join(sorted(map(str, folder.keys() - {loc[-1]})))
         return f"{key}: unknown" + (f"; there are: {known}" if known else "")
@@ -221,7 +220,21 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
         return f"{key}: missing"
     given = repr(details["input"])
     given = given if len(given) <= 80 else f"{given[:77]}..."
-    return f"{key}={given}: {message[0].lower()}{message[1:]}"
+    return f"{key}={given}: {message}"
+
+
+def _place(details: Any, value: Any) -> tuple[list[int | str], Any]:
+    """Where in a value something is wrong, and the innermost container around that place."""
+    loc: list[int | str] = []
+    folder = inner = value
+    for part in details["loc"]:
+        try:
+            folder, inner = inner, inner[part]
+        except (LookupError, TypeError):
+            if details["type"] != "missing":  # a union's member is named, too, and is no key
+                continue
+        loc.append(part)
+    return loc, folder
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)

@@ -565,9 +565,10 @@ def space_features(space: Any, levels: Levels) -> Tensor:
             f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
             "from which a model of outcomes tells them apart"
         )
-    c, places = space.locate(levels).double().cpu(), space.coordinates.double()
+    c = space.locate(levels).double().cpu()
     parts = [torch.ones_like(c[..., :1]), c, c.square()]
-    if len(places) <= MANY_BINS:
+    if space.size <= MANY_BINS:
+        places = space.coordinates.double()
         nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
         parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
     return torch.cat(parts, -1)

@@ -78,7 +78,7 @@ WRONG = [
     ("solver.batch_size=-4", "solver.batch_size=-4: input should be greater than or equal to 1"),
     ("solver.ppo.learning_rate=-1", "learning_rate=-1: input should be greater than 0"),
     ("solver.ppo.learning_rate=0", "learning_rate=0: input should be greater than 0"),
-    ("solver.ppo.learning_rate=nan", "learning_rate=nan: input should be a finite number"),
+    ("solver.ppo.learning_rate=nan", "learning_rate=nan: must be finite"),
     ("solver.ppo.learning_rate=inf", "learning_rate=inf: must be finite and at most 1,000"),
     ("solver.ppo.gamma=1.1", "solver.ppo.gamma=1.1: input should be less than or equal to 1"),
     ("solver.ppo.lmbda=-0.1", "solver.ppo.lmbda=-0.1: input should be greater than or equal to 0"),

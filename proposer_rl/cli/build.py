@@ -135,9 +135,11 @@ def _curriculum(
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
+        hint = "; task.vectorization=async spreads one Solver's environments over processes"
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
+            f"{hint if 'vectorization' in config.task else ''}"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -70,7 +71,7 @@ def read_config(config: DictConfig) -> RunConfig:
     """
     values = _resolved(config)
     for name, value in _leaves(values):
-        if isinstance(value, int | float) and abs(value) > LARGEST:
+        if isinstance(value, int | float) and not abs(value) <= LARGEST:
             raise ConfigError(f"{name}={value!r}: must be finite and at most {LARGEST:,} in size")
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
@@ -115,7 +116,9 @@ def _maker(
         made = instantiate({**values, "_partial_": True}, _convert_="all")
         known = [*inspect.signature(made.func).parameters]
     except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ConfigError(f"{name}._target_={target}: {_why_not_found(error)}") from error
+        inner = re.search(r"full_key: (\w+?)\W*\d*\W*$", str(error))  # of a list the place, too
+        wrong = f"{name}.{inner[1]}" if inner else f"{name}._target_={target}"
+        raise ConfigError(f"{wrong}: {_why_not_found(error)}") from error
     others = given(known)
     for missing in set(others) - set(known):
         raise ConfigError(
@@ -171,7 +174,7 @@ def stored_config(file: Path) -> Any:
 
 def _why_not_found(error: BaseException) -> str:
     """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
-    line = one_line(error).partition(", set env var HYDRA_FULL_ERROR")[0]
+    line = re.split(r", set env var HYDRA_FULL_ERROR|\s*full_key: ", one_line(error))[0]
     innermost = error
     while innermost.__cause__ is not None:
         innermost = innermost.__cause__

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -15,6 +17,7 @@ from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step, WrapperSettings
 from proposer_rl.tasks.gymnasium.spaces import plain
+from proposer_rl.tasks.parameters import SEED
 
 
 class RefusedLevelError(ValueError):
@@ -99,6 +102,11 @@ class Play(NamedTuple):
     seed: int
     once: bool = False
 
+    def __str__(self) -> str:
+        """The level."""
+        values = [f"{name}={value:g}" for name, value in self.values.items()]
+        return ", ".join([*values, f"{SEED}={self.seed}"])
+
 
 class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment whose resets set up the level that it plays.
@@ -168,7 +176,14 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         """One step, unless it stands still."""
         if self._still:
             return self._seen, 0.0, False, False, {}
-        self._seen, reward, terminated, truncated, self.told = self.env.step(action)
+        try:
+            self._seen, reward, terminated, truncated, self.told = self.env.step(action)
+        except UnfitEnvironmentError:
+            raise
+        except Exception as error:  # whatever an environment of somebody's may raise
+            raise UnfitEnvironmentError(
+                f"step raises {told(error)}, on the level {self._play}"
+            ) from error
         self._return += float(reward)
         succeeded = False
         if self._succeeded is not None and (terminated or truncated):
@@ -224,9 +239,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {name: play.values[parameter] for parameter, how, name in self._ways if how == way}
 
     def _refused(self, play: Play, error: Exception) -> RefusedLevelError:
-        level = ", ".join(f"{name}={value:g}" for name, value in play.values.items())
-        taken = f"refuses {level}" if level else "cannot be made or reset"
-        return RefusedLevelError(f"parameters: {self._make.env_id} {taken}: {told(error)}")
+        return RefusedLevelError(f"parameters: {self._make.env_id} refuses {play}: {told(error)}")
 
 
 def _answers(env: Any) -> Answers:
@@ -266,5 +279,7 @@ def imported(name: str | None) -> Callable[..., Any]:
 
 
 def told(error: Exception) -> str:
-    """An exception of an environment's as part of a line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no reason given'}"
+    """An exception of an environment's as part of a line, and where it was raised."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    reason = " ".join(str(error).split()) or "no reason given"
+    return f"{type(error).__name__}: {reason} ({Path(last.filename).name}, line {last.lineno})"

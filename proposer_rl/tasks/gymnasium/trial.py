@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
 
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.attributes import read
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
@@ -62,6 +63,7 @@ def tried(
     limit = make.limit(player)
     if not limit:
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
+    _check_kinds(player, parameters, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
         ends = [{**target.values, name: end} for end in (part.low[0].item(), part.high[-1].item())]
@@ -128,10 +130,7 @@ def _ask_gymnasium(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
 ) -> None:
     """Let Gymnasium's own checker see the beginning of an episode; it warns for the most part."""
-    try:
-        list(_played(LevelPlayer(make, parameters, play), 1))
-    except AssertionError as error:
-        raise UnfitEnvironmentError(told(error)) from error
+    list(_played(LevelPlayer(make, parameters, play), 1))
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
@@ -147,6 +146,46 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
             "limit, set max_steps to it",
             stacklevel=2,
         )
+    if success.least is not None:
+        _check_reachable(player, success.least, [step.reward for step in steps], limit)
+
+
+def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
+    """Refuse a return above what the environment says, warn of one above what it seems to pay."""
+    match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
+        case (_, int() | float() as highest):
+            pass
+        case _:
+            highest = np.inf
+    if max(rewards) <= highest and least > max(highest, highest * limit):
+        raise ValueError(
+            f"success.least={least:g}: is never reached: the environment's reward_range ends at "
+            f"{highest:g}, and an episode after {limit} steps"
+        )
+    reward = rewards[0]
+    if reward > 0 and min(rewards) == max(rewards) and least > reward * limit:
+        warnings.warn(
+            f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
+            f"{reward:g}, and there are {limit} steps at most",
+            stacklevel=2,
+        )
+
+
+def _check_kinds(
+    player: LevelPlayer, parameters: Mapping[str, ParameterSettings], bins: Mapping[str, Bins]
+) -> None:
+    """Warn of fractions in the place of whole numbers, before there has been a reset."""
+    for name, given in parameters.items():
+        if given.set != "attribute" or not bins[name].low.is_floating_point():
+            continue
+        for path in given.names(name):
+            before = read(player.unwrapped, path)
+            if isinstance(before, int) and not isinstance(before, bool):
+                warnings.warn(
+                    f"parameters.{name}: {path} is a whole number, {before}, and gets fractions; "
+                    "where it counts something, give values: [...] of whole numbers",
+                    stacklevel=2,
+                )
 
 
 def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
@@ -203,8 +242,10 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
     for _ in range(steps):
         seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
         _check_seen(player.observation_space, seen, "step")
-        if not np.isfinite(reward):
-            raise UnfitEnvironmentError(f"step pays a reward of {reward}: it must be finite")
+        if not abs(reward) <= np.finfo(np.float32).max:
+            raise UnfitEnvironmentError(
+                f"step pays a reward of {reward}: it must be finite, also as float32"
+            )
         yield _Played([np.array(part) for part in _arrays(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
@@ -258,8 +299,9 @@ def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
         return f"an observation of shape {list(array.shape)} instead of {list(space.shape or ())}"
     if array.dtype.kind not in "biuf":
         return f"{_short(seen)}, which are no numbers"
-    if not np.isfinite(array).all():
-        return "NaN or infinity"
+    with np.errstate(over="ignore"):
+        if not np.isfinite(array.astype(np.float32)).all():
+            return "NaN or infinity, or a number beyond float32"
     if not np.array_equal(array.astype(space.dtype), array) and space.dtype.kind in "biu":
         return f"{_short(array)} of {array.dtype}, which {space.dtype} cannot hold"
     if isinstance(space, spaces.Box):

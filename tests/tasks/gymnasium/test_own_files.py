@@ -39,6 +39,14 @@ PARAMETERS = "  parameters:\n"
             "task.parameters.width.bins=257: input should be less than or equal to 256",
         ),
         (
+            (FIRST + FILE.replace("target: 2.0", "target: .nan")).encode(),
+            "task.parameters.width.target=nan: must be finite",
+        ),
+        (
+            (FIRST + FILE + "  transforms: [{_target_: torchrl.envs.NoSuch}]\n").encode(),
+            "task.transforms: Error locating target 'torchrl.envs.NoSuch'",
+        ),
+        (
             (FIRST + FILE.replace(PARAMETERS, PARAMETERS + AXES)).encode(),
             "task: space: Dictionary should have at most 8 items",
         ),

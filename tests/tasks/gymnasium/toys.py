@@ -98,7 +98,7 @@ def walk_task(**changed: Any) -> GymnasiumTask:
         "parameters": PARAMETERS,
         "success": SuccessSettings(kind="terminated"),
         "reward_scale": 0.5,
-        "network": NetworkSettings(hidden=[8], channels=[4]),
+        "network": NetworkSettings(hidden=[8]),
         "evaluation": EvaluationSettings(levels=8),
         "vectorization": "sync",
         "extra": None,
