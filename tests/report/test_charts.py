@@ -182,8 +182,8 @@ def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:
         assert (np.abs(found - colour).max(-1) <= 8).any(), colour
 
 
-SIZE = 2 * 2**20
-FIGURES = 2**19  # more than the pictures of 9 methods take
+SIZE = 4 * 2**20
+FIGURES = 2**20  # more than the pictures of 9 methods take
 
 
 @pytest.mark.slow
