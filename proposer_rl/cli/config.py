@@ -69,6 +69,11 @@ def read_config(config: DictConfig) -> RunConfig:
     Raises:
         ConfigError: naming the first wrong key, its value and what is allowed.
     """
+    if isinstance(config.task, DictConfig) and "_target_" not in config.task:
+        raise ConfigError(
+            "task._target_: missing: the class that makes the task; a file of one's own has it "
+            "from another, such as by `defaults: [gymnasium, _self_]`"
+        )
     values = _resolved(config)
     for name, value in _leaves(values):
         if isinstance(value, int | float) and not abs(value) <= LARGEST:

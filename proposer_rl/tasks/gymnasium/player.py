@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -84,9 +84,13 @@ class MakeEnvironment:
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
         """Steps after which an episode is truncated; None for never."""
-        if self.max_steps is not None or env.unwrapped.spec is None:
-            return self.max_steps
-        return gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
+        limits = [one._max_episode_steps for one in _wrappers(env) if isinstance(one, TimeLimit)]
+        declared = self.max_steps
+        if declared is None and env.unwrapped.spec is not None:
+            declared = gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
+        if declared is not None:
+            limits.append(declared)
+        return min(limits, default=None)
 
 
 class Play(NamedTuple):
@@ -231,7 +235,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             if arguments:
                 raise self._refused(play, error) from error
             raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
-        self._answers = _answers(env)
+        self._answers = next(one for one in _wrappers(env) if isinstance(one, Answers))
         return env
 
     def _named(self, way: str, play: Play) -> dict[str, float]:
@@ -242,10 +246,11 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return RefusedLevelError(f"parameters: {self._make.env_id} refuses {play}: {told(error)}")
 
 
-def _answers(env: Any) -> Answers:
-    while not isinstance(env, Answers):
+def _wrappers(env: Any) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
+    """The wrappers around an environment, the outermost first."""
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
         env = env.env
-    return env
 
 
 def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:

@@ -282,8 +282,9 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
             own = "; if it is your own module, name its folder, as in PYTHONPATH=. bin/train ..."
         raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason}){own}") from error
     except gymnasium.error.Error as error:
-        own = "" if ":" in env_id else "; one's own comes after its module, as module:Name-v0"
-        raise ValueError(f"env_id={env_id}: {error}{own}") from error
+        unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
+        own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
+        raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
     except UnfitEnvironmentError as error:
         line = str(error)
         raise ValueError(

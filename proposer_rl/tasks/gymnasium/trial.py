@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -56,6 +57,7 @@ def tried(
             is not as the environment's spaces and Gymnasium's interface say.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
+    _check_module(make.env_id)
     _check_functions(make, parameters)
     _check_wrappers(make, parameters, target)
     _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
@@ -70,6 +72,17 @@ def tried(
         _check_ends(player, name, [Play(values, target.seed) for values in ends])
     player.close()
     return limit
+
+
+def _check_module(env_id: str) -> None:
+    module, colon, _ = env_id.partition(":")
+    try:
+        if colon:
+            import_module(module)
+    except ImportError:
+        raise
+    except Exception as error:  # whatever somebody's module may raise
+        raise UnfitEnvironmentError(f"its module cannot be imported: {told(error)}") from error
 
 
 def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:

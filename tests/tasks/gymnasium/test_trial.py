@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 from tensordict import TensorDict
 
 from proposer_rl.streams import Streams
@@ -244,6 +244,20 @@ def test_a_parameter_that_changes_nothing_is_told() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         line_task(odd())
+
+
+def test_a_time_limit_of_its_own_is_the_time_limit() -> None:
+    """Also where the episode of the trial ends before it."""
+    inside = odd(step=lambda self, a: (*Line.step(self, 0)[:4], {}))
+    name = f"Limited{inside}"
+    gymnasium.register(
+        name, lambda **given: TimeLimit(gymnasium.make(inside, **given).unwrapped, 5),
+        max_episode_steps=LIMIT,
+    )  # fmt: skip
+    task = line_task(name, success=SuccessSettings(kind="survived"))
+    assert (
+        task.max_steps == 5 and task.measure(task.learner([Streams(0)]).agent)["all_success"] == 1
+    )
 
 
 @pytest.mark.parametrize(
