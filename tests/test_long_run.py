@@ -1,6 +1,6 @@
 """A long run needs no more memory and no more open files than a short one.
 
-Here 100 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
+Here 60 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from tests.tiny import composed
 
-UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "100"))
+UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "60"))
 CYCLES = 20
 MIB = 2**20
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any
 
+import scipy  # which loads its statistics, a second of work, where they are asked for
 import torch
 from annotated_types import Ge, Le, Len
-from scipy import stats
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError, Positive, arguments, settings
@@ -180,8 +180,8 @@ def _inside(target: Bins, space: Bins) -> float:
 
 def _named(name: str, given: Mapping[str, Any], low: Tensor, high: Tensor) -> Law:
     """A continuous distribution of scipy's within a range."""
-    kind = getattr(stats, str(name), None)
-    if not isinstance(kind, stats.rv_continuous):
+    kind = getattr(scipy.stats, str(name), None)
+    if not isinstance(kind, scipy.stats.rv_continuous):
         raise ValueError(
             f"target.distribution={name}: must be a continuous distribution of scipy.stats, such "
             "as norm, uniform or loguniform"

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
 
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
 from proposer_rl.tasks.gymnasium.attributes import read
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
@@ -58,6 +58,7 @@ def tried(
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
     _check_module(make.env_id)
+    _check_places(parameters)
     _check_functions(make, parameters)
     _check_wrappers(make, parameters, target)
     _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
@@ -83,6 +84,16 @@ def _check_module(env_id: str) -> None:
         raise
     except Exception as error:  # whatever somebody's module may raise
         raise UnfitEnvironmentError(f"its module cannot be imported: {told(error)}") from error
+
+
+def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
+    """Refuse two parameters of which one would undo the other."""
+    taken: dict[tuple[str, str], str] = {}
+    for name, given in parameters.items():
+        for path in given.names(name):
+            other = taken.setdefault((given.set, path), name)
+            if other != name:
+                raise ValueError(f"parameters.{name}: {path} is set by parameters.{other}, too")
 
 
 def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
@@ -251,10 +262,10 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
     numbers = np.random.default_rng(0)
     player.action_space.seed(0)
     seen, _ = player.reset()
-    _check_seen(player.observation_space, seen, "reset")
+    check_seen(player.observation_space, seen, "reset")
     for _ in range(steps):
         seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
-        _check_seen(player.observation_space, seen, "step")
+        check_seen(player.observation_space, seen, "step")
         if not abs(reward) <= np.finfo(np.float32).max:
             raise UnfitEnvironmentError(
                 f"step pays a reward of {reward}: it must be finite, also as float32"
@@ -280,49 +291,6 @@ def _check_spaces(player: LevelPlayer) -> None:
         check(space)
 
 
-def _check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
-    """Refuse an observation that would be read as another than it is.
-
-    A number beyond its bounds is not: nothing here depends on them.
-    """
-    line = _unlike(space, seen)
-    if line is not None:
-        raise UnfitEnvironmentError(f"{by} shows {line}; its observation space is {space}")
-
-
-def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
-    if isinstance(space, spaces.Dict):
-        if not isinstance(seen, Mapping) or seen.keys() != space.spaces.keys():
-            return f"{_short(seen)} instead of the entries {', '.join(space.spaces)}"
-        return next(filter(None, (_unlike(s, seen[k]) for k, s in space.spaces.items())), None)
-    if isinstance(space, spaces.Tuple):
-        if not isinstance(seen, tuple) or len(seen) != len(space.spaces):
-            return f"{_short(seen)} instead of a tuple of {len(space.spaces)}"
-        parts = zip(space.spaces, seen, strict=True)
-        return next(filter(None, (_unlike(s, one) for s, one in parts)), None)
-    if not isinstance(
-        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-    ):
-        return None if space.contains(seen) else _short(seen)
-    try:
-        array = np.asarray(seen)
-    except ValueError:
-        return _short(seen)
-    if array.shape != space.shape:
-        return f"an observation of shape {list(array.shape)} instead of {list(space.shape or ())}"
-    if array.dtype.kind not in "biuf":
-        return f"{_short(seen)}, which are no numbers"
-    with np.errstate(over="ignore"):
-        if not np.isfinite(array.astype(np.float32)).all():
-            return "NaN or infinity, or a number beyond float32"
-    if not np.array_equal(array.astype(space.dtype), array) and space.dtype.kind in "biu":
-        return f"{_short(array)} of {array.dtype}, which {space.dtype} cannot hold"
-    if isinstance(space, spaces.Box):
-        return None
-    one = array.item() if isinstance(space, spaces.Discrete) else array.astype(space.dtype)
-    return None if space.contains(one) else _short(seen)
-
-
 def _alike(one: list[_Played], other: list[_Played]) -> bool:
     return len(one) == len(other) and all(
         a[1:] == b[1:] and all(map(np.array_equal, a.seen, b.seen))
@@ -336,8 +304,3 @@ def _arrays(seen: Any) -> Iterator[Any]:
             yield from _arrays(part)
     else:
         yield seen
-
-
-def _short(seen: Any) -> str:
-    text = " ".join(str(seen).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -163,7 +163,7 @@ class ViewMazeTask(GridTask):
         for i, (name, told) in enumerate(about.items()):
             for k in range(len(copies)):
                 reached = round(float(performance["success"][k, i]) * episodes)
-                interval = binomtest(reached, episodes).proportion_ci(method="wilson")
+                interval = scipy.stats.binomtest(reached, episodes).proportion_ci(method="wilson")
                 results = {
                     "success": reached / episodes,
                     "success_low": float(interval.low),

@@ -19,7 +19,7 @@ task:
     width: {set: argument, values: [1.0, 2.0], target: 2.0}
   success: {kind: terminated}
 """
-AXES = "".join(f"    p{i}: {{name: wind, values: [0], target: 0}}\n" for i in range(9))
+AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(9))
 PARAMETERS = "  parameters:\n"
 
 
@@ -62,9 +62,7 @@ def test_a_file_that_would_be_misread_is_refused(
     folder = Path("conf/task")
     folder.mkdir(parents=True)
     (folder / "line.yaml").write_bytes(content)
-    changed = (
-        [] if b"target: 2.0" in content and b"defaults" not in content else TINY
-    )  # of nothing there is nothing to change
+    changed = TINY if b"defaults" in content else []  # what is not there cannot be changed
     run = ["--config-dir=conf", "task=line", "+method=target", *changed, "hydra.run.dir=run"]
     assert train(*run) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()

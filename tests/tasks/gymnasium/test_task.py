@@ -86,6 +86,10 @@ def picture(record: dict[str, Any]) -> np.ndarray:
             {"env_id": "tests.tasks.gymnasium.broken:Walk-v0"},
             r"env_id=.*: its module cannot be imported: ZeroDiv.* \(broken.py, line \d+\)$",
         ),
+        (
+            {"parameters": {n: ParameterSettings(name="wind", values=[1], target=1) for n in "ab"}},
+            "parameters.b: wind is set by parameters.a, too",
+        ),
         ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
         ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
         ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
