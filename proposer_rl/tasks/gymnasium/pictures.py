@@ -67,11 +67,12 @@ class Camera:
     ) -> list[NDArray[np.uint8]]:
         """Pictures uint8 [H, W, 3] of levels [n], and of first episodes there [n, T]."""
         return [
-            self._picture(play, None if rollout is None else _first_actions(rollout[index]))
+            self.picture(play, None if rollout is None else _first_actions(rollout[index]))
             for index, play in enumerate(plays(levels))
         ]
 
-    def _picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+    def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+        """Of one level, and of an episode with actions [T, ...] there."""
         if self.works:
             try:
                 return self._drawn(play, actions)

@@ -36,11 +36,13 @@ class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
         super().__init__(render_mode)
         self.stump_height, self.stump_spacing = 0.0, 3.0
 
-    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in a new world: a used one keeps an order of its contacts."""
         self._destroy()
         self.world = Box2D.b2World()
-        return super().reset(**given)
+        return super().reset(seed=seed, options=options)
 
     def _generate_terrain(self, hardcore: bool) -> None:
         super()._generate_terrain(hardcore)

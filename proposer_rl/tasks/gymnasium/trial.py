@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -16,6 +16,7 @@ from gymnasium.utils.passive_env_checker import check_action_space, check_observ
 
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
 from proposer_rl.tasks.gymnasium.attributes import read
+from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
@@ -70,7 +71,8 @@ def tried(
     _check_episode(player, success, limit)
     for name, part in bins.items():
         ends = [{**target.values, name: end} for end in (part.low[0].item(), part.high[-1].item())]
-        _check_ends(player, name, [Play(values, target.seed) for values in ends])
+        plays = [Play(values, target.seed) for values in ends]
+        _check_ends(player, name, plays, partial(_look_alike, make, parameters, plays))
     player.close()
     return limit
 
@@ -212,8 +214,13 @@ def _check_kinds(
                 )
 
 
-def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
-    """Set both ends of a parameter, see that they are there and stay, and that they matter."""
+def _check_ends(
+    player: LevelPlayer, name: str, ends: list[Play], look_alike: Callable[[], bool]
+) -> None:
+    """Set both ends of a parameter, see that they are there and stay, and that they matter.
+
+    They do, too, if the environment draws them in different ways: it may take skill to get there.
+    """
     shown = player.observation_space, player.action_space
     episodes: list[list[_Played]] = []
     for play in ends:
@@ -234,12 +241,20 @@ def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
     first, last = (play.values[name] for play in ends)
-    if first != last and _alike(*episodes):
+    if first != last and _alike(*episodes) and look_alike():
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
             "same to the last digit; does it arrive?",
             stacklevel=2,
         )
+
+
+def _look_alike(
+    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], ends: list[Play]
+) -> bool:
+    camera = Camera(make, parameters, ends[0])
+    first, last = (camera.picture(play, None) for play in ends)
+    return not camera.works or np.array_equal(first, last)
 
 
 def _refuse_strays(player: LevelPlayer, when: str) -> None:

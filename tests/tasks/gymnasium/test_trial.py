@@ -318,6 +318,22 @@ def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
         env.close()
 
 
+@pytest.mark.parametrize("drawn", [True, False])
+def test_what_is_only_drawn_arrives(drawn: bool) -> None:
+    """What lies far away is not met in a short episode, but it is there to be seen."""
+    far = odd(
+        metadata={"render_modes": ["rgb_array"]},
+        hill=1.0,
+        render=lambda self: np.full((8, 8, 3), 50 * self.hill * drawn, np.uint8),
+    )
+    hill = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
+    warned = pytest.warns(UserWarning, match="parameters.hill: .* does it arrive?")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with nullcontext() if drawn else warned:
+            line_task(far, parameters=hill)
+
+
 def test_an_environment_that_the_seed_does_not_decide_is_told() -> None:
     noisy = odd(seen=lambda self: np.array([np.random.normal(), self.goal], np.float32))
     with pytest.warns(UserWarning, match="the reset's seed does not decide all of it"):
