@@ -1,4 +1,4 @@
-"""Numbers on a command line."""
+"""What stands on a command line: numbers, and folders of runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import argparse
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
+
+from proposer_rl.cli.errors import ConfigError
 
 Number = TypeVar("Number", int, float)
 
@@ -29,3 +32,11 @@ def number(
         raise argparse.ArgumentTypeError(f"must be {allowed}, got {text!r}")
 
     return parse
+
+
+def settings_file(folder: Path) -> Path:
+    """The file of settings in a run's folder; a folder without one is no run's."""
+    file = folder / "config.json"
+    if not file.is_file():
+        raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
+    return file

@@ -16,6 +16,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from proposer_rl.cli.arguments import settings_file
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.settings import (
     ComputeSettings,
@@ -127,9 +128,7 @@ def _maker(
 
 def saved_config(folder: Path) -> RunConfig:
     """The settings of the run in a folder; where it is computed is left to choice."""
-    file = folder / "config.json"
-    if not file.is_file():
-        raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
+    file = settings_file(folder)
     return checked_config(stored_config(file), file)
 
 

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from proposer_rl.cli.arguments import number
+from proposer_rl.cli.arguments import number, settings_file
 from proposer_rl.cli.errors import command
 from proposer_rl.extras import install_command
 
@@ -61,6 +61,7 @@ def _run(options: argparse.Namespace) -> None:
 
 def open_session(folder: Path) -> Session:
     """What there is to see of the run in a folder."""
+    settings_file(folder)  # before what takes seconds to import
     from proposer_rl.cli.outcome import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
