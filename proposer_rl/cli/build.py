@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import RunConfig, curriculum_maker, task_maker
-from proposer_rl.cli.errors import ConfigError, key, one_line
+from proposer_rl.cli.config import RunConfig, curriculum_maker, key, task_maker
+from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline

@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,6 +36,26 @@ LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
+
+
+@contextmanager
+def key(
+    name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
+) -> Iterator[None]:
+    """Put a key of the configuration before what is said of the arguments that stand below it.
+
+    Args:
+        name: the key.
+        other: what comes before any other error of these kinds.
+        kinds: that mean bad input.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except kinds as error:
+        lead = f"{name}." if isinstance(error, ArgumentError) else other
+        raise ConfigError(f"{lead}{one_line(error)}") from error
 
 
 @settings
