@@ -13,6 +13,7 @@ from torchrl.modules import LSTMCell, recurrent_mode
 
 from proposer_rl.models.actor_critic import ActorCritic, categorical
 from proposer_rl.models.population import Population
+from proposer_rl.models.recurrence import Distinct, through_time
 from proposer_rl.models.unet import orthogonal_
 
 MEMORY = ("recurrent_state_h", "recurrent_state_c")
@@ -65,14 +66,22 @@ class MemoryNetwork(nn.Module):
         Returns:
             Logits [N, T, A], values [N, T, 1], and the memory after every step, [N, T, M] twice.
         """
-        batch = begins.shape[:2]
-        features = self.encoder(*(x.flatten(0, 1) for x in observed)).unflatten(0, batch)
-        after = []
-        for x, kept in zip(features.unbind(1), (~begins).to(features).unbind(1), strict=True):
-            hidden, cell = self.cell(x, (hidden * kept, cell * kept))
-            after.append((hidden, cell))
-        hiddens, cells = (torch.stack(steps, 1) for steps in zip(*after, strict=True))
-        return self.policy(hiddens), self.value(hiddens), hiddens, cells
+        count, steps = begins.shape[:2]
+        observed = tuple(x.flatten(0, 1) for x in observed)
+        if hasattr(self.encoder, "codes"):
+            kinds, rows = Distinct.apply(self.encoder.codes(*observed))
+            observed = tuple(x[kinds] for x in observed)
+        else:
+            rows = torch.arange(count * steps, device=begins.device)
+        hiddens, cells = through_time(
+            self.cell,
+            self.encoder(*observed),
+            rows.view(count, steps).T,
+            begins.transpose(0, 1),
+            (hidden, cell),
+        )
+        outputs = self.policy(hiddens), self.value(hiddens), hiddens, cells
+        return tuple(output.transpose(0, 1) for output in outputs)  # type: ignore[return-value]
 
 
 def memory_actor_critic(
