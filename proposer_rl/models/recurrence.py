@@ -77,12 +77,13 @@ class _ThroughTime(torch.autograd.Function):
                 inputs.index_select(-2, row), torch.matmul(before, weight.mT), out=gates[t]
             )
             i, f, g, o = gate.chunk(4, -1)
-            gate[..., : 2 * width].sigmoid_()
-            g.tanh_()
-            o.sigmoid_()
+            g.mul_(2)
+            gate.sigmoid_()
+            g.mul_(2).sub_(1)
             f.mul_(kept[t])
             cell = torch.mul(f, cell, out=cells[t]).addcmul_(i, g)
-            hidden = torch.mul(o, torch.tanh(cell, out=squashed[t]), out=hiddens[t])
+            torch.mul(cell, 2, out=squashed[t]).sigmoid_().mul_(2).sub_(1)
+            hidden = torch.mul(o, squashed[t], out=hiddens[t])
         return hiddens, cells, gates, squashed
 
     @staticmethod
