@@ -47,8 +47,11 @@ class RolloutCollector:
         self._horizon = horizon
         self._level = _LevelAside(*agent.level_keys)
         self._policy = RolloutPolicy(agent)
+        acted_in = self.episodes or env
+        if agent.level_keys:
+            acted_in = _WithoutLevel(acted_in, self._level, auto_unwrap=False)
         self._collector = Collector(
-            _WithoutLevel(self.episodes or env, self._level, auto_unwrap=False),
+            acted_in,
             self._policy,
             frames_per_batch=env.batch_size.numel() * horizon,
             total_frames=-1,
@@ -80,12 +83,14 @@ class RolloutCollector:
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
         """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
-        self._policy.begin(inputs["noise"], self._level, self.memory)
+        level = self._level if self._agent.level_keys else None
+        self._policy.begin(inputs["noise"], level, self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
             self.memory = self._policy.memory
         set_next_values(self._agent, rollout, self._policy.context)
-        return TensorDict({"rollout": rollout, "level": self._level.entries})
+        entries = TensorDict({}, rollout.batch_size[:-1]) if level is None else level.entries
+        return TensorDict({"rollout": rollout, "level": entries})
 
 
 @torch.no_grad()

@@ -67,19 +67,18 @@ class MemoryNetwork(nn.Module):
             Logits [N, T, A], values [N, T, 1], and the memory after every step, [N, T, M] twice.
         """
         count, steps = begins.shape[:2]
-        observed = tuple(x.flatten(0, 1) for x in observed)
-        if hasattr(self.encoder, "codes"):
-            kinds, rows = Distinct.apply(self.encoder.codes(*observed))
-            observed = tuple(x[kinds] for x in observed)
+        seen = tuple(x.flatten(0, 1) for x in observed)
+        if steps == 1:
+            kept = (~begins[:, 0]).to(hidden)
+            after = self.cell(self.encoder(*seen), (hidden * kept, cell * kept))
+            hiddens, cells = (memory.unsqueeze(0) for memory in after)
         else:
             rows = torch.arange(count * steps, device=begins.device)
-        hiddens, cells = through_time(
-            self.cell,
-            self.encoder(*observed),
-            rows.view(count, steps).T,
-            begins.transpose(0, 1),
-            (hidden, cell),
-        )
+            if hasattr(self.encoder, "codes"):
+                kinds, rows = Distinct.apply(self.encoder.codes(*seen))
+                seen = tuple(x[kinds] for x in seen)
+            turns = rows.view(count, steps).T, begins.transpose(0, 1)
+            hiddens, cells = through_time(self.cell, self.encoder(*seen), *turns, (hidden, cell))
         outputs = self.policy(hiddens), self.value(hiddens), hiddens, cells
         return tuple(output.transpose(0, 1) for output in outputs)  # type: ignore[return-value]
 
