@@ -108,10 +108,28 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
     """Write the values after each of the steps [*B, T], whose level has this context [*B].
 
-    With the memory that is there after each step.
+    With the memory that is there after each step. Where an episode goes on, that is the value
+    before the next step; an agent that reads each step for itself is not asked again for those.
     """
-    after = agent.decode(steps.get("next").select(*agent.step_keys), context)
-    steps.set(("next", agent.value_key), after.get(agent.value_key))
+    after, key = steps.get("next").select(*agent.step_keys), agent.value_key
+    value = steps.get(key)
+    if agent.level_keys or value.device.type != "cpu":  # to count them is to wait for a GPU
+        steps.set(("next", key), agent.decode(after, context).get(key))
+        return
+    shape = (1 if agent.copies is None else agent.copies, -1)
+    unknown = steps.get(("next", "done")).squeeze(-1).clone()
+    unknown[..., -1] = True
+    unknown = unknown.reshape(shape)
+    # As many of each replica as of that which has most: those that are known come out the same.
+    most = int(unknown.sum(1).max())
+    which = unknown.byte().argsort(1, descending=True, stable=True)[:, :most]
+    rows = (torch.arange(len(which)).unsqueeze(1), which)
+    asked = after.reshape(shape)[rows]
+    if agent.copies is None:
+        asked = asked.squeeze(0)
+    values = torch.cat([value[..., 1:, :], value[..., -1:, :]], -2).reshape(*unknown.shape, 1)
+    values[rows] = agent.decode(asked, context).get(key).reshape(*which.shape, 1)
+    steps.set(("next", key), values.view(value.shape))
 
 
 class RolloutPolicy(TensorDictModuleBase):

@@ -13,7 +13,7 @@ from torchrl.modules import LSTMCell, recurrent_mode
 
 from proposer_rl.models.actor_critic import ActorCritic, categorical
 from proposer_rl.models.population import Population
-from proposer_rl.models.recurrence import Distinct, through_time
+from proposer_rl.models.recurrence import distinct, through_time
 from proposer_rl.models.unet import orthogonal_
 
 MEMORY = ("recurrent_state_h", "recurrent_state_c")
@@ -75,7 +75,7 @@ class MemoryNetwork(nn.Module):
         else:
             rows = torch.arange(count * steps, device=begins.device)
             if hasattr(self.encoder, "codes"):
-                kinds, rows = Distinct.apply(self.encoder.codes(*seen))
+                kinds, rows = distinct(self.encoder.codes(*seen))
                 seen = tuple(x[kinds] for x in seen)
             turns = rows.view(count, steps).T, begins.transpose(0, 1)
             hiddens, cells = through_time(self.cell, self.encoder(*seen), *turns, (hidden, cell))

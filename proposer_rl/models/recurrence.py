@@ -32,12 +32,21 @@ def through_time(
     return hidden, after
 
 
-class Distinct(torch.autograd.Function):
-    """Finds equal rows by their codes, int64 [R]: one of each kind [U], and each row's kind [R].
+def distinct(codes: Tensor) -> tuple[Tensor, Tensor]:
+    """Finds equal rows by their codes.
 
-    On a GPU, which would have to be waited for, and under ``vmap`` every row is one of its own.
+    Args:
+        codes: int64 [R].
+
+    Returns:
+        One row of each kind, int64 [U], and the kind of each row, int64 [R]. On a GPU, which would
+        have to be waited for, and under ``vmap`` every row is a kind of its own.
     """
+    kinds, kind = _Distinct.apply(codes)
+    return kinds, kind
 
+
+class _Distinct(torch.autograd.Function):
     @staticmethod
     def forward(codes: Tensor) -> tuple[Tensor, Tensor]:
         every = torch.arange(len(codes), device=codes.device)

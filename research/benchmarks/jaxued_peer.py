@@ -227,7 +227,7 @@ def trainer(arrays: Mapping[str, Any]) -> Callable[[], Any]:
 def _environment(
     arrays: Mapping[str, Any], *, wrapped: bool, normalize_obs: bool = False
 ) -> tuple[Any, Any, Any]:
-    """jaxued's maze, its numbers, and levels [N] in it."""
+    """Jaxued's maze, its numbers, and levels [N] in it."""
     import jax
     import jax.numpy as jnp
     from jaxued.environments.maze import Level, Maze
@@ -236,9 +236,7 @@ def _environment(
     if not hasattr(jax, "tree_map"):
         jax.tree_map = jax.tree.map  # of JAX's newer versions, and what jaxued's wrapper calls
     height, width = arrays["wall_map"].shape[1:]
-    maze = Maze(
-        max_height=height, max_width=width, agent_view_size=5, normalize_obs=normalize_obs
-    )
+    maze = Maze(max_height=height, max_width=width, agent_view_size=5, normalize_obs=normalize_obs)
     env = AutoReplayWrapper(maze) if wrapped else maze
     limits = env.default_params.replace(max_steps_in_episode=int(arrays["max_steps"]))
     levels = Level(
