@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning.continued import ContinuedEpisodes
-from proposer_rl.models import ActorCritic, draw, uniform_noise
+from proposer_rl.models import ActorCritic, draw, population, uniform_noise
 from proposer_rl.settings import ArgumentError
 
 
@@ -113,7 +113,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     """
     after, key = steps.get("next").select(*agent.step_keys), agent.value_key
     value = steps.get(key)
-    if agent.level_keys or value.device.type != "cpu":  # to count them is to wait for a GPU
+    if agent.level_keys or not population.at_hand(value):  # to count is to wait
         steps.set(("next", key), agent.decode(after, context).get(key))
         return
     shape = (1 if agent.copies is None else agent.copies, -1)
@@ -122,7 +122,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     unknown = unknown.reshape(shape)
     # As many of each replica as of that which has most: those that are known come out the same.
     most = int(unknown.sum(1).max())
-    which = unknown.byte().argsort(1, descending=True, stable=True)[:, :most]
+    which = unknown.byte().argsort(dim=1, descending=True, stable=True)[:, :most]
     rows = (torch.arange(len(which)).unsqueeze(1), which)
     asked = after.reshape(shape)[rows]
     if agent.copies is None:

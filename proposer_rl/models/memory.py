@@ -28,7 +28,9 @@ class MemoryNetwork(nn.Module):
     by side, and the memory of those that begin is set to zero.
 
     Args:
-        encoder: maps observations [N, ...] to features [N, F].
+        encoder: maps observations [N, ...] to features [N, F]. If it has ``codes``, which maps them
+            to numbers int64 [N] that are equal only where they are, those that are seen more than
+            once are encoded once.
         features: number F of them.
         actions: number A of actions.
         memory: width M of the LSTM.
@@ -74,13 +76,15 @@ class MemoryNetwork(nn.Module):
             hiddens, cells = (memory.unsqueeze(0) for memory in after)
         else:
             rows = torch.arange(count * steps, device=begins.device)
-            if hasattr(self.encoder, "codes"):
-                kinds, rows = distinct(self.encoder.codes(*seen))
+            codes = getattr(self.encoder, "codes", None)
+            if codes is not None:
+                kinds, rows = distinct(codes(*seen))
                 seen = tuple(x[kinds] for x in seen)
             turns = rows.view(count, steps).T, begins.transpose(0, 1)
             hiddens, cells = through_time(self.cell, self.encoder(*seen), *turns, (hidden, cell))
         outputs = self.policy(hiddens), self.value(hiddens), hiddens, cells
-        return tuple(output.transpose(0, 1) for output in outputs)  # type: ignore[return-value]
+        logits, values, hiddens, cells = (output.transpose(0, 1) for output in outputs)
+        return logits, values, hiddens, cells
 
 
 def memory_actor_critic(

@@ -5,14 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn.functional import linear
+from torchrl.modules import LSTMCell
+
+from proposer_rl.models import population
 
 sigmoid_slope_ = torch.ops.aten.sigmoid_backward.grad_input
 tanh_slope_ = torch.ops.aten.tanh_backward.grad_input
 
 
 def through_time(
-    cell: nn.Module, inputs: Tensor, rows: Tensor, begins: Tensor, memory: tuple[Tensor, Tensor]
+    cell: LSTMCell, inputs: Tensor, rows: Tensor, begins: Tensor, memory: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """An LSTM over N sequences of T steps, which forgets where an episode begins.
 
@@ -26,7 +30,7 @@ def through_time(
     Returns:
         Hidden and cell after every step, [T, N, M] each.
     """
-    projected = nn.functional.linear(inputs, cell.weight_ih, cell.bias_ih + cell.bias_hh)
+    projected = linear(inputs, cell.weight_ih, cell.bias_ih + cell.bias_hh)
     kept, weight = (~begins).to(memory[0]), cell.weight_hh.to(projected.dtype)
     hidden, after, *_ = _ThroughTime.apply(projected, rows, kept, *memory, weight)
     return hidden, after
@@ -50,7 +54,7 @@ class _Distinct(torch.autograd.Function):
     @staticmethod
     def forward(codes: Tensor) -> tuple[Tensor, Tensor]:
         every = torch.arange(len(codes), device=codes.device)
-        if codes.device.type != "cpu":
+        if not population.at_hand(codes):
             return every, every.clone()
         kinds, kind = torch.unique(codes, return_inverse=True)
         return torch.empty_like(kinds).scatter_(0, kind, every), kind

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from proposer_rl.models import population
 from proposer_rl.tasks.mazes.levels import Level
 
 ENDS = ("done", "terminated", "truncated")
@@ -104,7 +105,7 @@ class LevelEnv(EnvBase):
         if self._waiting:
             return super().maybe_reset(tensordict)
         done = tensordict.get("done")  # [*B, 1]
-        ended = done.flatten().nonzero().squeeze(1) if done.device.type == "cpu" else None
+        ended = done.flatten().nonzero().squeeze(1) if population.at_hand(done) else None
         if ended is not None and not len(ended):
             return tensordict
         after = tensordict.copy()
