@@ -1,4 +1,4 @@
-"""Whole training on the partially observable maze at the field's numbers, beside jaxued's."""
+"""Whole training on the partially observable maze at the published numbers, beside jaxued's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.scales import Scale, Solvers
 from research.benchmarks.timing import interleave, rate, ratio, threads
 
-FIELD = Scale("paper", "domain_randomization", ("task=view_maze",))
+PUBLISHED = Scale("paper", "domain_randomization", ("task=view_maze",))
 SMALL = Scale("paper", "domain_randomization", ("task=view_maze_smoke",))
 CORES = (1, 2)
 
@@ -27,7 +27,7 @@ def view_training(options: Options) -> Result:
     for cores in CORES if options.device == "cpu" else [None]:
         if cores is None or cores <= available_cores():
             with threads(cores):
-                beside = on_these_cores(SMALL if options.tiny else FIELD, options)
+                beside = on_these_cores(SMALL if options.tiny else PUBLISHED, options)
             result.rows += beside.rows
             result.notes += beside.notes
     return result
