@@ -10,10 +10,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
-
-from tensordict import TensorDict
 
 from proposer_rl.curricula import (
     Curriculum,
@@ -37,8 +34,9 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
+from proposer_rl.curricula.learnt import load_proposer
 from proposer_rl.curricula.scores import Source
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
@@ -51,8 +49,6 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import ActorCritic
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
-from proposer_rl.runs.folder import PROPOSER
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
@@ -245,7 +241,7 @@ def proposer(
     with streams.as_default("weights"):
         agent = proposer_agent(task, config)
     if checkpoint:
-        _load(agent, checkpoint, config.observes)
+        load_proposer(agent, checkpoint, config.observes)
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
@@ -285,7 +281,7 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
         )
     task, config = components.task, components.proposer
     agent = proposer_agent(task, config)
-    _load(agent, checkpoint, config.observes)
+    load_proposer(agent, checkpoint, config.observes)
     return ProposerCurriculum(
         agent,
         solver_view(task, config),
@@ -394,7 +390,7 @@ def _problem_policy(
     with Streams(components.seeds[0], "proposer").as_default("weights"):
         agent = proposer_agent(task, replace(config, observes=[], action=action))
     if checkpoint:
-        _load(agent, checkpoint, [])
+        load_proposer(agent, checkpoint, [])
     numbers = replace(
         config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
@@ -407,45 +403,3 @@ def _one_solver(components: Components) -> None:
             f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; give "
             "each a run of its own"
         )
-
-
-def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
-    """Give a Proposer the weights of one that has learnt with the same network.
-
-    Raises:
-        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
-    """
-    try:
-        learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
-        observed = [name for name in learnt["observed"] if name != "probes"]
-        load_agent(agent, TensorDict(learnt["proposer"]))
-    except CheckpointError as error:
-        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
-        ) from error
-    if observed != list(observes):
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
-            f"{list(observes)}"
-        )
-
-
-def _with_proposer(state: State) -> State:
-    """The state of the part that has a Proposer, where curricula hold others, as filtering does."""
-    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
-    return state if "proposer" in state else next(filter(None, inner), {})
-
-
-def _curriculum_state(path: Path) -> State:
-    """The curriculum's part of a checkpoint, or of a run's newest one, or what it left of it."""
-    if not path.exists():
-        raise CheckpointError("there is no such file or folder")
-    latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
-    if latest is None and (path / PROPOSER).exists():
-        latest = load_checkpoint(path / PROPOSER)
-    if latest is None:
-        raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
-    state: State = latest[1]["curriculum"]
-    return state

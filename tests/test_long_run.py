@@ -33,7 +33,6 @@ def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
         *(f"schedule.evaluate_every={UPDATES // CYCLES}", "schedule.checkpoint_every=20"),
     ]
     config = composed(*options)
-    experiment = build(config, parts(config, StopSignals()), RunFolder(tmp_path))
     memory, files = [], []
 
     def sample(table: str, row: object, step: int) -> None:
@@ -42,7 +41,8 @@ def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
             memory.append(resident())
             files.append(len(os.listdir("/proc/self/fd")))
 
-    experiment._log = sample
+    made = parts(config, StopSignals())
+    experiment = build(config, made, RunFolder(tmp_path), log=sample)
     gc.collect()
     gc.freeze()  # what all modules hold is looked through once, not at every sample
     try:

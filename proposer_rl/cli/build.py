@@ -37,11 +37,7 @@ class Made(NamedTuple):
 
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
-    """Task, Solvers and curriculum of an experiment; nothing is written yet.
-
-    Raises:
-        ConfigError: if settings that are each valid do not go together.
-    """
+    """Task, Solvers and curriculum of an experiment; nothing is written yet."""
     require_logger(config.logger)
     task = make_task(config)
     with key("solver.ppo"):
@@ -77,11 +73,7 @@ def build(
 
 
 def make_task(config: RunConfig) -> Task:
-    """The task of a run, on its device and with its number of threads.
-
-    Raises:
-        ConfigError: if the device cannot be used, or settings do not make a task.
-    """
+    """The task of a run, on its device and with its number of threads."""
     compute = config.compute
     device = _device(compute.device)
     if compute.threads is not None:
@@ -168,12 +160,7 @@ def _check_cycle(config: RunConfig) -> None:
 
 
 def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
-    """Where the replicas are trained; None for this process.
-
-    Raises:
-        ConfigError: for workers that there are not, that would have nothing to do, or that cannot
-            be had.
-    """
+    """Where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         for name in ("workers", "worker_devices"):

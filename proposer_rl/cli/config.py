@@ -64,11 +64,7 @@ class RunConfig:
 
 
 def read_config(config: DictConfig) -> RunConfig:
-    """Check a composed configuration.
-
-    Raises:
-        ConfigError: naming the first wrong key, its value and what is allowed.
-    """
+    """Check a composed configuration."""
     if isinstance(config.task, DictConfig) and "_target_" not in config.task:
         raise ConfigError(
             "task._target_: missing: the class that makes the task; a file of one's own has it "
@@ -93,20 +89,12 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(values: Mapping[str, Any]) -> partial[Any]:
-    """What makes the task of these settings, given ``solver`` and ``context``.
-
-    Raises:
-        ConfigError: if there is no such maker, or a setting is wrong, naming its key.
-    """
+    """What makes the task of these settings, given ``solver`` and ``context``."""
     return _maker("task", values, lambda _: GIVEN_TO_TASKS)
 
 
 def curriculum_maker(values: Mapping[str, Any]) -> partial[Any]:
-    """What makes the curriculum of these settings, given its parts as the first argument.
-
-    Raises:
-        ConfigError: as :func:`task_maker`.
-    """
+    """What makes the curriculum of these settings, given its parts as the first argument."""
     return _maker("curriculum", values, lambda names: names[:1])
 
 
@@ -138,11 +126,7 @@ def _maker(
 
 
 def saved_config(folder: Path) -> RunConfig:
-    """The settings of the run in a folder; where it is computed is left to choice.
-
-    Raises:
-        ConfigError: if the folder is no run's, or was written by another version.
-    """
+    """The settings of the run in a folder; where it is computed is left to choice."""
     file = folder / "config.json"
     if not file.is_file():
         raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
@@ -150,11 +134,7 @@ def saved_config(folder: Path) -> RunConfig:
 
 
 def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
-    """Settings as a run stored them; where it is computed is left to choice.
-
-    Raises:
-        ConfigError: if they are of another version.
-    """
+    """Settings as a run stored them; where it is computed is left to choice."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return _checked({**values, **free})
@@ -165,12 +145,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
 
 
 def stored_config(file: Path) -> Any:
-    """The settings in a run's ``config.json``, as they stand there: nothing that they name is made.
-
-    Raises:
-        ConfigError: if it is no JSON, or far too large to be settings.
-        StorageError: if it cannot be read.
-    """
+    """The settings in a run's ``config.json`` as they stand there, of which nothing is made."""
     try:
         return json.loads(read_bounded(file, LARGEST_FILE))
     except (ValueError, RecursionError):
@@ -193,11 +168,7 @@ def _why_not_found(error: BaseException) -> str:
 
 
 def _resolved(config: DictConfig) -> Any:
-    """Plain values, with what they refer to put in its place.
-
-    Raises:
-        ConfigError: naming a value that is missing or refers to none.
-    """
+    """Plain values, with what they refer to put in its place."""
     try:
         return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:

@@ -1,6 +1,7 @@
 """What a command that does not come to its end says, and the exit code that it ends with.
 
-An error that is foreseen is a class with an ``exit_code``; its message is one line.
+An error that is foreseen is a class with an ``exit_code``; its message is one line. Whatever is
+wrong with what a user gave is a :class:`ConfigError`, in every function of this room.
 docs/reference/exit_codes.md lists the codes: 2 bad input, 3 divergence, 4 storage, 5 a folder in
 use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an unforeseen error.
 """
@@ -38,9 +39,6 @@ def key(
         name: the key.
         other: what comes before any other error of these kinds.
         kinds: that mean bad input.
-
-    Raises:
-        ConfigError: in place of all of these.
     """
     try:
         yield

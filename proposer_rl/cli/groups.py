@@ -35,12 +35,7 @@ def overrides() -> list[str]:
 
 
 def check_groups(given: Sequence[str]) -> None:
-    """Refuse groups of which one would undo another, since later ones win, or that do not fit.
-
-    Raises:
-        ConfigError: if ``+method=`` or ``+scale=`` comes after a group that changes them, or a
-            scale of ours is of another of our tasks.
-    """
+    """Refuse groups of which one would undo another, since later ones win, or that do not fit."""
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
     if task in available("task") and scale in available("scale"):
@@ -63,9 +58,6 @@ def check_chosen(config: DictConfig) -> None:
     """Refuse to run without a method, or with a file that Hydra has put below its group.
 
     It does so with a file of one's own for want of its first line.
-
-    Raises:
-        ConfigError: naming the methods, or the file.
     """
     if config.method is None or config.curriculum is None:
         known = ", ".join(available("method"))

@@ -29,11 +29,7 @@ Write = Callable[[Mapping[str, float], Mapping[str, Picture], int], None]
 
 
 def require_logger(settings: LoggerSettings) -> None:
-    """Check that a logger can be used, before anything is written.
-
-    Raises:
-        ConfigError: if its package, of the same name, is not installed, or it knows no user.
-    """
+    """Check that a logger can be used, before anything is written."""
     if settings.type == "csv":
         return
     if find_spec(settings.type) is None:

@@ -60,11 +60,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def open_session(folder: Path) -> Session:
-    """What there is to see of the run in a folder.
-
-    Raises:
-        ConfigError: if it is no run's, or holds no checkpoints.
-    """
+    """What there is to see of the run in a folder."""
     from proposer_rl.cli.outcome import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session

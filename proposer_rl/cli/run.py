@@ -125,9 +125,6 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     """The summary of a run that is already at the end of a schedule of so many updates.
 
     One that goes on to a longer schedule has none until it ends again.
-
-    Raises:
-        ConfigError: if the run cannot come to the end of this schedule.
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     wrong = f"schedule.updates={updates}: the run in {folder}"

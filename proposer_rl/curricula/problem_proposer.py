@@ -14,7 +14,7 @@ from torchrl.objectives import ClipPPOLoss
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.bins import BinCounts
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.proposer import learnt_proposer
+from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning.divergence import located, require_finite
 from proposer_rl.learning.settings import PPOSettings

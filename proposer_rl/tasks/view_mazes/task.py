@@ -49,15 +49,9 @@ class ViewMazeTask(GridTask):
     A policy with memory has no exact evaluation: everything that is measured is played.
 
     Args:
-        maze: the inner environment.
-        distributions: by name.
-        target: the name of the one that the Solver is to master.
-        space: the Proposer's bins.
         network: of the Solver.
-        encoder_channels: of the convolutions with which a Proposer reads a probe.
-        evaluation: how the Solver is measured.
-        solver: the Solver's training.
-        context: device, precision and cores.
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+            :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
 
     Raises:
         ValueError: naming the key, if settings that are each valid do not go together.
