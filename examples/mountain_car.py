@@ -2,7 +2,7 @@
 
 A level is a gravity, an engine's power and a start. The Solver, an MLP, is to master a weak engine,
 with which chance hardly ever reaches the top; a Proposer mixes 20 kinds of cars. `MountainCarTask`
-gives an environment, a network and pictures; what it stands on is in `proposer_rl/task.py`.
+gives an environment, a network and pictures; what it stands on is in `proposer_rl/task/base.py`.
 
     PYTHONPATH=examples bin/train --config-dir examples/conf task=mountain_car +method=perf_gain
 

@@ -3,7 +3,7 @@
     PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=currot
 
 trains, and what it wrote is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) as
-any other run. `proposer_rl/task.py` has all that can be replaced; a picture, say.
+any other run. `proposer_rl/task/base.py` has all that can be replaced; a picture, say.
 """
 
 from __future__ import annotations

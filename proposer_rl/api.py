@@ -23,8 +23,9 @@ from proposer_rl.curricula import (
     TaskStudent,
     outcome_of,
 )
-from proposer_rl.experiment import Experiment
+from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success_gain, performance_gain, task_difficulty
@@ -39,7 +40,7 @@ from proposer_rl.models import (
     UNet,
 )
 from proposer_rl.recipes import Recipe, override_value, recipe_function
-from proposer_rl.settings import ArgumentError, PPOSettings, ScheduleSettings, SolverSettings
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length

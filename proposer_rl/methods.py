@@ -10,10 +10,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
-
-from tensordict import TensorDict
 
 from proposer_rl.curricula import (
     Curriculum,
@@ -37,7 +34,10 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
+from proposer_rl.curricula.learnt import load_proposer
+from proposer_rl.curricula.scores import Source
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
     meta_env,
@@ -46,27 +46,19 @@ from proposer_rl.meta.assembly import (
     solver_view,
     worker_env,
 )
+from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
 from proposer_rl.models import ActorCritic
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
-from proposer_rl.runs.folder import PROPOSER
-from proposer_rl.settings import (
-    ArgumentError,
-    Count,
-    FilterSettings,
-    ModelSettings,
-    NotNegative,
-    Positive,
-    PPOSettings,
-    ProblemSettings,
-    ProposerSettings,
-    checked,
-)
+from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
+
+
+class ProposerError(ArgumentError):
+    """A setting of the Proposer is not allowed here; the line begins with its name."""
 
 
 class Workers(NamedTuple):
@@ -104,30 +96,6 @@ class Components(NamedTuple):
     workers: Workers | None = None
 
 
-def filtered(curriculum: Curriculum, config: FilterSettings | None) -> Curriculum:
-    """A curriculum that draws more levels than are trained on; as it is, for a config of None.
-
-    Raises:
-        ArgumentError: if a value is wrong, naming its setting.
-    """
-    if config is None:
-        return curriculum
-    scorer = Scorer(config.score, config.source, config.rollouts)
-    return Filtered(curriculum, scorer, times=config.times, temperature=config.temperature)
-
-
-def modelled(curriculum: Curriculum, task: Any, config: ModelSettings | None) -> Curriculum:
-    """A curriculum that asks a model of outcomes wherever it would ask about performance.
-
-    Raises:
-        ArgumentError: if the task's levels have no features.
-    """
-    if config is None:
-        return curriculum
-    task.features(task.space.sample(1, Streams(0).generator())[None])
-    return Modelled(curriculum, task.features, **asdict(config))
-
-
 def _takes_numbers_of(*makers: Any, given: str = "") -> Callable[[F], F]:
     """Put the numbers of a curriculum and its parts in the place of a factory's ``**numbers``.
 
@@ -152,6 +120,40 @@ def _takes_numbers_of(*makers: Any, given: str = "") -> Callable[[F], F]:
         return factory
 
     return decorate
+
+
+@checked
+@_takes_numbers_of(Filtered)
+def filtered(
+    curriculum: Curriculum,
+    /,
+    score: str = "learnability",
+    source: Source = "exact",
+    rollouts: Count = 8,
+    **numbers: Any,
+) -> Filtered:
+    """A curriculum that draws more levels than are trained on, and keeps some.
+
+    Args:
+        curriculum: any.
+        score: of the levels; see :class:`Scorer`.
+        source: of the score.
+        rollouts: on each level, from episodes.
+        numbers: those of :class:`Filtered`.
+    """
+    return Filtered(curriculum, Scorer(score, source, rollouts), **numbers)
+
+
+@checked
+@_takes_numbers_of(Modelled)
+def modelled(curriculum: Curriculum, task: Any, /, **numbers: Any) -> Modelled:
+    """A curriculum that asks a model of outcomes wherever it would ask about performance.
+
+    Raises:
+        ArgumentError: if the task's levels have no features.
+    """
+    task.features(task.space.sample(1, Streams(0).generator())[None])
+    return Modelled(curriculum, task.features, **numbers)
 
 
 def _part(make: Callable[..., T], numbers: dict[str, Any]) -> T:
@@ -217,29 +219,29 @@ def proposer(
     Raises:
         CheckpointError: if the checkpoint cannot be read.
         TypeError: if the reward is no function.
-        ValueError: for several seeds, or settings that do not go together.
+        ProposerError: for settings of the Proposer that do not go together.
+        ValueError: for several seeds.
     """
     if not callable(reward):
         raise TypeError(f"reward must be a function of a training step, got {reward!r}")
     _one_solver(components)
     task, config = components.task, components.proposer
     if config.advantage == "leave_one_out" and config.rollouts < 2:
-        raise ValueError(
-            f"proposer.rollouts={config.rollouts} must be at least 2 where "
-            "proposer.advantage=leave_one_out"
+        raise ProposerError(
+            f"rollouts={config.rollouts}: must be at least 2 where advantage=leave_one_out"
         )
     streams = Streams(components.seeds[0], "proposer")
     env = meta_env(task, config, streams, reward, range(config.rollouts), components.on_update)
     unknown = [name for name in config.observes if name not in env.observation_spec.keys()]
     if unknown:
-        raise ValueError(
-            f"proposer.observes={config.observes}: this task does not tell {', '.join(unknown)}; "
-            "return and progress are available"
+        raise ProposerError(
+            f"observes={config.observes}: this task does not tell {', '.join(unknown)}; return and "
+            "progress are available"
         )
     with streams.as_default("weights"):
         agent = proposer_agent(task, config)
     if checkpoint:
-        _load(agent, checkpoint, config.observes)
+        load_proposer(agent, checkpoint, config.observes)
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
@@ -279,7 +281,7 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
         )
     task, config = components.task, components.proposer
     agent = proposer_agent(task, config)
-    _load(agent, checkpoint, config.observes)
+    load_proposer(agent, checkpoint, config.observes)
     return ProposerCurriculum(
         agent,
         solver_view(task, config),
@@ -384,11 +386,11 @@ def _problem_policy(
     task, config = components.task, components.proposer
     action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()
     if action.ratio == "joint":
-        raise ValueError("proposer.action.ratio=joint: here each draw is rewarded by itself")
+        raise ProposerError("action.ratio=joint: here each draw is rewarded by itself")
     with Streams(components.seeds[0], "proposer").as_default("weights"):
         agent = proposer_agent(task, replace(config, observes=[], action=action))
     if checkpoint:
-        _load(agent, checkpoint, [])
+        load_proposer(agent, checkpoint, [])
     numbers = replace(
         config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
@@ -401,45 +403,3 @@ def _one_solver(components: Components) -> None:
             f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; give "
             "each a run of its own"
         )
-
-
-def _load(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
-    """Give a Proposer the weights of one that has learnt with the same network.
-
-    Raises:
-        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
-    """
-    try:
-        learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
-        observed = [name for name in learnt["observed"] if name != "probes"]
-        load_agent(agent, TensorDict(learnt["proposer"]))
-    except CheckpointError as error:
-        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
-        ) from error
-    if observed != list(observes):
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
-            f"{list(observes)}"
-        )
-
-
-def _with_proposer(state: State) -> State:
-    """The state of the part that has a Proposer, where curricula hold others, as filtering does."""
-    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
-    return state if "proposer" in state else next(filter(None, inner), {})
-
-
-def _curriculum_state(path: Path) -> State:
-    """The curriculum's part of a checkpoint, or of a run's newest one, or what it left of it."""
-    if not path.exists():
-        raise CheckpointError("there is no such file or folder")
-    latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
-    if latest is None and (path / PROPOSER).exists():
-        latest = load_checkpoint(path / PROPOSER)
-    if latest is None:
-        raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
-    state: State = latest[1]["curriculum"]
-    return state

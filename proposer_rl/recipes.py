@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -175,9 +175,15 @@ def yaml_file(name: str) -> dict[str, Any]:
 
 
 def _about(group: str, name: str) -> str:
-    text = (CONFIG_FOLDER / group / f"{name}.yaml").read_text(encoding="utf-8")
-    lines = (line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
-    return next(line for line in lines if not line.startswith("@package"))
+    return next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))
+
+
+def comments(file: Path) -> Iterator[str]:
+    """The lines of a configuration file that begin with a #, but for the one that Hydra reads."""
+    # What is no UTF-8 is refused where it is used.
+    for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
+        if line.startswith("#") and not line.startswith("# @package"):
+            yield line.lstrip("# ")
 
 
 def _refusal(line: str) -> ValueError:

@@ -18,7 +18,7 @@ from scipy.stats import bootstrap, linregress, rankdata
 from torch import Tensor
 
 from proposer_rl.cli.arguments import number
-from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv

@@ -11,7 +11,7 @@ from pathlib import Path
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import needs
-from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.report import curves, page, pictures
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary

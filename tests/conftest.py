@@ -28,8 +28,8 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from proposer_rl.cli import run
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.train import main
+from proposer_rl.recipes import CONFIG_FOLDER
 from tests.commands import call
 from tests.processes import Processes
 

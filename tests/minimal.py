@@ -107,7 +107,7 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 
 
 RUN = "runs"
-SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=1"]
+SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=2"]
 GYMNASIUM = [
     *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
     "solver.ppo.horizon=16", "solver.ppo.minibatches=2",
@@ -121,6 +121,7 @@ TASKS = {
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 # Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
 FEW = [*SMOKE, "schedule.evaluate_every=4", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
+FEW += ["task.maze.max_steps=5", "task.evaluation.levels=2", "task.network.channels=[8,8]"]
 FEW += ["schedule.updates=4", "proposer.meta_episode_length=2"]
 
 
@@ -192,10 +193,10 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
 
 def _run(extra: str) -> None:
     from proposer_rl.cli import run
-    from proposer_rl.cli.config import methods
+    from proposer_rl.recipes import available
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
-    for name, *arguments in commands(extra, methods()):
+    for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
         if name == "play":
             _play(command, arguments)

@@ -10,16 +10,9 @@ import pytest
 import torch
 from annotated_types import Interval
 
-from proposer_rl.settings import (
-    ArgumentError,
-    Count,
-    Positive,
-    ProposerSettings,
-    Share,
-    SolverSettings,
-    arguments,
-    checked,
-)
+from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.settings import ArgumentError, Count, Positive, Share, arguments, checked
 
 
 class Task(Protocol):
@@ -37,6 +30,7 @@ def make(
     names: Sequence[str] = (),
     shape: tuple[int, ...] = (),
     bins: Mapping[str, list[float]] | None = None,
+    goal: int | float | list[int | float] = 1,
     reward: Callable[..., Any] | None = None,
     solver: SolverSettings | None = None,
     flag: bool = False,
@@ -61,6 +55,9 @@ WRONG = [
     ("names", ["id", 3], "names.1=3: input should be a valid string"),
     ("shape", [1, "a"], "shape.1='a': input should be a valid integer"),
     ("bins", {"a share": [1, "b"]}, "bins.a share.1='b': input should be a valid number"),
+    ("goal", "a", "goal='a': input should be a valid integer, or a valid number, or a valid array"),
+    ("goal", [1, "a"], "goal.1='a': input should be a valid integer, or a valid number"),
+    ("goal", float("nan"), "goal=nan: input should be a valid integer, or a finite number"),
     ("reward", 3, "reward=3: input should be callable"),
     (
         "solver",

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from proposer_rl.cli.outcome import quoted
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.experiment import Experiment
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted

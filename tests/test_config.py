@@ -23,17 +23,19 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import (
-    CONFIG_FOLDER,
+from proposer_rl.cli.config import read_config, saved_config
+from proposer_rl.cli.errors import (
+    BAD_INPUT,
+    UNFORESEEN,
     ConfigError,
-    methods,
-    read_config,
-    saved_config,
+    exit_code,
+    lacks_memory,
+    one_line,
 )
-from proposer_rl.cli.errors import BAD_INPUT, UNFORESEEN, exit_code, lacks_memory, one_line
 from proposer_rl.cli.same_run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
+from proposer_rl.recipes import CONFIG_FOLDER, available
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import Interrupted, StopSignals
@@ -76,7 +78,7 @@ WRONG = [
     ("solver.batch_size=-4", "solver.batch_size=-4: input should be greater than or equal to 1"),
     ("solver.ppo.learning_rate=-1", "learning_rate=-1: input should be greater than 0"),
     ("solver.ppo.learning_rate=0", "learning_rate=0: input should be greater than 0"),
-    ("solver.ppo.learning_rate=nan", "learning_rate=nan: input should be a finite number"),
+    ("solver.ppo.learning_rate=nan", "learning_rate=nan: must be finite"),
     ("solver.ppo.learning_rate=inf", "learning_rate=inf: must be finite and at most 1,000"),
     ("solver.ppo.gamma=1.1", "solver.ppo.gamma=1.1: input should be less than or equal to 1"),
     ("solver.ppo.lmbda=-0.1", "solver.ppo.lmbda=-0.1: input should be greater than or equal to 0"),
@@ -90,19 +92,13 @@ WRONG = [
     ("solver.ppo.clip_value=0", "solver.ppo.clip_value=0: input should be greater than 0"),
     ("solver.ppo.horizon=0", "solver.ppo.horizon=0: input should be greater than or equal to 1"),
     ("task.network.channels=[]", "task.network.channels=[]: list should have at least 1 item"),
-    (
-        "task.network.channels=[8,0]",
-        "task.network.channels.1=0: input should be greater than or equal to 1",
-    ),
+    ("task.network.channels=[8,0]", "task.network.channels.1=0: input should be greater than or"),
     ("task.encoder_channels=[]", "task.encoder_channels=[]: list should have at least 1 item"),
     ("task.encoder_channels=[8,0]", "task.encoder_channels.1=0: input should be greater than or"),
     ("task.network.groups=0", "task.network.groups=0: input should be greater than or equal to 1"),
     ("task.maze.height=0", "task.maze.height=0: input should be greater than or equal to 1"),
     ("task.maze.max_steps=0", "task.maze.max_steps=0: input should be greater than or equal to 1"),
-    (
-        "task.maze.step_penalty=-1",
-        "task.maze.step_penalty=-1: input should be greater than or equal to 0",
-    ),
+    ("task.maze.step_penalty=-1", "task.maze.step_penalty=-1: input should be greater than or"),
     ("schedule.updates=0", "schedule.updates=0: input should be greater than or equal to 1"),
     ("schedule.threshold=1.5", "threshold=1.5: must be above 0 and at most 1, as id_success is"),
     ("schedule.threshold=0", "threshold=0: must be above 0 and at most 1, as id_success is"),
@@ -115,31 +111,16 @@ WRONG = [
     ("proposer.probe_levels=-1", "probe_levels=-1: input should be greater than or equal to 0"),
     ("compute.threads=0", "compute.threads=0: input should be greater than or equal to 1"),
     ("compute.cores=0", "compute.cores=0: input should be greater than or equal to 1"),
-    (
-        "task.evaluation.levels=0",
-        "task.evaluation.levels=0: input should be greater than or equal to 1",
-    ),
-    (
-        "hand_designed.until=[0]",
-        "hand_designed.until.0=0: input should be greater than or equal to 1",
-    ),
-    (
-        "task.distributions.id.specifications=[]",
-        "specifications=[]: list should have at least 1 item",
-    ),
+    ("task.evaluation.levels=0", "task.evaluation.levels=0: input should be greater than or"),
+    ("hand_designed.until=[0]", "hand_designed.until.0=0: input should be greater than or equal"),
+    ("task.distributions.id.specifications=[]", "specifications=[]: list should have at least 1"),
     ("task.distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
-    (
-        "task.distributions.id.specifications=[[1,4]]",
-        "specifications.0.0=1: input should be less than",
-    ),
+    ("task.distributions.id.specifications=[[1,4]]", "specifications.0.0=1: input should be less"),
     (
         "task.distributions.id.specifications=[[0.4,0]]",
         "specifications.0.1=0: input should be greater",
     ),
-    (
-        "task.maze={height:10000,width:10000}",
-        "task.maze.height=10000: input should be less than or equal to 1000",
-    ),
+    ("task.maze={height:10000,width:10000}", "task.maze.height=10000: input should be less than"),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
     ("solver.ppo.horizon=1000000000", "horizon=1000000000: a rollout takes at least "),
     # one of a few
@@ -156,34 +137,22 @@ WRONG = [
     ("proposer.advance=all", "proposer.advance='all': input should be "),
     ("proposer.action.spread=0", "proposer.action.spread=0: input should be greater than 0"),
     ("proposer.action.kind=golden", "proposer.action"),
-    (
-        "task.distributions.id.mechanism=x",
-        "mechanism='x': input should be 'uniform' or 'path_first'",
-    ),
+    ("task.distributions.id.mechanism=x", "mechanism='x': input should be 'uniform' or"),
     ("task.target=elsewhere", "task.target: must be among ['id', 'mix', 'ood'], got 'elsewhere'"),
-    (
-        "task.evaluation.distributions=[far]",
-        "task.evaluation.distributions: must be among ['id', 'mix'",
-    ),
+    ("task.evaluation.distributions=[far]", "task.evaluation.distributions: must be among ['id',"),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
     ("solver.ppo.gama=1", "solver.ppo.gama: unknown; there are: adam_eps, anneal_"),
     ("solver.x.y=1", "solver.x: unknown; there are: batch_size, ppo"),
     ("+sede=1", "sede: unknown; there are: method, scale"),
     ("+solver.x=1", "solver.x: unknown; there are: batch_size, ppo"),
-    (
-        "+task.distributions.id.x=1",
-        "task.distributions.id.x: unknown; there are: mechanism",
-    ),
+    ("+task.distributions.id.x=1", "task.distributions.id.x: unknown; there are: mechanism"),
     ("seed=${nowhere}", "seed: Interpolation key 'nowhere' not found"),
     ("seed=???", "seed: missing"),
     ("task.target=???", "Missing mandatory value: task.target"),
     ("task.maze=${task.nowhere}", "task.maze: Interpolation key 'task.nowhere' not found"),
     ("+proposer.ppo.horizon=3", "proposer.ppo.horizon: unknown; there are: adam_eps"),
-    (
-        "compute.collector=spark",
-        "compute.collector='spark': input should be 'single', 'multiprocess' or 'ray'",
-    ),
+    ("compute.collector=spark", "compute.collector='spark': input should be 'single',"),
     ("compute.workers=0", "compute.workers=0: input should be greater than or equal to 1"),
     ("compute.worker_devices=[]", "compute.worker_devices=[]: list should have at least 1 item"),
     # contradictions
@@ -191,18 +160,9 @@ WRONG = [
         "solver.ppo.continue_episodes=true",
         "solver.ppo.continue_episodes=True: this Solver reads its level once for a whole rollout",
     ),
-    (
-        "solver.ppo.minibatches=129",
-        "solver.ppo.minibatches=129: must be at most the 128 sequences of a batch",
-    ),
-    (
-        "compute.workers=2",
-        "compute.workers=2: there are workers only with compute.collector=multiprocess",
-    ),
-    (
-        "compute.worker_devices=[cpu]",
-        "compute.worker_devices=['cpu']: there are workers only with compute.collector=",
-    ),
+    ("solver.ppo.minibatches=129", "solver.ppo.minibatches=129: must be at most the 128"),
+    ("compute.workers=2", "compute.workers=2: there are workers only with"),
+    ("compute.worker_devices=[cpu]", "compute.worker_devices=['cpu']: there are workers only"),
     (
         "compute.ray_address=auto",
         "compute.ray_address=auto: is of use only with compute.collector=ray",
@@ -227,33 +187,17 @@ WRONG = [
         "curriculum._target_=my_parts.make: Error locating target 'my_parts.make': No module named "
         "'my_parts'; if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
     ),
-    (
-        "task._target_=my_parts.make",
-        "task._target_=my_parts.make: Error locating target 'my_parts.make': No module named "
-        "'my_parts'; if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
-    ),
-    (
-        "curriculum._target_=os.system",
-        "curriculum._target_=os.system: Target 'os.system' is blocklisted",
-    ),
+    ("task._target_=my_parts.make", "task._target_=my_parts.make: Error locating target"),
+    ("curriculum._target_=os.system", "curriculum._target_=os.system: Target 'os.system' is"),
     ("+curriculum.x=1", "curriculum.x: unknown; there are none"),
 ]
 WRONG_COMMANDS = [
-    (
-        ["+method=target", "logger=paper"],
-        "logger/paper: unknown; choose one of: csv, tensorboard, wandb",
-    ),
-    (
-        ["+method=target", "sede=1"],
-        "sede: unknown; there are: ablation, checkpoint, compute, curriculum",
-    ),
+    (["+method=target", "logger=paper"], "logger/paper: unknown; choose one of: csv,"),
+    (["+method=target", "sede=1"], "sede: unknown; there are: ablation, checkpoint, compute,"),
     (["+method=target", "curriculum.tempo=3"], "curriculum.tempo: unknown; there are: _target_"),
     (["+method=target", "seed"], "Error parsing override 'seed' missing EQUAL"),
     (["+method=target", "seeds=0"], "seeds=0: input should be a valid array"),
-    (
-        ["task=cartpole", "+method=target", "+scale=medium"],
-        "+scale=medium: is of task=maze; task=cartpole has numbers of its own",
-    ),
+    (["task=cartpole", "+method=target", "+scale=medium"], "+scale=medium: is of task=maze;"),
     ([], f"method: missing; choose one with +method=NAME, NAME one of: {METHODS}"),
     (
         ["+method=magic"],
@@ -262,14 +206,11 @@ WRONG_COMMANDS = [
     (["+method=3"], "Config group override must be a string or a list. Got int"),
     (
         ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
-        "curriculum: proposer.action.ratio=joint: here each draw is rewarded by itself",
+        "proposer.action.ratio=joint: here each draw is rewarded by itself",
     ),
     (["method=target"], f"method: choose one with +method=NAME, NAME one of: {METHODS}"),
     (["+method=target", "scale=quick"], "+scale=NAME, NAME one of: medium, paper, quick, smoke"),
-    (
-        ["+method=target", "task=none"],
-        "task/none: unknown; choose one of: bipedal_stumps, cartpole, gymnasium,",
-    ),
+    (["+method=target", "task=none"], "task/none: unknown; choose one of: bipedal_stumps,"),
     (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: paper_literal"),
     (["+method=plr", "+as=none"], "as/none: unknown; choose one of: dcd, dcd_accel, jaxued"),
     (["+method=plr", "+score=none"], "score/none: unknown; choose one of: model, sampled"),
@@ -289,40 +230,21 @@ WRONG_COMMANDS = [
         ["+method=hand_designed", "curriculum.until=[a]"],
         "curriculum.until.0='a': input should be a valid integer",
     ),
-    (
-        ["+method=hand_designed", "curriculum.until=3"],
-        "curriculum.until=3: input should be a valid array",
-    ),
-    (
-        ["+method=target", "checkpoint=other"],
-        "checkpoint=other: method=target takes none; those with a Proposer do, "
-        "and a run goes on with hydra.run.dir=FOLDER",
-    ),
+    (["+method=hand_designed", "curriculum.until=3"], "curriculum.until=3: input should be a"),
+    (["+method=target", "checkpoint=other"], "checkpoint=other: method=target takes none; those"),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
-    (
-        ["+method=plr", "+curriculum.x=1"],
-        "curriculum.x: unknown; there are: new_levels, score, source, rollouts, priorit",
-    ),
+    (["+method=plr", "+curriculum.x=1"], "curriculum.x: unknown; there are: new_levels, score,"),
     (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
-    (
-        ["+method=perf_gain", "+ablation=paper_literal", "+scale=quick"],
-        "+scale: must come before +ablation, or it would undo it",
-    ),
-    (
-        ["+ablation=paper_literal", "+method=perf_gain"],
-        "+method: must come before +ablation, or it would undo it",
-    ),
+    (["+method=perf_gain", "+ablation=paper_literal", "+scale=quick"], "+scale: must come before"),
+    (["+ablation=paper_literal", "+method=perf_gain"], "+method: must come before +ablation, or"),
     (["+method=plr", "+as=dcd", "+scale=smoke"], "+scale: must come before +as, or it would"),
     (["+as=dcd", "+method=plr"], "+method: must come before +as, or it would undo it"),
     (
         ["+method=target", *SMOKE, "curriculum._target_=builtins.len"],
         "curriculum: must make a Curriculum, but makes int",
     ),
-    (
-        ["+filter=learnability", "+method=target"],
-        "+method: must come before +filter, or it would undo it",
-    ),
+    (["+filter=learnability", "+method=target"], "+method: must come before +filter, or it would"),
     (
         ["+method=target", *SMOKE, "+filter=learnability", "filter.times=1"],
         "filter.times=1: input should be greater than or equal to 2",
@@ -368,13 +290,10 @@ WRONG_COMMANDS = [
         ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
         "compute.workers=17: must be at least 1 and at most 16, the replicas that they share",
     ),
-    (
-        ["+method=target", "compute.collector=ray"],
-        "compute.collector=ray: this method trains no replicas",
-    ),
+    (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
     (
         ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],
-        "compute.worker_devices='abacus': must be auto, cpu or a usable one",
+        "compute.worker_devices='abacus': must be auto, cpu or a usable",
     ),
     (["--experimental-rerun", "x.pickle"], "--experimental-rerun: not supported"),
 ]
@@ -708,7 +627,7 @@ def keys_of(values: Any, place: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
 @pytest.fixture(scope="module")
 def smoke() -> dict[str, Any]:
     found = {}
-    for method in methods():
+    for method in available("method"):
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
             config = compose("train", [f"+method={method}", *SMOKE])
@@ -764,7 +683,7 @@ def little_memory() -> Iterator[None]:
 def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
     smoke: dict[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    values = copy.deepcopy(smoke[data.draw(st.sampled_from(methods()))])
+    values = copy.deepcopy(smoke[data.draw(st.sampled_from(available("method")))])
     for _ in range(data.draw(st.integers(1, 3))):
         *folder, key = data.draw(st.sampled_from(keys_of(values)))
         holder = values

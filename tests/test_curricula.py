@@ -19,6 +19,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.proposer import explained_share
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, agent_weights, load_agent
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.models import (
     ActorCritic,
@@ -29,7 +30,6 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
 from tests.meta.test_env import SPACE, E, K, L, P, meta_env, mixture
 from tests.tiny import TASK, learners

@@ -18,7 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from proposer_rl.cli.eval import main as evaluate
-from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER
 from tests.commands import call, trained_run
 from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
 

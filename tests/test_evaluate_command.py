@@ -208,7 +208,7 @@ def test_several_runs_are_compared_by_their_means(
             mean = sum(row[name] for row in own) / len(own)
             assert float(score[key]) == pytest.approx(mean, rel=1e-5)
     shutil.rmtree(tmp_path / "runs" / "unreadable")
-    monkeypatch.setattr("proposer_rl.cli.evaluate.load", None)  # nothing is left to be done
+    monkeypatch.setattr("proposer_rl.cli.compare.load", None)  # nothing is left to be done
     assert evaluate(*both)[0] == 0
 
 
@@ -266,17 +266,17 @@ def test_two_commands_may_add_to_one_table(
         return [folder, "--levels", "small", "-o", output]
 
     def meanwhile(checkpoint: Path) -> object:
-        monkeypatch.setattr("proposer_rl.cli.evaluate.load", load)
+        monkeypatch.setattr("proposer_rl.cli.compare.load", load)
         assert evaluate(*command(folders[1]))[0] == 0
         return load(checkpoint)
 
-    monkeypatch.setattr("proposer_rl.cli.evaluate.load", meanwhile)
+    monkeypatch.setattr("proposer_rl.cli.compare.load", meanwhile)
     assert evaluate(*command(folders[0]))[0] == 0
     with output.open() as file:
         found = [(row["run"], row["seed"]) for row in csv.DictReader(file)]
     assert sorted(found) == [(name, seed) for name in "abcd" for seed in "35"]
     before = output.read_bytes()
-    monkeypatch.setattr("proposer_rl.cli.evaluate.load", None)  # nothing is left to be done
+    monkeypatch.setattr("proposer_rl.cli.compare.load", None)  # nothing is left to be done
     assert evaluate(tmp_path, "--levels", "small", "-o", output)[0] == 0
     assert output.read_bytes() == before
 

@@ -24,12 +24,11 @@ from proposer_rl.curricula import (
     UnfitStudentError,
     outcome_of,
 )
-from proposer_rl.experiment import Experiment
+from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted, StopSignals
-from proposer_rl.settings import ScheduleSettings
 from proposer_rl.streams import Streams
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.cli.help import GROUPS, help_text
-from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER
 from tests.processes import python
 from tests.test_bin import MODULES
 from tests.tiny import composed

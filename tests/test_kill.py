@@ -19,8 +19,8 @@ SMOKE += ["schedule.updates=4", "proposer.meta_episode_length=3"]
 # name. A method meets some of them, one after another; which ones, methods have no part in.
 MOMENTS = ["", "", "fsync .step_", "replace .step_"]
 # In one process every curriculum is taken up from its state, in tests/curricula/test_contract.py.
-# These differ in what a checkpoint holds of them: nothing, a buffer, a Proposer that learns.
-METHODS = {"target": [0, 2], "plr": [1, 3], "perf_gain": [0, 2]}
+# These differ in what a checkpoint holds of them: a buffer, and a Proposer that learns.
+METHODS = {"plr": [1, 3], "perf_gain": [0, 2]}
 
 
 def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:

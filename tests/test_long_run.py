@@ -1,6 +1,6 @@
 """A long run needs no more memory and no more open files than a short one.
 
-Here 100 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
+Here 60 updates and 20 cycles; ``LONG_RUN_UPDATES=2000 pytest -s tests/test_long_run.py`` is long.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from tests.tiny import composed
 
-UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "100"))
+UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "60"))
 CYCLES = 20
 MIB = 2**20
 
@@ -33,7 +33,6 @@ def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
         *(f"schedule.evaluate_every={UPDATES // CYCLES}", "schedule.checkpoint_every=20"),
     ]
     config = composed(*options)
-    experiment = build(config, parts(config, StopSignals()), RunFolder(tmp_path))
     memory, files = [], []
 
     def sample(table: str, row: object, step: int) -> None:
@@ -42,7 +41,8 @@ def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
             memory.append(resident())
             files.append(len(os.listdir("/proc/self/fd")))
 
-    experiment._log = sample
+    made = parts(config, StopSignals())
+    experiment = build(config, made, RunFolder(tmp_path), log=sample)
     gc.collect()
     gc.freeze()  # what all modules hold is looked through once, not at every sample
     try:

@@ -11,12 +11,12 @@ import pytest
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.meta.rewards import performance_gain
+from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, proposer
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopSignals
-from proposer_rl.settings import ProposerSettings
 from proposer_rl.tasks.mazes.task import MazeTask
 from research.ranking import EXACT, GRADIENTS, TARGET
 from tests.tiny import TASK, composed
@@ -41,7 +41,7 @@ def test_a_proposer_observes_what_the_task_tells() -> None:
     task = copy.copy(TASK)
     task.performance = lambda *given: TASK.performance(*given).exclude("success")
     chosen = ProposerSettings(rollouts=2, validation_levels=4, probe_levels=2)
-    said = r"proposer\.observes=\['log_success', 'progress'\]: this task does not tell log_success"
+    said = r"^observes=\['log_success', 'progress'\]: this task does not tell log_success"
     with pytest.raises(ValueError, match=said):
         proposer(Components(task, chosen, [0]), performance_gain)
 

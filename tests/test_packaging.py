@@ -19,7 +19,6 @@ from typing import NamedTuple
 import pytest
 import yaml
 
-from proposer_rl.cli.config import methods
 from proposer_rl.recipes import available
 from tests import minimal
 
@@ -101,13 +100,13 @@ def test_everything_runs_where_only_what_it_requires_is_installed(
     said = (tmp_path / "output").read_text(encoding="utf-8")
     assert code == 0, said[-5000:]
     done = [line.split()[1:] for line in said.splitlines() if line.startswith("DID ")]
-    assert done == list(minimal.commands(extra, methods()))
+    assert done == list(minimal.commands(extra, available("method")))
 
 
 def test_every_method_task_and_command_is_called() -> None:
-    called = [words for extra in NAMED for words in minimal.commands(extra, methods())]
+    called = [words for extra in NAMED for words in minimal.commands(extra, available("method"))]
     words = {word for command in called for word in command}
-    assert {f"+method={method}" for method in methods()} <= words
+    assert {f"+method={method}" for method in available("method")} <= words
     # Of view mazes the smallest; task=gymnasium is what the others are made of; task=maze is given.
     tasks = set(available("task"))
     tasks -= {"maze", "gymnasium", "view_maze", "view_maze_quick"}

@@ -10,17 +10,13 @@ from typing import Any
 import pytest
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.config import CONFIG_FOLDER
 from proposer_rl.cli.settings import ComputeSettings
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
+from proposer_rl.experiment import ScheduleSettings
+from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, ProposerSettings
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
-from proposer_rl.settings import (
-    MixtureSettings,
-    ProblemSettings,
-    ProposerSettings,
-    ScheduleSettings,
-    SolverSettings,
-)
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.settings import MazeSettings
 from tests.tiny import composed

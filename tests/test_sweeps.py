@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 from submitit.core.utils import UncompletedJobError
 
 from proposer_rl.cli.config import RunConfig
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked

@@ -9,21 +9,21 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import ConfigError, RunConfig, curriculum_maker, key, task_maker
-from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.config import RunConfig, curriculum_maker, task_maker
+from proposer_rl.cli.errors import ConfigError, key, one_line
 from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.meta.workers import WorkerSettings, shares
-from proposer_rl.methods import Components, Workers, filtered, modelled
+from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
 from proposer_rl.models import available_cores, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.machine import memory
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -37,11 +37,7 @@ class Made(NamedTuple):
 
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
-    """Task, Solvers and curriculum of an experiment; nothing is written yet.
-
-    Raises:
-        ConfigError: if settings that are each valid do not go together.
-    """
+    """Task, Solvers and curriculum of an experiment; nothing is written yet."""
     require_logger(config.logger)
     task = make_task(config)
     with key("solver.ppo"):
@@ -77,11 +73,7 @@ def build(
 
 
 def make_task(config: RunConfig) -> Task:
-    """The task of a run, on its device and with its number of threads.
-
-    Raises:
-        ConfigError: if the device cannot be used, or settings do not make a task.
-    """
+    """The task of a run, on its device and with its number of threads."""
     compute = config.compute
     device = _device(compute.device)
     if compute.threads is not None:
@@ -126,21 +118,30 @@ def _curriculum(
 
     workers = _workers(config, task, tell)
     components = Components(task, config.proposer, config.seeds, on_update, workers)
-    with key("curriculum", "curriculum: ", (TypeError, ValueError)):
+    with (
+        key("curriculum", "curriculum: ", (TypeError, ValueError)),
+        key("proposer", kinds=(ProposerError,)),
+    ):
         curriculum = curriculum_maker(config.curriculum)(components)
         if not isinstance(curriculum, Curriculum):
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
+        hint = "; task.vectorization=async spreads one Solver's environments over processes"
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
+            f"{hint if 'vectorization' in config.task else ''}"
         )
     if config.proposer.advance != "train":
         _check_cycle(config)
-    with key("filter"):
-        curriculum = filtered(curriculum, config.filter)
-    return modelled(curriculum, task, config.model)
+    if config.filter is not None:
+        with key("filter"):
+            curriculum = filtered(curriculum, **config.filter)
+    if config.model is not None:
+        with key("model"):
+            curriculum = modelled(curriculum, task, **config.model)
+    return curriculum
 
 
 def _check_cycle(config: RunConfig) -> None:
@@ -159,12 +160,7 @@ def _check_cycle(config: RunConfig) -> None:
 
 
 def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
-    """Where the replicas are trained; None for this process.
-
-    Raises:
-        ConfigError: for workers that there are not, that would have nothing to do, or that cannot
-            be had.
-    """
+    """Where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         for name in ("workers", "worker_devices"):

@@ -17,10 +17,12 @@ from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli.config import ConfigError, check_groups, read_config
+from proposer_rl.cli.config import read_config
+from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.groups import check_groups
 from proposer_rl.cli.hydra_errors import explained
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.run import carry_out
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 
 

@@ -1,6 +1,7 @@
 """What a command that does not come to its end says, and the exit code that it ends with.
 
-An error that is foreseen is a class with an ``exit_code``; its message is one line.
+An error that is foreseen is a class with an ``exit_code``; its message is one line. Whatever is
+wrong with what a user gave is a :class:`ConfigError`, in every function of this room.
 docs/reference/exit_codes.md lists the codes: 2 bad input, 3 divergence, 4 storage, 5 a folder in
 use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an unforeseen error.
 """
@@ -8,15 +9,44 @@ use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an u
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT
 from typing import NoReturn
+
+from proposer_rl.settings import ArgumentError
 
 BAD_INPUT = 2
 STORAGE = 4
 UNFORESEEN = 1
 SIGNALLED = 128
+
+
+class ConfigError(ValueError):
+    """The configuration is wrong; the message is one line."""
+
+    exit_code = BAD_INPUT
+
+
+@contextmanager
+def key(
+    name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
+) -> Iterator[None]:
+    """Put a key of the configuration before what is said of the arguments that stand below it.
+
+    Args:
+        name: the key.
+        other: what comes before any other error of these kinds.
+        kinds: that mean bad input.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except kinds as error:
+        lead = f"{name}." if isinstance(error, ArgumentError) else other
+        raise ConfigError(f"{lead}{one_line(error)}") from error
 
 
 def command(body: Callable[[], None]) -> None:

@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.cli.config import ConfigError
+    from proposer_rl.cli.errors import ConfigError
 
     for option, suffixes in SUFFIXES.items():
         file: Path | None = getattr(options, option)
@@ -28,10 +28,11 @@ def _run(options: argparse.Namespace) -> None:
             raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
         if file is not None and not file.parent.is_dir():
             raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
-    from proposer_rl.cli.evaluate import run
+    from proposer_rl.cli.compare import compare, of_several
+    from proposer_rl.cli.evaluate import list_levels
 
     try:
-        run(options)
+        (compare if of_several(options) else list_levels)(options)
     except ValueError as error:
         raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
 

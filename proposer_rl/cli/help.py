@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from proposer_rl.cli.places import CONFIG_FOLDER, GROUPS
-from proposer_rl.recipes import available
+from proposer_rl.recipes import CONFIG_FOLDER, available, comments
 
 USAGE = """\
 Train a Solver on a curriculum.
@@ -20,7 +19,18 @@ Examples:
   bin/train +method=perf_gain +scale=quick --cfg job   # every setting; nothing is run
 
 -m runs every combination; --hydra-help lists the other options, all of them Hydra's."""
-PACKAGE_LINE = "# @package"
+# In the order in which they are given on the command line, and what each decides.
+GROUPS = {
+    "task=": "what is to be learnt",
+    "+method=": "what the Solver trains on",
+    "+scale=": "how much is computed",
+    "+as=": "the numbers of another library, for methods that keep levels",
+    "+score=": "where the scores of levels come from",
+    "+filter=": "which of more levels are trained on",
+    "+source=": "what knows the Solver's performance",
+    "+ablation=": "what is changed of a method",
+    "+sweep=": "many runs",
+}
 NEEDS, NOTHING = "Needs: ", "nothing."
 
 
@@ -52,7 +62,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
     found: dict[str, str] = {}
     for folder in folders:
         for name in available(group, folder):
-            found.setdefault(name, _first_comment(folder / group / f"{name}.yaml"))
+            found.setdefault(name, next(comments(folder / group / f"{name}.yaml"), ""))
     return dict(sorted(found.items()))
 
 
@@ -61,23 +71,12 @@ def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for folder in folders:
         for name in available("method", folder):
-            lines = _comments(folder / "method" / f"{name}.yaml")
+            lines = comments(folder / "method" / f"{name}.yaml")
             said = (line.removeprefix(NEEDS) for line in lines if line.startswith(NEEDS))
             for text in map(str.strip, said):
                 needed = [] if text == NOTHING else [n.strip(" .") for n in text.split(",")]
                 found.setdefault(name, needed)
     return found
-
-
-def _first_comment(file: Path) -> str:
-    return next(_comments(file), "")
-
-
-def _comments(file: Path) -> Iterator[str]:
-    # What is no UTF-8 is refused where it is used.
-    for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
-        if line.startswith("#") and not line.startswith(PACKAGE_LINE):
-            yield line.lstrip("# ")
 
 
 def own_folders(arguments: Sequence[str]) -> Iterator[Path]:

@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.groups import ADDED
 from proposer_rl.cli.help import own_folders
-from proposer_rl.cli.places import ADDED
 from proposer_rl.extras import install_command
 from proposer_rl.recipes import available
 

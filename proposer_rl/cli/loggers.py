@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from proposer_rl.cli.config import ConfigError
-from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.settings import LoggerSettings
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
@@ -30,11 +29,7 @@ Write = Callable[[Mapping[str, float], Mapping[str, Picture], int], None]
 
 
 def require_logger(settings: LoggerSettings) -> None:
-    """Check that a logger can be used, before anything is written.
-
-    Raises:
-        ConfigError: if its package, of the same name, is not installed, or it knows no user.
-    """
+    """Check that a logger can be used, before anything is written."""
     if settings.type == "csv":
         return
     if find_spec(settings.type) is None:

@@ -18,11 +18,11 @@ from hydra.types import RunMode
 from rich.console import Console
 from tqdm import tqdm
 
-from proposer_rl.cli.config import RunConfig, overrides
+from proposer_rl.cli.config import RunConfig
+from proposer_rl.cli.groups import overrides
 from proposer_rl.cli.help import choices, needs
-from proposer_rl.cli.places import CONFIG_FOLDER, PACKAGE
 from proposer_rl.experiment import Experiment
-from proposer_rl.recipes import override_value
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.records import level_text
 from proposer_rl.report.terminal import screen

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.cli.config import ConfigError
+    from proposer_rl.cli.errors import ConfigError
 
     missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
     if missing:
@@ -60,14 +60,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def open_session(folder: Path) -> Session:
-    """What there is to see of the run in a folder.
-
-    Raises:
-        ConfigError: if it is no run's, or holds no checkpoints.
-    """
-    from proposer_rl.cli.config import saved_config
-
-    saved_config(folder)  # before what takes seconds to import
+    """What there is to see of the run in a folder."""
     from proposer_rl.cli.outcome import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session

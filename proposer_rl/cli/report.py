@@ -10,7 +10,7 @@ from pathlib import Path
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
 from proposer_rl.cli.help import choices
-from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER
 
 EPILOG = """\
 examples:

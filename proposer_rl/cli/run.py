@@ -14,8 +14,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import LARGEST_FILE, ConfigError, RunConfig
-from proposer_rl.cli.errors import one_line
+from proposer_rl.cli.config import LARGEST_FILE, RunConfig
+from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.cli.same_run import as_begun, check_same_run
@@ -125,9 +125,6 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     """The summary of a run that is already at the end of a schedule of so many updates.
 
     One that goes on to a longer schedule has none until it ends again.
-
-    Raises:
-        ConfigError: if the run cannot come to the end of this schedule.
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     wrong = f"schedule.updates={updates}: the run in {folder}"

@@ -6,7 +6,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.cli.config import ConfigError, RunConfig, stored_config
+from proposer_rl.cli.config import RunConfig, stored_config
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.runs.folder import RunFolder
 
 # What may differ: where it is computed and shown, and a longer schedule.
@@ -19,10 +20,6 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
 
     The stored configuration is compared with the present one and used for nothing else. If there is
     none, the present one is written.
-
-    Raises:
-        ConfigError: naming the settings that differ, or what the folder holds instead of a run.
-        StorageError: if the file cannot be read or written.
     """
     now = {key: value for key, value in asdict(config).items() if key not in FREE}
     now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
@@ -53,12 +50,7 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
 
 
 def as_begun(config: RunConfig, path: Path) -> RunConfig:
-    """The settings, with what ``precision=auto`` was on the machine where the run was begun.
-
-    Raises:
-        ConfigError: if the folder's ``config.json`` is no JSON.
-        StorageError: if it cannot be read.
-    """
+    """The settings, with what ``precision=auto`` was on the machine where the run was begun."""
     file = path / "config.json"
     if config.precision != "auto" or not file.is_file():
         return config

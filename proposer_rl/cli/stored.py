@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from tensordict import TensorDict
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.cli.config import ConfigError, RunConfig, saved_config
+from proposer_rl.cli.config import RunConfig, saved_config
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import (
     CheckpointError,
@@ -25,13 +26,7 @@ from proposer_rl.task import Task
 
 
 class Stage(NamedTuple):
-    """A run's Solvers after some updates.
-
-    Attributes:
-        step: the checkpoint's.
-        updates: that the Solvers have made.
-        learner: PPO of them.
-    """
+    """A run's Solvers after some updates."""
 
     step: int
     updates: int
@@ -44,26 +39,15 @@ class Stage(NamedTuple):
 
 
 class StoredRun(NamedTuple):
-    """A run's folder.
-
-    Attributes:
-        folder: the run's.
-        config: its settings.
-        task: made from them.
-        files: its checkpoints, oldest first; at least one.
-    """
+    """A run's folder."""
 
     folder: Path
     config: RunConfig
     task: Task
-    files: list[Path]
+    files: list[Path]  # its checkpoints, oldest first; at least one
 
     def stage(self, file: Path | None = None) -> Stage:
-        """The Solvers in one of the files; None for the newest that is intact.
-
-        Raises:
-            CheckpointError: if it cannot be used.
-        """
+        """The Solvers in one of the files; None for the newest that is intact."""
         if file is not None:
             return self._stage(*load_checkpoint(file))
         latest = load_latest(self.files[-1].parent)
@@ -86,9 +70,6 @@ def stored_run(path: Path) -> StoredRun:
 
     Args:
         path: the folder, or one of its checkpoints, which is the only file then.
-
-    Raises:
-        ConfigError: if there are none, or the folder is no run's.
     """
     if not path.exists():
         raise ConfigError(f"{path}: there is no such file or folder")

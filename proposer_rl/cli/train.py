@@ -19,18 +19,12 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli import traces
-from proposer_rl.cli.config import (
-    ConfigError,
-    check_groups,
-    check_packages,
-    overrides,
-    read_config,
-)
-from proposer_rl.cli.errors import UNFORESEEN, command, exit_code, one_line, refuse
+from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
+from proposer_rl.cli.groups import check_chosen, check_groups, overrides
 from proposer_rl.cli.hydra_errors import explained
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.cli.sweep import LostJobError, forget_failure, record_failure
 from proposer_rl.cli.traces import remove_traces
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 
 LONGEST = 300  # characters of what is said of a lost job
@@ -79,12 +73,12 @@ def _main(hydra_config: DictConfig) -> float:
     try:
         forget_failure(path)
         check_groups(overrides())
-        check_packages(hydra_config)
+        check_chosen(hydra_config)
         with signals:  # already now: amid imports is no place to stop
-            config = read_config(hydra_config)
-            from proposer_rl.cli.run import train  # only now: it takes seconds
+            from proposer_rl.cli.config import read_config  # only now: it takes seconds
+            from proposer_rl.cli.run import train
 
-            return train(config, path, signals)
+            return train(read_config(hydra_config), path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error, one_line(error, path), exit_code(error))

@@ -44,11 +44,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def draw(folder: Path) -> RenderableType:
-    """The folder's run as a screen, or its runs as a table.
-
-    Raises:
-        UnreadableRun: if there is nothing to show.
-    """
+    """The folder's run as a screen, or its runs as a table."""
     found = find_progress(folder)
     shown = screen(found[0]) if len(found) == 1 else overview(found)
     if not (folder / PLAN).exists():

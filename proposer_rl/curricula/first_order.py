@@ -12,6 +12,7 @@ from torch import Tensor
 from proposer_rl.curricula.batches import device_of, fresh_levels
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.contract import Batch
+from proposer_rl.curricula.probes import tell_cost
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.first_order import Measure, bin_scores
 from proposer_rl.settings import Count, Decay, Positive, Share, checked
@@ -76,6 +77,7 @@ class FirstOrderCurriculum(_AlignedBins):
         measure: Measure = "log_success",
     ) -> None:
         super().__init__(space, target, every, temperature, smoothing)
+        tell_cost(space, candidates, "candidates")
         self._target_levels, self._candidates = target_levels, candidates
         self._step, self._measure = step, measure
 

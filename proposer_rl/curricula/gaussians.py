@@ -18,7 +18,7 @@ from proposer_rl.curricula.student import Student
 from proposer_rl.extras import install_command
 from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space
+from proposer_rl.task import Space, refuse_single_bin
 
 LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
 CHUNK = 2**16  # earlier episodes that are compared at once
@@ -69,7 +69,8 @@ class MixtureCurriculum(Curriculum):
             space of continuous parameters has (its method ``at``).
 
     Raises:
-        ValueError: if scikit-learn is missing, or the numbers of episodes are not in order.
+        ValueError: if scikit-learn is missing, the numbers of episodes are not in order, or the
+            space has a single bin.
     """
 
     remembers = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
@@ -90,6 +91,13 @@ class MixtureCurriculum(Curriculum):
             raise ArgumentError(
                 f"rounded=false: {type(space).__name__} has bins alone; leave rounded=true"
             )
+        if rounded and space.axes and space.size < 2:
+            raise ArgumentError(
+                "rounded=true: the space has a single bin, to which all points would be rounded; "
+                "give its axes bins, or rounded=false"
+            )
+        if not space.axes:
+            refuse_single_bin(space)
         if find_spec("sklearn") is None:
             raise ValueError(
                 f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"

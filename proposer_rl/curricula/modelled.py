@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -50,7 +51,7 @@ class Modelled(Combinator):
         *,
         labels: Labels = "above_worst",
         ridge: Positive = 0.3,
-        half_life: Positive = 12.0,
+        half_life: Annotated[float, Ge(1)] = 12.0,
     ) -> None:
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)

@@ -17,6 +17,16 @@ Measure = Literal["success", "return"]
 MANY = 10_000  # levels of a scoring pass, beyond which its cost is told
 
 
+def tell_cost(space: Space, each: int, name: str) -> None:
+    """Warn of many levels in a scoring pass, where each bin has so many of what has this name."""
+    if space.size * each > MANY:
+        warnings.warn(
+            f"{space.size:,} bins with {each} {name} each: {space.size * each:,} levels are "
+            f"evaluated at every scoring pass; fewer bins, or a lower `{name}`, cost less",
+            stacklevel=2,
+        )
+
+
 class Probes:
     """Fixed levels of every bin, each student's own, on which its performance is measured.
 
@@ -33,12 +43,7 @@ class Probes:
 
     def __init__(self, space: Space, count: int, measure: Measure) -> None:
         self._space, self._count, self.measure = space, count, measure
-        if space.size * count > MANY:
-            warnings.warn(
-                f"{space.size:,} bins with {count} probes each: {space.size * count:,} levels are "
-                "evaluated at every scoring pass; fewer bins, or a lower `probes`, cost less",
-                stacklevel=2,
-            )
+        tell_cost(space, count, "probes")
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 

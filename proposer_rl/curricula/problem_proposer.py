@@ -14,13 +14,13 @@ from torchrl.objectives import ClipPPOLoss
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.bins import BinCounts
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.proposer import learnt_proposer
+from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning.divergence import located, require_finite
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic, draw
-from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, Levels, Space
+from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
 
 
 class ProblemProposer(Curriculum):
@@ -40,6 +40,9 @@ class ProblemProposer(Curriculum):
         settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
             ``entropy_coeff`` and ``max_grad_norm`` count.
         probe_levels: probes C.
+
+    Raises:
+        ValueError: if the space has a single bin.
     """
 
     needs: tuple[str, ...] = ("probe",)
@@ -54,6 +57,7 @@ class ProblemProposer(Curriculum):
         *,
         probe_levels: int = 16,
     ) -> None:
+        refuse_single_bin(space)
         self.agent, self.space, self.target = agent, space, target
         self._settings, self._probe_levels = settings, probe_levels
         actor, _ = agent.readout()

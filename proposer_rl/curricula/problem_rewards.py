@@ -12,9 +12,10 @@ from torch import Tensor
 from proposer_rl.curricula.contract import Batch, Inbox
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.student import Student, TaskStudent
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import Measure
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import Count, Positive, PPOSettings, checked
+from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedCurriculum
+from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
@@ -230,11 +231,6 @@ class ProposerTrainer:
             **{key: float(value) for key, value in training.items()},
             "histogram": proposed.unflatten(0, sides).tolist(),
         }
-
-
-def learnt_proposer(agent: ActorCritic) -> dict[str, Any]:
-    """A Proposer's weights and what it observes, as its curriculum's state has them."""
-    return {"proposer": agent_weights(agent).to_dict(), "observed": agent.in_keys}
 
 
 def explained_share(action: Tensor, rewards: Tensor) -> float | None:

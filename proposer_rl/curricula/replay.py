@@ -16,8 +16,8 @@ One loop with options, which is what the methods differ in:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -42,19 +42,16 @@ from proposer_rl.curricula.buffer import (
     replay_weights,
     rescore,
 )
+from proposer_rl.curricula.children import Children, Edit, Parents, lineage
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.keys import level_keys
-from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
+from proposer_rl.curricula.scores import Scored, Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
-Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
-"""Levels [K, n] after so many small random edits each, student k's from generator k."""
-
-EASY = 4  # parents of a batch of edits, where they are not all of the batch
 SHOWN = 6  # levels of each kind that a reader is shown
 
 
@@ -72,9 +69,8 @@ class ReplayCurriculum(Curriculum):
         synchronous: whether each proposal has one new batch that is scored, and one that is
             replayed; None for yes, unless new levels are trained on.
         edits: of each child; 0 for no children.
-        edit: makes children; see :data:`Edit`.
-        parents: of a batch of children: what was trained on (``batch``), or the four of it with the
-            lowest difference of mean return and mean absolute advantage (``easy``).
+        edit: makes children: levels [K, n] after so many small random edits each.
+        parents: of a batch of children; see :class:`~proposer_rl.curricula.children.Children`.
         renew: whether all scores are renewed before each draw, instead of those of what was trained
             on.
         co_learnability: what is added to the scores of the levels trained on before, for each unit
@@ -102,7 +98,7 @@ class ReplayCurriculum(Curriculum):
         synchronous: bool | None = None,
         edits: Annotated[int, Interval(ge=0, le=1_000_000)] = 0,
         edit: Edit | None = None,
-        parents: Literal["batch", "easy"] = "batch",
+        parents: Parents = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
     ) -> None:
@@ -112,20 +108,16 @@ class ReplayCurriculum(Curriculum):
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
                 "scored, beside every update"
             )
-        if edits and edit is None:
-            raise ArgumentError(
-                f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
-                "set edits=0"
-            )
         if renew and co_learnability:
             raise ArgumentError(
                 f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
                 "before each draw, what is added to them is lost"
             )
+        self._children = Children(edit, edits, parents)
         # Levels are scored aside where they are new and not trained on, edited, or renewed.
-        aside = not train_on_new or edits or renew
+        aside = not train_on_new or self._children or renew
         self.needs = scorer.needs if aside else scorer.asks
-        self.reads = (*scorer.reads, *(("rollout",) if edits and parents == "easy" else ()))
+        self.reads = (*scorer.reads, *self._children.reads)
         self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
         self._capacity, self._warm, self._probability = (
             capacity,
@@ -133,8 +125,7 @@ class ReplayCurriculum(Curriculum):
             replay_probability,
         )
         self._synchronous, self._train_on_new = synchronous, train_on_new
-        self._edits, self._edit, self._parents, self._renew = edits, edit, parents, renew
-        self._co_learnability = co_learnability
+        self._renew, self._co_learnability = renew, co_learnability
         self._template = new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, 0, self._capacity)
@@ -206,8 +197,7 @@ class ReplayCurriculum(Curriculum):
             known = (notes[name] for name in (*SEEN, "before"))
             evidence |= self.scorer.of_outcome(student, outcome, *known)._asdict()
             evidence["reached"] = outcome["return"].float()
-        if self._edits and self._parents == "easy":
-            evidence["easy"] = _easiness(student, outcome)
+        evidence |= self._children.evidence(student, outcome)
         self._came_back["levels"] += notes["replayed"].numel()
         self._came_back["replayed"] += int(notes["replayed"].sum())
         self._inbox.put(batch, **evidence)
@@ -256,12 +246,12 @@ class ReplayCurriculum(Curriculum):
 
     def _take_in(self) -> None:
         """Take in what episodes on levels have shown, and note what remains to be done."""
-        for evidence in self._inbox.take(whole=self._edits > 0 and self._parents == "easy"):
+        for evidence in self._inbox.take(whole=bool(self._children.reads)):
             self._last = evidence.select("level", "place")
             if self.scorer.from_episodes:
                 told = dict(evidence.items())
                 self._take(told, Scored(*(told[name] for name in Scored._fields)), told["reached"])
-            if self._edits or not self.scorer.from_episodes:
+            if self._children or not self.scorer.from_episodes:
                 self._due.append(evidence)
 
     def _finish(self, student: Student, streams: Sequence[Streams]) -> None:
@@ -275,22 +265,10 @@ class ReplayCurriculum(Curriculum):
             if not self.scorer.from_episodes and not known:
                 scored = self._score(student, evidence["level"], streams, "trained", *which)
                 self._take(dict(evidence.items()), scored)
-            if self._edit is None or not self._edits or not bool(replayed.any()):
+            if not self._children or not bool(replayed.any()):
                 continue
-            count = evidence.shape[1]
-            some = torch.arange(count).expand(evidence.shape)
-            if self._parents == "easy":
-                easiest = evidence["easy"].topk(min(EASY, count), -1).indices
-                some = easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
-            slot = evidence["slot"].gather(1, some)
-            parents = levels_at(evidence["level"], some)
-            origin = {
-                "parent": level_keys(parents),
-                "generation": self.buffer["generation"].gather(1, slot) + 1,
-            }
-            children = self._edit(
-                parents, self._edits, [s.generator("edits", *which) for s in streams]
-            )
+            draws = [s.generator("edits", *which) for s in streams]
+            children, origin = self._children.of(evidence, self.buffer["generation"], draws)
             scored = self._score(student, children, streams, "children", *which)
             self._add(children, scored, origin, replayed)
 
@@ -396,37 +374,6 @@ class ReplayCurriculum(Curriculum):
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
             "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
         }
-        if self._edits:
-            shown["the longest line of edits in the buffer"] = _lineage(buffer)
+        if self._children:
+            shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
         return {caption: buffer["level"][which] for caption, which in shown.items()}
-
-
-def _easiness(student: Student, outcome: TensorDictBase) -> Tensor:
-    """Mean absolute advantage minus mean return of levels [K, n]: what "easy" parents have most of.
-
-    Of the published ones, those with the lowest return minus value loss (the authors' code, dcd).
-    """
-    if "rollout" not in outcome.keys():
-        raise ValueError("parents=easy: the outcome has no rollout")
-    rollout = outcome["rollout"]
-    ended = episodes(rollout)
-    loss = Scorer("l1_value_loss", "episodes")
-    lost = loss.of_rollouts(student, [rollout], *unseen(ended.ended.shape)).score
-    return lost - (ended.total / ended.ended.clamp(1)).cpu()
-
-
-def _lineage(buffer: TensorDictBase) -> Tensor:
-    """Slots of a buffer [n] that hold the longest line of levels, each edited from the one before.
-
-    At most the last :data:`SHOWN` of it.
-    """
-    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
-    parents = [place.get(key) for key in buffer["parent"].tolist()]
-    longest: list[int] = []
-    for slot in range(len(parents)):
-        line, parent = [slot], parents[slot]
-        while parent is not None and parent not in line and len(line) < SHOWN:
-            line.append(parent)
-            parent = parents[parent]
-        longest = max(longest, line, key=len)
-    return torch.tensor(longest[::-1])

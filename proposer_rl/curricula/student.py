@@ -34,7 +34,6 @@ from proposer_rl.task import (
     DifferentiableTask,
     EnumerableTask,
     EpisodeLaw,
-    ExactTask,
     Levels,
     OptimalTask,
     Task,
@@ -255,7 +254,7 @@ class TaskStudent(Student):
 
     def _gradient_norms(self, levels: Levels) -> Tensor:
         self.spend(evaluations=levels.shape[-1])
-        self._norms = self._norms or squared_gradients(cast(ExactTask, self._task))
+        self._norms = self._norms or squared_gradients(self._task)
         return self._norms(self._learner, levels)
 
     def _policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
@@ -264,11 +263,13 @@ class TaskStudent(Student):
 
     def _target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
         self.spend(evaluations=levels.shape[-1])
-        return exact_direction(cast(ExactTask, self._task), self._learner, levels, measure)
+        return exact_direction(cast(DifferentiableTask, self._task), self._learner, levels, measure)
 
     def _alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
         self.spend(evaluations=2 * levels.shape[-1])
-        return exact_alignment(cast(ExactTask, self._task), self._learner, direction, levels, step)
+        return exact_alignment(
+            cast(DifferentiableTask, self._task), self._learner, direction, levels, step
+        )
 
     def _sampled_direction(self, rollout: TensorDictBase) -> Direction:
         learner = self._learner

@@ -9,8 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning.losses import ACTED_VALUE
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import ArgumentError, PPOSettings
+from proposer_rl.settings import ArgumentError
 
 
 class Minibatches:

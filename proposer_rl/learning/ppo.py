@@ -35,10 +35,11 @@ from proposer_rl.learning.losses import (
 )
 from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
 from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
-from proposer_rl.settings import ArgumentError, PPOSettings
+from proposer_rl.settings import ArgumentError
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 

@@ -8,9 +8,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning.rollout import set_values
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.models.normalization import Normalization
-from proposer_rl.settings import ArgumentError, PPOSettings
+from proposer_rl.settings import ArgumentError
 
 
 class Statistics:

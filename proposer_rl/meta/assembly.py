@@ -10,6 +10,7 @@ from torch.distributions import Distribution
 from proposer_rl.meta import rewards
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, ProposerSettings
 from proposer_rl.meta.view import SolverView
 from proposer_rl.models import (
     ActorCritic,
@@ -21,7 +22,6 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.settings import MixtureSettings, ProblemSettings, ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 

@@ -15,6 +15,7 @@ the gradient.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -25,7 +26,7 @@ from proposer_rl.learning.snapshot import agent_values
 from proposer_rl.meta.first_order import squared_length, surrogate
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
-from proposer_rl.task import ExactTask, Levels, Task
+from proposer_rl.task import DifferentiableTask, Levels, Task
 
 AT_ONCE = 16
 """Levels: as many networks, their gradients and their activations are in memory."""
@@ -34,19 +35,22 @@ Value = Callable[[ActorCritic, int, Tensor], Tensor]
 """Of m agents in a population, a Solver and the places of m of its levels, int64 [m]: float [m]."""
 
 
-def squared_gradients(task: ExactTask) -> Callable[[PPO, Levels], Tensor]:
+def squared_gradients(task: Task) -> Callable[[PPO, Levels], Tensor]:
     """Makes the function that scores levels by the gradient of their exact return.
+
+    Args:
+        task: a :class:`~proposer_rl.task.DifferentiableTask`.
 
     Returns:
         A function of a learner of K Solvers, which it leaves as it is, and levels [K, n], each to
         be scored for its Solver: float [K, n], without gradients.
     """
-    lengths = level_gradients(task)
+    lengths, exact = level_gradients(task), cast(DifferentiableTask, task)
 
     def score(learner: PPO, levels: Levels) -> Tensor:
         def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
             some = levels[solver, which].unsqueeze(-1)
-            return task.differentiable_performance(agent, some)["return"].squeeze(-1)
+            return exact.differentiable_performance(agent, some)["return"].squeeze(-1)
 
         return lengths(learner, returns, *levels.batch_size)
 

@@ -1,48 +1,25 @@
 """Networks and actor-critics of both agents; they know tensors and no environment."""
 
-from proposer_rl.models.actor_critic import (
-    ActorCritic,
-    categorical,
-    draw,
-    joint_categorical,
-    normal,
-    uniform_noise,
-)
-from proposer_rl.models.maps import cell_logits, cell_maps, map_actor_critic, read_maps
-from proposer_rl.models.memory import MemoryNetwork, memory_actor_critic
-from proposer_rl.models.population import Population, available_cores, use_device
-from proposer_rl.models.proposer import (
-    MapEncoder,
-    MixtureHead,
-    ProblemHead,
-    ProposerNetwork,
-    fourier_encoding,
-    proposer_actor_critic,
-)
-from proposer_rl.models.unet import UNet, orthogonal_
-
-__all__ = [
-    "ActorCritic",
-    "MapEncoder",
-    "MemoryNetwork",
-    "MixtureHead",
-    "Population",
-    "ProblemHead",
-    "ProposerNetwork",
-    "UNet",
-    "available_cores",
-    "categorical",
-    "cell_logits",
-    "cell_maps",
-    "draw",
-    "fourier_encoding",
-    "joint_categorical",
-    "map_actor_critic",
-    "memory_actor_critic",
-    "normal",
-    "orthogonal_",
-    "proposer_actor_critic",
-    "read_maps",
-    "uniform_noise",
-    "use_device",
-]
+from proposer_rl.models.actor_critic import ActorCritic as ActorCritic
+from proposer_rl.models.actor_critic import categorical as categorical
+from proposer_rl.models.actor_critic import draw as draw
+from proposer_rl.models.actor_critic import joint_categorical as joint_categorical
+from proposer_rl.models.actor_critic import normal as normal
+from proposer_rl.models.actor_critic import uniform_noise as uniform_noise
+from proposer_rl.models.maps import cell_logits as cell_logits
+from proposer_rl.models.maps import cell_maps as cell_maps
+from proposer_rl.models.maps import map_actor_critic as map_actor_critic
+from proposer_rl.models.maps import read_maps as read_maps
+from proposer_rl.models.memory import MemoryNetwork as MemoryNetwork
+from proposer_rl.models.memory import memory_actor_critic as memory_actor_critic
+from proposer_rl.models.population import Population as Population
+from proposer_rl.models.population import available_cores as available_cores
+from proposer_rl.models.population import use_device as use_device
+from proposer_rl.models.proposer import MapEncoder as MapEncoder
+from proposer_rl.models.proposer import MixtureHead as MixtureHead
+from proposer_rl.models.proposer import ProblemHead as ProblemHead
+from proposer_rl.models.proposer import ProposerNetwork as ProposerNetwork
+from proposer_rl.models.proposer import fourier_encoding as fourier_encoding
+from proposer_rl.models.proposer import proposer_actor_critic as proposer_actor_critic
+from proposer_rl.models.unet import UNet as UNet
+from proposer_rl.models.unet import orthogonal_ as orthogonal_

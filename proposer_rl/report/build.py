@@ -53,12 +53,7 @@ STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
 def read_checked(
     folders: Sequence[Path], threshold: float | None, baseline: str | None
 ) -> tuple[list[Study], list[str]]:
-    """The studies of the runs in some folders; see :func:`write_report`.
-
-    Raises:
-        UnreadableRun: if a folder has no run, or none can be read.
-        OutputError: if there is no such threshold or baseline.
-    """
+    """The studies of the runs in some folders; see :func:`write_report`."""
     studies, notes = read_studies(find_runs(folders), threshold, baseline)
     labels = sorted({group.label for study in studies for group in study.compared})
     if baseline not in (None, *labels):
@@ -88,14 +83,6 @@ def write_report(
         progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
-
-    Returns:
-        The page.
-
-    Raises:
-        UnreadableRun: if a folder has no run, or none can be read.
-        OutputError: if the output folder holds something that is no report, or there is no such
-            threshold or baseline.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
     studies, notes = read_checked(folders, threshold, baseline)
@@ -127,11 +114,7 @@ def write_report(
 
 
 def check_output(output: Path, *signs: str) -> None:
-    """Refuse a folder with files of somebody else.
-
-    Raises:
-        OutputError: if it is none, or has files but none of those by which ours are known.
-    """
+    """Refuse a folder with files of somebody else."""
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the report")
     occupied = output.is_dir() and any(output.iterdir())

@@ -11,21 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from proposer_rl.report import measures
 from proposer_rl.report.comparisons import Outcome, outcomes
-from proposer_rl.report.measures import (
-    COSTS,
-    UPDATES,
-    Measure,
-    Series,
-    axis_text,
-    gains,
-    level_means,
-    measured,
-    of_levels,
-    own_numbers,
-    trained,
-    worst,
-)
+from proposer_rl.report.measures import Measure, Series, axis_text
 from proposer_rl.report.records import LevelRecord, number, picture
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
@@ -64,17 +52,8 @@ def charts(study: Study) -> dict[str, Json]:
             }
             for group in study.groups
         ],
-        "axes": [UPDATES, *COSTS],
-        "measures": [
-            _measure(study, each)
-            for each in (
-                *measured(study).values(),
-                *trained(study),
-                *gains(study),
-                *own_numbers(study),
-                *worst(study),
-            )
-        ],
+        "axes": [measures.UPDATES, *measures.COSTS],
+        "measures": [_measure(study, each) for each in measures.every(study)],
         "outcomes": _outcomes(study),
         "levels": _levels(study),
         "baseline": [group.label for group in study.groups].index(study.baseline.label),
@@ -101,8 +80,8 @@ def _measure(study: Study, measure: Measure) -> Json:
 def _levels(study: Study) -> list[Json]:
     """What the methods reach on every single level at the end, mean over seeds."""
     every = {
-        name: [level_means(study, group, name) for group in study.groups]
-        for name in of_levels(study)
+        name: [measures.level_means(study, group, name) for group in study.groups]
+        for name in measures.of_levels(study)
     }
     return [
         {

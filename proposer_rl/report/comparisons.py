@@ -10,20 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from proposer_rl.report import statistics
 from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import (
-    ERROR,
-    FEWEST,
-    Estimate,
-    Interval,
-    balanced,
-    difference_of,
-    holm,
-    mean_of,
-    median_interval,
-    seeds_needed,
-)
+from proposer_rl.report.statistics import Estimate, Interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.columns import is_rate
 
@@ -57,7 +47,7 @@ class Outcome(NamedTuple):
     def median(self, group: Group) -> Interval | None:
         """Their median with its interval; None without any."""
         values = self.values(group)
-        return median_interval(values) if values else None
+        return statistics.median_interval(values) if values else None
 
 
 class Decision(NamedTuple):
@@ -124,17 +114,17 @@ def _difference(*known: list[tuple[int, float]]) -> Estimate:
     seeds, others = ([seed for seed, _ in pairs] for pairs in known)
     paired = seeds == others and len(set(seeds)) == len(seeds)
     a, b = ([value for _, value in pairs] for pairs in known)
-    return difference_of(a, b, paired)
+    return statistics.difference_of(a, b, paired)
 
 
 def learnt(group: Group, name: str, updates: float) -> bool:
     """Whether a measurement is shown to have grown by then, a rate by more than :data:`ALIKE`."""
     gains = np.array([run.at(name, updates) - run.metrics[name].iloc[0] for run in group.runs])
     known = gains[~np.isnan(gains)]
-    if len(known) < FEWEST:
+    if len(known) < statistics.FEWEST:
         return False
-    found = mean_of(known)
-    low = found.value if math.isnan(found.error) else found.interval(1 - 2 * ERROR).low
+    found = statistics.mean_of(known)
+    low = found.value if math.isnan(found.error) else found.interval(1 - 2 * statistics.ERROR).low
     return low > (ALIKE if is_rate(name) else 0)
 
 
@@ -151,7 +141,7 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
     known = {group.label: outcome.known(group) for group in study.compared}
     pairs = list(combinations(study.compared, 2))
     found = [_difference(known[one.label], known[other.label]) for one, other in pairs]
-    corrected = holm([one.p for one in found])
+    corrected = statistics.holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
     return {
         (one.label, other.label): _decide(study, (one, other), known, estimate, p, count)
@@ -169,16 +159,16 @@ def _decide(
 ) -> Decision:
     values = [[value for _, value in known[group.label]] for group in pair]
     runs = [len(own) for own in values]
-    if min(runs) < FEWEST:
-        text = f"{runs[0]} and {runs[1]} seeds, and it takes {FEWEST} of each"
+    if min(runs) < statistics.FEWEST:
+        text = f"{runs[0]} and {runs[1]} seeds, and it takes {statistics.FEWEST} of each"
         return Decision(None, TOO_FEW, p, text)
     if math.isnan(p):
         return Decision(None, UNDECIDED, p, "no spread between the runs")
     text = f"p = {p:.2g} after correction for {count} comparisons"
-    if p > ERROR:
+    if p > statistics.ERROR:
         if runs[0] != runs[1]:
-            estimate = balanced(*values)
-        needed = seeds_needed(estimate, min(runs), ERROR / count)
+            estimate = statistics.balanced(*values)
+        needed = statistics.seeds_needed(estimate, min(runs), statistics.ERROR / count)
         more = f", about {needed:,} seeds each would decide it" if needed else ""
         return Decision(None, UNDECIDED, p, text + more, needed)
     winner = pair[0] if estimate.value > 0 else pair[1]

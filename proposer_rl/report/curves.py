@@ -11,20 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
+from proposer_rl.report import measures
 from proposer_rl.report.comparisons import waiting_outcome
-from proposer_rl.report.measures import (
-    TRAINED,
-    Measure,
-    Series,
-    gains,
-    level_means,
-    measured,
-    of_levels,
-    own_numbers,
-    trained,
-    worst,
-    worst_tenths,
-)
+from proposer_rl.report.measures import TRAINED, Measure, Series
 from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST, HELD, median_of
 from proposer_rl.report.studies import Group, Study
@@ -48,7 +37,7 @@ SELECTION = {
 
 def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
-    every = measured(study)
+    every = measures.measured(study)
     panels = [_panel(study, every[name]) for name in study.measurements[:MOST_PANELS]]
     return Drawing(
         "learning_curves",
@@ -66,7 +55,7 @@ def learning_curves(study: Study) -> Drawing:
 
 def cost_curves(study: Study) -> Drawing:
     """The headline against updates and every cost, the curriculum's part included."""
-    measure = measured(study)[study.headline]
+    measure = measures.measured(study)[study.headline]
     seconds = (
         "Seconds: of the whole process, evaluation included; where seeds were trained together, "
         "an even share. Seconds can be compared only between runs on equal machines."
@@ -89,15 +78,15 @@ def cost_curves(study: Study) -> Drawing:
 
 def level_by_level(study: Study) -> Drawing | None:
     """Every method against the baseline on each level; None where there are no two."""
-    names = of_levels(study)
+    names = measures.of_levels(study)
     name = study.headline if study.headline in names else next(iter(names), None)
-    if name is None or level_means(study, study.baseline, name) is None:
+    if name is None or measures.level_means(study, study.baseline, name) is None:
         return None
     known = [
         (float(means.mean()), group)
         for group in study.groups
         if group.label != study.baseline.label
-        and (means := level_means(study, group, name)) is not None
+        and (means := measures.level_means(study, group, name)) is not None
     ]
     if not known:
         return None
@@ -150,7 +139,7 @@ def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str) 
 
 def _draw_scatter(figure: FigureBase, study: Study, group: Group, name: str) -> None:
     axes: Axes = axes_of(figure)
-    x, y = (level_means(study, each, name) for each in (study.baseline, group))
+    x, y = (measures.level_means(study, each, name) for each in (study.baseline, group))
     assert x is not None and y is not None  # or there would be no panel
     ends = (0.0, 1.0) if is_rate(name) else (min(x.min(), y.min()), max(x.max(), y.max()))
     axes.plot(ends, ends, color="0.4", linewidth=0.8)
@@ -195,7 +184,7 @@ def _of_measures(
     name: str,
     title: str,
     caption: str,
-    measures: Callable[[Study], Iterable[Measure]],
+    drawn: Callable[[Study], Iterable[Measure]],
     columns: int = 3,
     size: tuple[float, float] = PANEL,
 ) -> Callable[[Study], Drawing | None]:
@@ -207,7 +196,7 @@ def _of_measures(
 
     def draw(study: Study) -> Drawing | None:
         panels, shown = [], set()
-        for measure in measures(study):
+        for measure in drawn(study):
             series = next(iter(measure.axes.values()))
             having = {group.label for group in study.groups if series(group) is not None}
             if having:
@@ -230,7 +219,7 @@ worst_levels = _of_measures(
     "The worst tenth of the {levels} (CVaR)",
     "Mean over the 10 % of the {levels} where the Solver is worst at that moment: a policy that "
     "gives up on hard ones shows here first.",
-    worst_tenths,
+    measures.worst_tenths,
     2,
 )
 worst_curves = _of_measures(
@@ -239,7 +228,7 @@ worst_curves = _of_measures(
     "Mean over the share of the {levels} where a Solver is worst, after {horizon} updates: at "
     "100 % the mean over all. Each seed has worst levels of its own. Lines: median over seeds, "
     "with bands as above. {selection}",
-    worst,
+    measures.worst,
     2,
 )
 difficulty = _of_measures(
@@ -247,14 +236,14 @@ difficulty = _of_measures(
     "What the Solver trained on",
     "Statistics of the task over the batch of each evaluated update: means, or where a name says "
     "so standard deviations (sd). Lines and bands as above.",
-    trained,
+    measures.trained,
 )
 gains_of_replicas = _of_measures(
     "gains",
     "Total gain of the replicas in each cycle (the paper's Figure 4)",
     "The total gain on the target of the replicas over one meta-episode: maximum and mean over a "
     "cycle's replicas. Lines and bands as above.",
-    gains,
+    measures.gains,
     2,
 )
 diagnostics = _of_measures(
@@ -263,6 +252,6 @@ diagnostics = _of_measures(
     "Per cycle, median and interval over seeds; of a list of numbers its mean. Total gain, mean "
     "over standard deviation between the replicas: where it is large, all replicas gain alike "
     "whatever they are proposed, and there is little to learn from.",
-    own_numbers,
+    measures.own_numbers,
     size=SMALL,
 )

@@ -71,6 +71,12 @@ class Measure(NamedTuple):
     log: bool = False
 
 
+def every(study: Study) -> list[Measure]:
+    """All that can be drawn of a study."""
+    solver, curricula = [*measured(study).values(), *trained(study)], gains(study)
+    return [*solver, *curricula, *own_numbers(study), *worst(study)]
+
+
 def measured(study: Study) -> dict[str, Measure]:
     """What was measured of the Solver against updates and every cost, by its column."""
     first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]

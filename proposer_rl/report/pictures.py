@@ -106,11 +106,7 @@ def _in_rows(
 
 
 def draw_run(folder: Path, title: str) -> Path:
-    """One picture of a run: what was measured on every distribution, and levels trained on.
-
-    Returns:
-        The file, ``run.png`` in the folder.
-    """
+    """Draw ``run.png`` of a run: what was measured on every distribution, and levels trained on."""
     runs = read_run(folder)
     height = (SIDE + 0.15) * BATCH + 0.4
     with rc_context(SETTINGS):
@@ -186,14 +182,7 @@ def heat_maps(study: Study) -> Drawing | None:
 
 
 def last_map(folder: Path) -> NDArray[np.uint8] | None:
-    """The heat map of a running experiment's last cycle as pixels, uint8 [H, W, 3].
-
-    Returns:
-        None if its proposals were not recorded.
-
-    Raises:
-        UnreadableRun: if the folder is none of a run.
-    """
+    """The heat map of a run's last cycle, uint8 [H, W, 3]; None without recorded proposals."""
     run = read_run(folder)[0]
     shares = run.shares(run.cycles[-1]) if run.cycles else None
     if shares is None:

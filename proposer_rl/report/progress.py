@@ -79,11 +79,7 @@ def read_progress(folder: Path) -> Progress:
 
 
 def find_progress(folder: Path) -> list[Progress]:
-    """The states of all runs in a folder, or of the folder itself.
-
-    Raises:
-        UnreadableRun: if there is no such folder, or no run in it.
-    """
+    """The states of all runs in a folder, or of the folder itself."""
     found = [read_progress(path) for path, _ in begun(folder)]
     if not found:
         raise UnreadableRun(f"{folder}: no run in it, finished or begun")
@@ -156,9 +152,6 @@ def left(folder: Path, planned: Sequence[Sequence[str]]) -> Left | None:
 
     A run takes as long as the mean of the finished ones that differ from it in the seed alone, or
     else of all; of one that goes on that is the whole.
-
-    Raises:
-        UnreadableRun: if there is no such folder.
     """
     if not planned:
         return None

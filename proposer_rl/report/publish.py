@@ -36,10 +36,6 @@ def publish(folders: Sequence[Path], output: Path) -> tuple[int, list[str]]:
 
     Returns:
         How many runs were written, and a line for each that was left out.
-
-    Raises:
-        UnreadableRun: if a folder has no run, or one cannot be read.
-        OutputError: if the output folder holds something else, or two runs have one name.
     """
     occupied = output.is_dir() and any(output.iterdir()) and not (output / STUDY).is_file()
     if (output.exists() and not output.is_dir()) or occupied:

@@ -1,4 +1,7 @@
-"""Runs are read from their folders, or from a study's tables: nothing in either is trusted."""
+"""Runs are read from their folders, or from a study's tables: nothing in either is trusted.
+
+Whatever is not as it should be raises :class:`UnreadableRun`, which names the folder and the file.
+"""
 
 from __future__ import annotations
 
@@ -50,11 +53,7 @@ class OutputError(ValueError):
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of runs and of studies: those given, or else those found within them.
-
-    Raises:
-        UnreadableRun: if a folder is none, or there is no run in it.
-    """
+    """Folders of runs and of studies: those given, or else those found within them."""
     found: list[Path] = []
     for folder in folders:
         inside = [
@@ -75,9 +74,6 @@ def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
     """Folders of runs in a folder, or itself, with names of their files; studies are left out.
 
     Links are not followed, hidden folders not looked into.
-
-    Raises:
-        UnreadableRun: if there is no such folder, or there are too many in it.
     """
     return ((path, files) for path, files in _walk(folder) if STUDY not in files)
 
@@ -97,11 +93,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
 
 
 def read_run(folder: Path) -> list[Run]:
-    """All seeds of a run's folder, or all runs of a study.
-
-    Raises:
-        UnreadableRun: naming the file that is missing, too large, or not what it should be.
-    """
+    """All seeds of a run's folder, or all runs of a study."""
     try:
         if (folder / STUDY).exists():
             return _read_study(folder)

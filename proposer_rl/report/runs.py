@@ -123,7 +123,7 @@ class Run:
 
     def last(self, name: str) -> float:
         """The last value of a column of the measurements."""
-        return float(self.metrics[name].iloc[-1])
+        return float(self.columns[name][-1])
 
     def until(self, horizon: int) -> Run:
         """The run as it was after so many updates, measurements linear between evaluations.
@@ -149,7 +149,8 @@ class Run:
 
     def reached(self, measurement: str, threshold: float) -> float:
         """Updates until a measurement first reached a threshold; NaN where it never did."""
-        return float(self.metrics["updates"][self.metrics[measurement] >= threshold].min())
+        found = self.columns["updates"][self.columns[measurement] >= threshold]
+        return float(found.min()) if found.size else math.nan
 
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
         """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.

@@ -54,12 +54,7 @@ def write_scores(scores: Iterable[Score]) -> bytes:
 
 
 def read_scores(file: Path) -> list[Score]:
-    """Scores as ``bin/eval`` writes them for several runs.
-
-    Raises:
-        UnreadableRun: if the file holds something else.
-        StorageError: if it cannot be read.
-    """
+    """Scores as ``bin/eval`` writes them for several runs."""
     try:
         rows = csv.DictReader(io.StringIO(read_bounded(file, LARGEST_FILE).decode()))
         return [
@@ -85,11 +80,7 @@ def stored_name(levels: str) -> str:
 
 
 def check_names(runs: Iterable[Run]) -> None:
-    """Scores know runs by the names of their folders: refuse two that they would take for one.
-
-    Raises:
-        UnreadableRun: naming both.
-    """
+    """Scores know runs by the names of their folders: refuse two that they would take for one."""
     found: dict[tuple[str, int, int], Path] = {}
     for run in runs:
         other = found.setdefault((run.folder.name, run.seed, run.updates), run.folder)

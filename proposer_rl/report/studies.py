@@ -131,11 +131,7 @@ class Study:
         return next((group for group in found if group is not None), self.compared[0])
 
     def scores(self, group: Group, name: str) -> Column | None:
-        """What a group's runs of full length reach on each level, [runs, levels].
-
-        Returns:
-            None where no run tells.
-        """
+        """What a group's runs of full length reach on each level, [runs, levels]; else None."""
         rows = [run.levels[name] for run in self.tellers(group, name)]
         return np.array(rows) if rows else None
 
@@ -160,9 +156,6 @@ def read_studies(
 
     Returns:
         The studies, the largest first, and a line for each folder that was left out.
-
-    Raises:
-        UnreadableRun: if no run could be read.
     """
     runs: list[Run] = []
     notes: list[str] = []

@@ -92,11 +92,7 @@ def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
 
 
 def read_table(file: Path) -> pd.DataFrame:
-    """A table of a study, its cells as text; NaN where one is empty.
-
-    Raises:
-        ValueError: if it is none, or too large.
-    """
+    """A table of a study, its cells as text; NaN where one is empty."""
     if file.is_symlink():
         raise ValueError(f"{file.name} is not a plain file")
     content = read_bounded(file, LARGEST_FILE)

@@ -97,12 +97,7 @@ class RunFolder:
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
-        """Writes a JSON file; whoever reads it sees the old content or the new, never a part.
-
-        Raises:
-            ValueError: if the value cannot be written as JSON.
-            StorageError: if the disk does not take it.
-        """
+        """Writes a JSON file; whoever reads it sees the old content or the new, never a part."""
         path = self.path / name
         write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
 
@@ -116,15 +111,7 @@ class RunFolder:
 
 
 def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
-    """Reads a ``.csv`` table of a run's folder.
-
-    Returns:
-        One mapping per complete row, its values as they were given to :meth:`RunFolder.append`.
-
-    Raises:
-        FileNotFoundError: if there is no such table.
-        ValueError: if a line is not a row of the table.
-    """
+    """The complete rows of a ``.csv`` table, as they were given to :meth:`RunFolder.append`."""
     rows: list[dict[str, Number]] = []
     lines = _lines(Path(path))
     header = next(lines, ("", ""))[1].split(",")
@@ -137,15 +124,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
 
 
 def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
-    """Reads a ``.jsonl`` table of a run's folder.
-
-    Returns:
-        One mapping per complete row.
-
-    Raises:
-        FileNotFoundError: if there is no such table.
-        ValueError: if a line is not a JSON object.
-    """
+    """The complete rows of a ``.jsonl`` table; a ValueError for a line that is no JSON object."""
     rows = []
     for place, line in _lines(Path(path)):
         try:

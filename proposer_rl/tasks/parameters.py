@@ -16,6 +16,7 @@ SEED = "seed"
 LARGEST_SEED = 2**31 - 1
 STEP = 0.1  # standard deviation of an edit, as a share of a range
 MOST_BINS = 256  # along an axis; readers of runs take no more
+MOST_COMBINATIONS = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,9 @@ class ParameterSpace:
         seeds: that they are drawn from.
         device: of the levels.
 
+    Raises:
+        ValueError: if int64 cannot count the combinations of bins.
+
     Example:
         >>> space = ParameterSpace({"gravity": points([5, 10]), "force": intervals(2.0, 18.0, 4)})
         >>> space.size, list(space.sample(3, torch.Generator()).keys())
@@ -186,6 +190,11 @@ class ParameterSpace:
         self._device = torch.device(device)
         self.axes = {name: part.middles for name, part in self.bins.items()}
         self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
+        if self.size > MOST_COMBINATIONS:
+            raise ValueError(
+                f"parameters: {self.size:,} combinations of their bins, more than can be numbered; "
+                "leave out bins where a method needs none"
+            )
 
     @property
     def coordinates(self) -> Tensor:
@@ -215,7 +224,8 @@ class ParameterSpace:
     def shares(self, other: ParameterSpace) -> Tensor:
         """Which of these bins the levels of another distribution lie in, float [N]."""
         parts = [self.bins[name].shares(bins) for name, bins in other.bins.items()]
-        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts).float()
+        none = torch.ones(1, dtype=torch.float64)
+        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts, none).float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
         sizes = [len(values) for values in self.axes.values()]

@@ -2,13 +2,14 @@
 
 # Annotations are objects here, not texts: settings of other modules inherit the fields.
 import re
+import warnings
 from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any
 
+import scipy  # which loads its statistics, a second of work, where they are asked for
 import torch
 from annotated_types import Ge, Le, Len
-from scipy import stats
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError, Positive, arguments, settings
@@ -38,7 +39,7 @@ class RangeSettings:
     Attributes:
         values: rising; whole numbers, if all are.
         low, high, bins: of a range.
-        target: what is to be mastered: a number; of ``values`` also several, equally likely; of a
+        target: what is to be mastered: a number; of ``values`` one or several, equally likely; of a
             range also [from, to]. Or a mapping: :class:`WeightedPoints`, or a ``distribution`` of
             :mod:`scipy.stats` by its name, with its arguments.
     """
@@ -85,6 +86,8 @@ class RangeSettings:
         kind, single = self.space_bins().low.dtype, points(values, key).low
         if kind == torch.int64 and single.dtype != kind:
             raise ValueError(f"{key}={values} must be whole, as values={self.values} are")
+        if self.values is not None and set(values) - set(self.values):
+            raise ValueError(f"{key}={values}: must be among values={self.values}")
         return Bins(single.to(kind), single.to(kind))
 
     def _law(self, distribution: str | None = None, **given: Any) -> Law:
@@ -159,13 +162,26 @@ def spaces(
             bins[name], target[name] = given.space_bins(), given.target_bins()
         except ValueError as error:
             raise ValueError(f"parameters.{name}: {error}") from error
+        if _inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
+            warnings.warn(
+                f"parameters.{name}: most of the target, {target[name]}, lies outside of "
+                f"low={given.low:g} to high={given.high:g}: is that meant?",
+                stacklevel=2,
+            )
     return ParameterSpace(bins, **seeds), ParameterSpace(target, **seeds)
+
+
+def _inside(target: Bins, space: Bins) -> float:
+    """How much of a target lies within the ends of a space."""
+    low, high = space.low[:1].double(), space.high[-1:].double()
+    below = torch.nextafter(low, low - 1)
+    return float(target.below(high) - target.below(below))
 
 
 def _named(name: str, given: Mapping[str, Any], low: Tensor, high: Tensor) -> Law:
     """A continuous distribution of scipy's within a range."""
-    kind = getattr(stats, str(name), None)
-    if not isinstance(kind, stats.rv_continuous):
+    kind = getattr(scipy.stats, str(name), None)
+    if not isinstance(kind, scipy.stats.rv_continuous):
         raise ValueError(
             f"target.distribution={name}: must be a continuous distribution of scipy.stats, such "
             "as norm, uniform or loguniform"

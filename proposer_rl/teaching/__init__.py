@@ -1,24 +1,12 @@
 """Curricula in loops of one's own: a teacher, spaces of levels, TorchRL, Gymnasium, data sets."""
 
-from __future__ import annotations
-
-from proposer_rl.teaching.abilities import ActorStudent
-from proposer_rl.teaching.gymnasium import TaughtEnv
-from proposer_rl.teaching.remote import TeacherClient
-from proposer_rl.teaching.sampler import TeacherSampler
-from proposer_rl.teaching.spaces import Items, LevelGenerator, LevelSpace, Parameters
-from proposer_rl.teaching.teacher import Teacher
-from proposer_rl.teaching.torchrl import LevelTransform
-
-__all__ = [
-    "ActorStudent",
-    "Items",
-    "LevelGenerator",
-    "LevelSpace",
-    "LevelTransform",
-    "Parameters",
-    "TaughtEnv",
-    "Teacher",
-    "TeacherClient",
-    "TeacherSampler",
-]
+from proposer_rl.teaching.abilities import ActorStudent as ActorStudent
+from proposer_rl.teaching.gymnasium import TaughtEnv as TaughtEnv
+from proposer_rl.teaching.remote import TeacherClient as TeacherClient
+from proposer_rl.teaching.sampler import TeacherSampler as TeacherSampler
+from proposer_rl.teaching.spaces import Items as Items
+from proposer_rl.teaching.spaces import LevelGenerator as LevelGenerator
+from proposer_rl.teaching.spaces import LevelSpace as LevelSpace
+from proposer_rl.teaching.spaces import Parameters as Parameters
+from proposer_rl.teaching.teacher import Teacher as Teacher
+from proposer_rl.teaching.torchrl import LevelTransform as LevelTransform

@@ -10,15 +10,10 @@ from importlib import import_module
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
+from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, filtered, modelled
 from proposer_rl.recipes import Recipe, available, file_settings, recipe_function, yaml_file
-from proposer_rl.settings import (
-    ArgumentError,
-    FilterSettings,
-    ModelSettings,
-    ProposerSettings,
-    arguments,
-)
+from proposer_rl.settings import ArgumentError, arguments
 
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # to another setting, as the files have them
 MODEL = "/source/model@_global_"  # likewise, a filter's file
@@ -59,9 +54,8 @@ def make_curriculum(
         on_model = MODEL in yaml_file(f"filter/{filter}").get("defaults", ())
         filter = file_settings("filter", filter) or None
     if filter is not None:
-        arguments(FilterSettings, filter)
-    curriculum = filtered(curriculum, None if filter is None else FilterSettings(**filter))
-    return modelled(curriculum, space, ModelSettings() if on_model else None)
+        curriculum = filtered(curriculum, **filter)
+    return modelled(curriculum, space) if on_model else curriculum
 
 
 def _made(recipe: Recipe, space: Any, seeds: Sequence[int]) -> Curriculum:

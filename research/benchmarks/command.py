@@ -14,8 +14,7 @@ from typing import Any, NoReturn
 
 import torch
 
-from proposer_rl.cli.config import ConfigError
-from proposer_rl.cli.errors import SIGNALLED
+from proposer_rl.cli.errors import SIGNALLED, ConfigError
 from proposer_rl.runs.folder import write_atomically
 from research.benchmarks.curricula import read_methods
 from research.benchmarks.gymnasium import ENVIRONMENTS

@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.continued import ContinuedLevels
-from proposer_rl.recipes import override_value
+from proposer_rl.recipes import CONFIG_FOLDER, override_value
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams

@@ -16,6 +16,7 @@ from research.benchmarks.learning import learning_curves
 from research.benchmarks.levels import generation, shortest_paths
 from research.benchmarks.meta import memory, meta_step
 from research.benchmarks.placement import throughput
+from research.benchmarks.processes import in_processes
 from research.benchmarks.results import Options, Result
 from research.benchmarks.solver import against_plain, in_both_precisions, overhead, population
 from research.benchmarks.teacher import teacher_calls
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "levels": Benchmark("levels generated per second", generation),
     "shortest_paths": Benchmark("shortest paths against networkx and scipy", shortest_paths),
     "environment": Benchmark("environment steps against Gymnasium", environment_steps),
+    "processes": Benchmark("environments of Gymnasium in several processes", in_processes),
     "view": Benchmark("steps in the view maze against MiniGrid", view_steps),
     "view_training": Benchmark("training in the view maze, beside jaxued's PPO", view_training),
     "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),

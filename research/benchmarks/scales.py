@@ -16,8 +16,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from proposer_rl.cli.build import Made, build, make_task, parts
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.learning import PPO
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams

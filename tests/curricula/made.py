@@ -28,6 +28,8 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
+from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (
     ActorCritic,
@@ -36,7 +38,6 @@ from proposer_rl.models import (
     categorical,
     proposer_actor_critic,
 )
-from proposer_rl.settings import PPOSettings, ProposerSettings
 from proposer_rl.streams import Streams
 from tests.tiny import TASK
 

@@ -22,10 +22,11 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.continued import ContinuedLevels
-from proposer_rl.experiment import Experiment
+from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.settings import ArgumentError, PPOSettings, ScheduleSettings, SolverSettings
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer

@@ -7,14 +7,13 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl import curricula
-from proposer_rl.cli.places import CONFIG_FOLDER
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
@@ -28,8 +27,9 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.student import ABILITIES
 from proposer_rl.learning import PPO
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
-from tests.curricula.living import live, solvers
+from tests.curricula.living import Lived, live, solvers
 from tests.curricula.made import LEARNED, MADE, SPACE, Make, P, replay
 from tests.tiny import TASK, mountain_cars, tiny_view_task
 
@@ -44,29 +44,38 @@ SCORES = {
 REMEMBER = [name for name in EVERY if name not in SCORES]
 
 
+class Past(NamedTuple):
+    """A life of some updates: the state after it, and who goes on from there."""
+
+    state: bytes
+    snapshot: TensorDict
+    life: Lived
+    curriculum: Curriculum
+    learner: PPO
+
+
 @functools.cache
-def lived(name: str) -> tuple[bytes, TensorDict, Curriculum, PPO]:
-    """State and Solver after some updates, and both themselves, for the one test that goes on."""
-    curriculum, learner = EVERY[name](), solvers([0])
-    live(curriculum, learner, [0], range(4))  # long enough to fit, replay and score
+def lived(name: str) -> Past:
+    curriculum, learner = EVERY[name](), solvers([3])
+    life = live(curriculum, learner, [3], range(4))  # long enough to fit, replay and score
     file = io.BytesIO()
     torch.save(curriculum.state_dict(), file)
-    return file.getvalue(), learner.snapshot(), curriculum, learner
+    return Past(file.getvalue(), learner.snapshot(), life, curriculum, learner)
 
 
 def resumed(name: str) -> tuple[Curriculum, PPO]:
-    state, snapshot, _, _ = lived(name)
+    before = lived(name)
     curriculum, learner = EVERY[name](), solvers([5])
-    curriculum.load_state_dict(torch.load(io.BytesIO(state), weights_only=True))
-    learner.restore(snapshot)
+    curriculum.load_state_dict(torch.load(io.BytesIO(before.state), weights_only=True))
+    learner.restore(before.snapshot)
     return curriculum, learner
 
 
 @pytest.mark.parametrize("name", REMEMBER)
 def test_restored_from_a_file_it_goes_on_as_if_nothing_had_happened(name: str) -> None:
     again = resumed(name)
-    whole = lived(name)[2:]
-    expected, found = (live(*each, [0], range(4, 7)) for each in (whole, again))
+    whole = lived(name).curriculum, lived(name).learner
+    expected, found = (live(*each, [3], range(4, 6)) for each in (whole, again))
     for one, other in zip(expected.levels, found.levels, strict=True):
         assert (one == other).all()
     assert (expected.frames, expected.evaluations) == (found.frames, found.evaluations)
@@ -74,6 +83,7 @@ def test_restored_from_a_file_it_goes_on_as_if_nothing_had_happened(name: str) -
         one.pop("levels", None), other.pop("levels", None)
         assert one == other
     assert (again[1].snapshot() == whole[1].snapshot()).all()
+    assert same(again[0].state_dict(), whole[0].state_dict())
 
 
 ALONE = [name for name in REMEMBER if name in MADE and name not in ("robust", "mixed")]
@@ -82,8 +92,8 @@ ALONE = [name for name in REMEMBER if name in MADE and name not in ("robust", "m
 @pytest.mark.parametrize("name", ALONE)
 def test_each_student_lives_as_if_alone(name: str) -> None:
     """Several Solvers in one population get what each would get alone."""
-    both = live(MADE[name](), solvers([3, 4]), [3, 4], range(4))
-    alone = live(MADE[name](), solvers([4]), [4], range(4))
+    both = live(MADE[name](), solvers([4, 3]), [4, 3], range(4))
+    alone = lived(name).life
     for together, one in zip(both.levels, alone.levels, strict=True):
         assert (together[1] == one[0]).all()
     assert both.frames == alone.frames and both.evaluations == alone.evaluations

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.exact_scores import expected_best, return_variance
 from proposer_rl.curricula.scores import Scored, Scorer, unseen
-from proposer_rl.settings import PPOSettings, SolverSettings
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import EpisodeLaw, NoSuccessError
 from proposer_rl.tasks.mazes import Level

@@ -127,15 +127,31 @@ def test_a_mixture_is_not_filtered() -> None:
 
 def test_what_bins_cost_or_lack_is_told_first() -> None:
     one, many = (ParameterSpace({"x": intervals(0.0, 1.0, count)}) for count in (1, 5000))
-    for make in (LearningProgressCurriculum, Mixture):
+    draws = partial(
+        FirstOrderProposer, target=TARGET, agent=problem_agent(), settings=SETTINGS
+    )  # and PAIRED's generator, its twin
+    seeds, rounded = ParameterSpace({}), partial(MixtureCurriculum, refit=64, warmup=64)
+    makers: list[Callable[..., Any]] = [LearningProgressCurriculum, Mixture, draws]
+    for make in (
+        *(partial(maker, one) for maker in makers),
+        partial(rounded, seeds, rounded=False),
+    ):
         with pytest.raises(
             ValueError, match=r"^the space has a single bin, so there is nothing to"
         ):
-            make(one)
+            make()
+    with pytest.raises(ArgumentError, match=r"rounded=true: .* its axes bins, or rounded=false"):
+        rounded(one)
+    rounded(one, rounded=False)
+    assert seeds.shares(seeds).tolist() == [1.0]
     with pytest.raises(ArgumentError, match="5,000 bins: at most 4,096"):
         TransportCurriculum(many, torch.ones(5000))
     with pytest.warns(UserWarning, match="5,000 bins with 16 probes each: 80,000 levels"):
         LearningProgressCurriculum(many)
+    with pytest.warns(UserWarning, match="5,000 bins with 8 candidates each: 40,000 levels"):
+        FirstOrderCurriculum(many, many)
+    with pytest.raises(ValueError, match=r"parameters: .* combinations of their bins"):
+        ParameterSpace({str(axis): intervals(0.0, 1.0, 256) for axis in range(8)})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         LearningProgressCurriculum(many, source="episodes")  # which plays none for it

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.config import ConfigError
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import ReplayCurriculum, Scorer, TaskStudent, outcome_of
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (
@@ -20,7 +20,7 @@ from proposer_rl.curricula.buffer import (
     level_keys,
     score_weights,
 )
-from proposer_rl.curricula.replay import _easiness, _lineage
+from proposer_rl.curricula.children import _easiness, lineage
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.signals import StopSignals
@@ -162,7 +162,7 @@ def test_the_lineage_is_the_longest_line_of_edits() -> None:
     buffer["key"] = torch.tensor([1, 2, 3, 4, 5, 6])
     buffer["parent"] = torch.tensor([3, 0, 2, 1, 99, 5])  # 2 > 3 > 1 > 4, and 5 > 6
     buffer["generation"] = torch.tensor([2, 0, 1, 3, 7, 8])
-    assert _lineage(buffer).tolist() == [1, 2, 0, 3]
+    assert lineage(buffer, 6).tolist() == [1, 2, 0, 3]
 
 
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:

@@ -13,8 +13,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from proposer_rl.curricula.transport import TransportCurriculum, step_towards
+from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, currot
-from proposer_rl.settings import ProposerSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings

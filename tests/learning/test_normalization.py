@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import PPO
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.learning.snapshot import agent_weights, load_agent
 from proposer_rl.meta.gradient_norms import level_gradients
 from proposer_rl.models.normalization import LARGEST, RunningMoments
-from proposer_rl.settings import ArgumentError, PPOSettings, SolverSettings
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import tiny_task

@@ -11,6 +11,7 @@ from torch import nn
 from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
 
 from proposer_rl.learning import PPO, LeaveOneOutBaseline
+from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.actions import ProblemChoices
 from proposer_rl.models import (
     MixtureHead,
@@ -20,7 +21,6 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.settings import PPOSettings
 from proposer_rl.streams import Streams
 from tests.skill_ladder import any_mixture, best_constant, best_sequence, even, ladder_env
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from proposer_rl.cli.config import methods
+from proposer_rl.recipes import available
 from proposer_rl.report.style import (
     DASHES,
     FURTHER,
@@ -51,7 +51,7 @@ def test_methods_can_be_told_apart(vision: str | None) -> None:
 
 
 def test_every_method_has_a_look_of_its_own() -> None:
-    found = looks([*methods(), *(f"further_{i}" for i in range(16))])
+    found = looks([*available("method"), *(f"further_{i}" for i in range(16))])
     assert len(set(found.values())) == len(found)
 
 

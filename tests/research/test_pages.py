@@ -14,7 +14,7 @@ import pytest
 from scipy import integrate, stats
 
 from proposer_rl.cli.help import needs
-from proposer_rl.cli.places import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.scores import (

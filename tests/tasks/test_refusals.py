@@ -19,6 +19,10 @@ VIEWS = ["task=view_maze_smoke", "compute.progress=false"]
     [
         ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
         ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
+        (
+            [*CARS, "+method=plr", "compute.collector=multiprocess"],
+            "leave compute.collector=single; task.vectorization=async spreads one Solver's env",
+        ),
         ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
         (
             [*VIEWS, "+method=first_order_gain"],

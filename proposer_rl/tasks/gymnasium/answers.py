@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 
 class UnfitEnvironmentError(ValueError):
@@ -93,6 +94,62 @@ def flag(value: Any, what: str) -> bool:
     raise UnfitEnvironmentError(f"{what} must be true or false, not {_what(value)}")
 
 
+def check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
+    """Refuse an observation that would be read as another than it is.
+
+    A number beyond its bounds is not: nothing here depends on them.
+
+    Args:
+        space: of observations.
+        seen: one of them.
+        by: what has shown it.
+
+    Raises:
+        UnfitEnvironmentError: saying what it is, and the space.
+    """
+    line = _unlike(space, seen)
+    if line is not None:
+        raise UnfitEnvironmentError(f"{by} shows {line}; its observation space is {space}")
+
+
+def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
+    if isinstance(space, spaces.Dict):
+        if not isinstance(seen, Mapping) or seen.keys() != space.spaces.keys():
+            return f"{_short(seen)} instead of the entries {', '.join(space.spaces)}"
+        return next(filter(None, (_unlike(s, seen[k]) for k, s in space.spaces.items())), None)
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(seen, tuple) or len(seen) != len(space.spaces):
+            return f"{_short(seen)} instead of a tuple of {len(space.spaces)}"
+        parts = zip(space.spaces, seen, strict=True)
+        return next(filter(None, (_unlike(s, one) for s, one in parts)), None)
+    if not isinstance(
+        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    ):
+        return None if space.contains(seen) else _short(seen)
+    try:
+        array = np.asarray(seen)
+    except ValueError:
+        return _short(seen)
+    if array.shape != space.shape:
+        return f"an observation of shape {list(array.shape)} instead of {list(space.shape or ())}"
+    if array.dtype.kind not in "biuf":
+        return f"{_short(seen)}, which are no numbers"
+    with np.errstate(over="ignore"):
+        if not np.isfinite(array.astype(np.float32)).all():
+            return "NaN or infinity, or a number beyond float32"
+    if not np.array_equal(array.astype(space.dtype), array) and space.dtype.kind in "biu":
+        return f"{_short(array)} of {array.dtype}, which {space.dtype} cannot hold"
+    if isinstance(space, spaces.Box):
+        return None
+    one = array.item() if isinstance(space, spaces.Discrete) else array.astype(space.dtype)
+    return None if space.contains(one) else _short(seen)
+
+
+def _short(seen: Any) -> str:
+    text = " ".join(str(seen).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def _element(value: Any) -> Any:
     """The only element of an array or a list as a number of Python's; anything else as it is."""
     try:
@@ -105,5 +162,4 @@ def _element(value: Any) -> Any:
 def _what(value: Any) -> str:
     if isinstance(value, tuple):
         return f"a tuple of {len(value)}: {', '.join(type(one).__name__ for one in value)}"
-    text = " ".join(repr(value).split())
-    return f"{text if len(text) <= 60 else text[:57] + '...'} ({type(value).__name__})"
+    return f"{_short(repr(value))} ({type(value).__name__})"

@@ -17,6 +17,7 @@ from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbou
 from torchrl.envs import EnvBase
 
 from proposer_rl.models import available_cores
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.processes import ProcessVectorEnv
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step
@@ -58,9 +59,8 @@ class GymnasiumEnv(EnvBase):
         super().__init__(batch_size=levels.batch_size)
         self._reward_scale = reward_scale
         self._once = once
-        players = [
-            partial(LevelPlayer, make, parameters, play, success) for play in plays(levels, once)
-        ]
+        self._plays = plays(levels, once)
+        players = [partial(LevelPlayer, make, parameters, play, success) for play in self._plays]
         self._vector: SyncVectorEnv | ProcessVectorEnv
         if vectorization == "sync":
             self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
@@ -70,7 +70,8 @@ class GymnasiumEnv(EnvBase):
 
     def set_levels(self, levels: TensorDictBase) -> None:
         """Play these levels [*B] from the next reset on."""
-        self._vector.set_attr("play", plays(levels, self._once))
+        self._plays = plays(levels, self._once)
+        self._vector.set_attr("play", self._plays)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all environments, and end their processes."""
@@ -94,7 +95,7 @@ class GymnasiumEnv(EnvBase):
             seen,
             success=info.get("success", none),
             is_init=none,
-            reward=(rewards * self._reward_scale).astype(np.float32),
+            reward=self._finite("reward", rewards * self._reward_scale),
             terminated=terminated,
             truncated=truncated,
             done=terminated | truncated,
@@ -103,14 +104,30 @@ class GymnasiumEnv(EnvBase):
     def _batched(self, seen: Any, **entries: NDArray[Any]) -> TensorDict:
         """Entries [n, ...] of all environments, [*B, ...]; single numbers as [*B, 1]."""
         observed = seen if isinstance(seen, dict) else {NUMBERS: seen}
+        numbers = {key: self._finite(key, entry) for key, entry in observed.items()}
         tensors = {
             key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
-            for key, entry in {**observed, **entries}.items()
+            for key, entry in {**numbers, **entries}.items()
         }
-        for key in observed:
-            if tensors[key].dtype != torch.uint8:
-                tensors[key] = tensors[key].float()
         return TensorDict(tensors, self.batch_size)
+
+    def _finite(self, name: str, entry: NDArray[Any]) -> NDArray[Any]:
+        """Numbers [n, ...] as float32; bytes as they are.
+
+        Raises:
+            UnfitEnvironmentError: for one that is not finite, naming the level.
+        """
+        if entry.dtype == np.uint8:
+            return entry
+        numbers = entry.astype(np.float32, copy=False)
+        finite = np.isfinite(numbers)
+        if not finite.all():
+            first = int(finite.reshape(len(finite), -1).all(-1).argmin())
+            raise UnfitEnvironmentError(
+                f"{name}: NaN or infinity, or a number beyond float32, on the level "
+                f"{self._plays[first]}"
+            )
+        return numbers
 
     def _make_specs(self) -> None:
         batch = self.batch_size

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +30,7 @@ for name, value in {
     os.environ.setdefault(name, value)
 
 MODE = "rgb_array"
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
 LONGER_SIDE = 150  # pixels
 LATER = 3  # moments of an episode that are drawn over its start
 KEY = "The environment's frames: the start, and more faintly three later moments of the episode."
@@ -64,11 +67,12 @@ class Camera:
     ) -> list[NDArray[np.uint8]]:
         """Pictures uint8 [H, W, 3] of levels [n], and of first episodes there [n, T]."""
         return [
-            self._picture(play, None if rollout is None else _first_actions(rollout[index]))
+            self.picture(play, None if rollout is None else _first_actions(rollout[index]))
             for index, play in enumerate(plays(levels))
         ]
 
-    def _picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+    def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+        """Of one level, and of an episode with actions [T, ...] there."""
         if self.works:
             try:
                 return self._drawn(play, actions)
@@ -92,12 +96,29 @@ class Camera:
         return np.average(frames, 0, shares).astype(np.uint8)
 
     def _frame(self) -> NDArray[np.uint8]:
-        frame: Any = self._player.render()
+        with _without_display():
+            frame: Any = self._player.render()
         if not (isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3):
             raise TypeError("render must return bytes [H, W, 3]")
         image = Image.fromarray(frame)
         image.thumbnail((LONGER_SIDE, LONGER_SIDE))
         return np.asarray(image)
+
+
+@contextmanager
+def _without_display() -> Iterator[None]:
+    """Let MuJoCo draw by EGL where there is no display and nobody has said how.
+
+    Only meanwhile: where there is no EGL, a new process could not even import it.
+    """
+    if sys.platform != "linux" or any(map(os.environ.get, DISPLAYS)):
+        yield
+        return
+    os.environ["MUJOCO_GL"] = "egl"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
 
 
 def _first_actions(rollout: TensorDictBase) -> Tensor:

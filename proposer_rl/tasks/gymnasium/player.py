@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -15,6 +17,7 @@ from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step, WrapperSettings
 from proposer_rl.tasks.gymnasium.spaces import plain
+from proposer_rl.tasks.parameters import SEED
 
 
 class RefusedLevelError(ValueError):
@@ -81,9 +84,13 @@ class MakeEnvironment:
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
         """Steps after which an episode is truncated; None for never."""
-        if self.max_steps is not None or env.unwrapped.spec is None:
-            return self.max_steps
-        return gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
+        limits = [one._max_episode_steps for one in _wrappers(env) if isinstance(one, TimeLimit)]
+        declared = self.max_steps
+        if declared is None and env.unwrapped.spec is not None:
+            declared = gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
+        if declared is not None:
+            limits.append(declared)
+        return min(limits, default=None)
 
 
 class Play(NamedTuple):
@@ -98,6 +105,11 @@ class Play(NamedTuple):
     values: Mapping[str, float]
     seed: int
     once: bool = False
+
+    def __str__(self) -> str:
+        """The level."""
+        values = [f"{name}={value:g}" for name, value in self.values.items()]
+        return ", ".join([*values, f"{SEED}={self.seed}"])
 
 
 class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -168,7 +180,14 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         """One step, unless it stands still."""
         if self._still:
             return self._seen, 0.0, False, False, {}
-        self._seen, reward, terminated, truncated, self.told = self.env.step(action)
+        try:
+            self._seen, reward, terminated, truncated, self.told = self.env.step(action)
+        except UnfitEnvironmentError:
+            raise
+        except Exception as error:  # whatever an environment of somebody's may raise
+            raise UnfitEnvironmentError(
+                f"step raises {told(error)}, on the level {self._play}"
+            ) from error
         self._return += float(reward)
         succeeded = False
         if self._succeeded is not None and (terminated or truncated):
@@ -216,7 +235,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             if arguments:
                 raise self._refused(play, error) from error
             raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
-        self._answers = _answers(env)
+        self._answers = next(one for one in _wrappers(env) if isinstance(one, Answers))
         return env
 
     def _named(self, way: str, play: Play) -> dict[str, float]:
@@ -224,15 +243,14 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {name: play.values[parameter] for parameter, how, name in self._ways if how == way}
 
     def _refused(self, play: Play, error: Exception) -> RefusedLevelError:
-        level = ", ".join(f"{name}={value:g}" for name, value in play.values.items())
-        taken = f"refuses {level}" if level else "cannot be made or reset"
-        return RefusedLevelError(f"parameters: {self._make.env_id} {taken}: {told(error)}")
+        return RefusedLevelError(f"parameters: {self._make.env_id} refuses {play}: {told(error)}")
 
 
-def _answers(env: Any) -> Answers:
-    while not isinstance(env, Answers):
+def _wrappers(env: Any) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
+    """The wrappers around an environment, the outermost first."""
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
         env = env.env
-    return env
 
 
 def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
@@ -266,5 +284,7 @@ def imported(name: str | None) -> Callable[..., Any]:
 
 
 def told(error: Exception) -> str:
-    """An exception of an environment's as part of a line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no reason given'}"
+    """An exception of an environment's as part of a line, and where it was raised."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    reason = " ".join(str(error).split()) or "no reason given"
+    return f"{type(error).__name__}: {reason} ({Path(last.filename).name}, line {last.lineno})"

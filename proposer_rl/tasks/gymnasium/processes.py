@@ -23,6 +23,12 @@ CONTEXT: Any = multiprocessing.get_context(
 )
 
 
+class LostProcessError(RuntimeError):
+    """A process of the environments has ended; the message is one line."""
+
+    exit_code = 6
+
+
 class ProcessVectorEnv:
     """The part of Gymnasium's vector environments that is used here, over several processes.
 
@@ -89,10 +95,20 @@ class ProcessVectorEnv:
 
         Raises:
             Exception: what the first environment that failed has raised.
+            LostProcessError: if a process answers no more.
         """
-        for pipe, given in zip(self._pipes, arguments, strict=True):
-            pipe.send((what, given))
-        answers = [pipe.recv() for pipe in self._pipes]
+        try:
+            for pipe, given in zip(self._pipes, arguments, strict=True):
+                pipe.send((what, given))
+            answers = [pipe.recv() for pipe in self._pipes]
+        except (EOFError, OSError) as error:
+            for process in self.processes:
+                process.join(1)
+            codes = [process.exitcode for process in self.processes if process.exitcode]
+            raise LostProcessError(
+                f"vectorization=async: a process of the environments was lost (exit code {codes}; "
+                "-9: killed, mostly for want of memory)"
+            ) from error
         for failed, answer in answers:
             if failed:
                 raise answer

@@ -9,6 +9,7 @@ from __future__ import annotations
 from itertools import count, takewhile
 from typing import Any
 
+import Box2D
 import gymnasium
 from gymnasium.envs.box2d.bipedal_walker import (
     TERRAIN_LENGTH,
@@ -34,6 +35,14 @@ class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
         self.stump_height, self.stump_spacing = 0.0, 3.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in a new world: a used one keeps an order of its contacts."""
+        self._destroy()
+        self.world = Box2D.b2World()
+        return super().reset(seed=seed, options=options)
 
     def _generate_terrain(self, hardcore: bool) -> None:
         super()._generate_terrain(hardcore)

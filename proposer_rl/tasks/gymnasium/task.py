@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from proposer_rl.extras import install_command
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task, distribution_of
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
@@ -251,6 +251,10 @@ class GymnasiumTask(Task):
         except (RuntimeError, KeyError) as error:
             kind = "transforms" if self._transforms else "network"
             raise ValueError(f"{kind}: {told(error)}") from error
+        for name in ("channels", "image"):
+            given = getattr(self._network, name)
+            if given is not None and all(len(box.shape) == 1 for box in boxes_of(seen).values()):
+                raise ValueError(f"network.{name}={given}: is of images, of which none is seen")
         return seen, acts
 
 
@@ -278,7 +282,9 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
             own = "; if it is your own module, name its folder, as in PYTHONPATH=. bin/train ..."
         raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason}){own}") from error
     except gymnasium.error.Error as error:
-        raise ValueError(f"env_id={env_id}: {error}") from error
+        unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
+        own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
+        raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
     except UnfitEnvironmentError as error:
         line = str(error)
         raise ValueError(

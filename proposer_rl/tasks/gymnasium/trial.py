@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -13,7 +14,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
 
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
+from proposer_rl.tasks.gymnasium.attributes import read
+from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
@@ -55,6 +58,8 @@ def tried(
             is not as the environment's spaces and Gymnasium's interface say.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
+    _check_module(make.env_id)
+    _check_places(parameters)
     _check_functions(make, parameters)
     _check_wrappers(make, parameters, target)
     _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
@@ -62,12 +67,35 @@ def tried(
     limit = make.limit(player)
     if not limit:
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
+    _check_kinds(player, parameters, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
         ends = [{**target.values, name: end} for end in (part.low[0].item(), part.high[-1].item())]
-        _check_ends(player, name, [Play(values, target.seed) for values in ends])
+        plays = [Play(values, target.seed) for values in ends]
+        _check_ends(player, name, plays, partial(_look_alike, make, parameters, plays))
     player.close()
     return limit
+
+
+def _check_module(env_id: str) -> None:
+    module, colon, _ = env_id.partition(":")
+    try:
+        if colon:
+            import_module(module)
+    except ImportError:
+        raise
+    except Exception as error:  # whatever somebody's module may raise
+        raise UnfitEnvironmentError(f"its module cannot be imported: {told(error)}") from error
+
+
+def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
+    """Refuse two parameters of which one would undo the other."""
+    taken: dict[tuple[str, str], str] = {}
+    for name, given in parameters.items():
+        for path in given.names(name):
+            other = taken.setdefault((given.set, path), name)
+            if other != name:
+                raise ValueError(f"parameters.{name}: {path} is set by parameters.{other}, too")
 
 
 def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
@@ -128,10 +156,7 @@ def _ask_gymnasium(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
 ) -> None:
     """Let Gymnasium's own checker see the beginning of an episode; it warns for the most part."""
-    try:
-        list(_played(LevelPlayer(make, parameters, play), 1))
-    except AssertionError as error:
-        raise UnfitEnvironmentError(told(error)) from error
+    list(_played(LevelPlayer(make, parameters, play), 1))
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
@@ -147,10 +172,55 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
             "limit, set max_steps to it",
             stacklevel=2,
         )
+    if success.least is not None:
+        _check_reachable(player, success.least, [step.reward for step in steps], limit)
 
 
-def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
-    """Set both ends of a parameter, see that they are there and stay, and that they matter."""
+def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
+    """Refuse a return above what the environment says, warn of one above what it seems to pay."""
+    match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
+        case (_, int() | float() as highest):
+            pass
+        case _:
+            highest = np.inf
+    if max(rewards) <= highest and least > max(highest, highest * limit):
+        raise ValueError(
+            f"success.least={least:g}: is never reached: the environment's reward_range ends at "
+            f"{highest:g}, and an episode after {limit} steps"
+        )
+    reward = rewards[0]
+    if reward > 0 and min(rewards) == max(rewards) and least > reward * limit:
+        warnings.warn(
+            f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
+            f"{reward:g}, and there are {limit} steps at most",
+            stacklevel=2,
+        )
+
+
+def _check_kinds(
+    player: LevelPlayer, parameters: Mapping[str, ParameterSettings], bins: Mapping[str, Bins]
+) -> None:
+    """Warn of fractions in the place of whole numbers, before there has been a reset."""
+    for name, given in parameters.items():
+        if given.set != "attribute" or not bins[name].low.is_floating_point():
+            continue
+        for path in given.names(name):
+            before = read(player.unwrapped, path)
+            if isinstance(before, int) and not isinstance(before, bool):
+                warnings.warn(
+                    f"parameters.{name}: {path} is a whole number, {before}, and gets fractions; "
+                    "where it counts something, give values: [...] of whole numbers",
+                    stacklevel=2,
+                )
+
+
+def _check_ends(
+    player: LevelPlayer, name: str, ends: list[Play], look_alike: Callable[[], bool]
+) -> None:
+    """Set both ends of a parameter, see that they are there and stay, and that they matter.
+
+    They do, too, if the environment draws them in different ways: it may take skill to get there.
+    """
     shown = player.observation_space, player.action_space
     episodes: list[list[_Played]] = []
     for play in ends:
@@ -171,12 +241,20 @@ def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
     first, last = (play.values[name] for play in ends)
-    if first != last and _alike(*episodes):
+    if first != last and _alike(*episodes) and look_alike():
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
             "same to the last digit; does it arrive?",
             stacklevel=2,
         )
+
+
+def _look_alike(
+    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], ends: list[Play]
+) -> bool:
+    camera = Camera(make, parameters, ends[0])
+    first, last = (camera.picture(play, None) for play in ends)
+    return not camera.works or np.array_equal(first, last)
 
 
 def _refuse_strays(player: LevelPlayer, when: str) -> None:
@@ -199,12 +277,14 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
     numbers = np.random.default_rng(0)
     player.action_space.seed(0)
     seen, _ = player.reset()
-    _check_seen(player.observation_space, seen, "reset")
+    check_seen(player.observation_space, seen, "reset")
     for _ in range(steps):
         seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
-        _check_seen(player.observation_space, seen, "step")
-        if not np.isfinite(reward):
-            raise UnfitEnvironmentError(f"step pays a reward of {reward}: it must be finite")
+        check_seen(player.observation_space, seen, "step")
+        if not abs(reward) <= np.finfo(np.float32).max:
+            raise UnfitEnvironmentError(
+                f"step pays a reward of {reward}: it must be finite, also as float32"
+            )
         yield _Played([np.array(part) for part in _arrays(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
@@ -226,48 +306,6 @@ def _check_spaces(player: LevelPlayer) -> None:
         check(space)
 
 
-def _check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
-    """Refuse an observation that would be read as another than it is.
-
-    A number beyond its bounds is not: nothing here depends on them.
-    """
-    line = _unlike(space, seen)
-    if line is not None:
-        raise UnfitEnvironmentError(f"{by} shows {line}; its observation space is {space}")
-
-
-def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
-    if isinstance(space, spaces.Dict):
-        if not isinstance(seen, Mapping) or seen.keys() != space.spaces.keys():
-            return f"{_short(seen)} instead of the entries {', '.join(space.spaces)}"
-        return next(filter(None, (_unlike(s, seen[k]) for k, s in space.spaces.items())), None)
-    if isinstance(space, spaces.Tuple):
-        if not isinstance(seen, tuple) or len(seen) != len(space.spaces):
-            return f"{_short(seen)} instead of a tuple of {len(space.spaces)}"
-        parts = zip(space.spaces, seen, strict=True)
-        return next(filter(None, (_unlike(s, one) for s, one in parts)), None)
-    if not isinstance(
-        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-    ):
-        return None if space.contains(seen) else _short(seen)
-    try:
-        array = np.asarray(seen)
-    except ValueError:
-        return _short(seen)
-    if array.shape != space.shape:
-        return f"an observation of shape {list(array.shape)} instead of {list(space.shape or ())}"
-    if array.dtype.kind not in "biuf":
-        return f"{_short(seen)}, which are no numbers"
-    if not np.isfinite(array).all():
-        return "NaN or infinity"
-    if not np.array_equal(array.astype(space.dtype), array) and space.dtype.kind in "biu":
-        return f"{_short(array)} of {array.dtype}, which {space.dtype} cannot hold"
-    if isinstance(space, spaces.Box):
-        return None
-    one = array.item() if isinstance(space, spaces.Discrete) else array.astype(space.dtype)
-    return None if space.contains(one) else _short(seen)
-
-
 def _alike(one: list[_Played], other: list[_Played]) -> bool:
     return len(one) == len(other) and all(
         a[1:] == b[1:] and all(map(np.array_equal, a.seen, b.seen))
@@ -281,8 +319,3 @@ def _arrays(seen: Any) -> Iterator[Any]:
             yield from _arrays(part)
     else:
         yield seen
-
-
-def _short(seen: Any) -> str:
-    text = " ".join(str(seen).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."

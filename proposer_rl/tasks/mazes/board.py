@@ -42,6 +42,8 @@ class Drawings:
         task: whose levels are drawn.
     """
 
+    drawing = staticmethod(recorded_drawing)
+
     def __init__(self, task: GridTask) -> None:
         self._task = task
         self.size = task.grid
@@ -60,10 +62,6 @@ class Drawings:
     def draw(self, level: Level) -> list[str]:
         """The rows of a level's drawing."""
         return str(level.to_text()).splitlines()
-
-    def drawing(self, record: Mapping[str, Any]) -> list[str]:
-        """The drawing in a record, whose text has spaces, and dots where an episode went."""
-        return recorded_drawing(record)
 
     def level_set(self, name: str) -> Mapping[str, Level]:
         """The levels of a shipped set; an agent that turns looks to the right."""

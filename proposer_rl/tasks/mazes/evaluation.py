@@ -62,11 +62,6 @@ class ExactEvaluator:
         Logits that require gradients get them where these are enabled; that takes the memory of
         ``max_steps`` distributions over the cells instead of two. A greedy policy has none.
 
-        Args:
-            levels: Levels ``[*B]``.
-            cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
-            generator: Unused.
-
         Returns:
             ``"return"`` and ``"success"``, ``[*B]`` each: float64 of float64 logits, else float32.
         """
@@ -115,16 +110,7 @@ class RolloutEvaluator:
     def __call__(
         self, levels: Level, cell_logits: Tensor, generator: torch.Generator | None = None
     ) -> TensorDict:
-        """Evaluates one policy in each maze.
-
-        Args:
-            levels: Levels ``[*B]``.
-            cell_logits: float ``[*B, 4, H, W]``, action logits at every cell.
-            generator: Source of randomness, on the CPU; None for torch's default one.
-
-        Returns:
-            ``"return"`` and ``"success"``, float32 ``[*B]`` each.
-        """
+        """Evaluates one policy in each maze, from a generator of the CPU: float32 ``[*B]`` each."""
         batch = (self.episodes, *levels.batch_size)
         env = MazeEnv(
             levels.expand(batch), max_steps=self.max_steps, step_penalty=self.step_penalty

@@ -14,9 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import first_episode_success
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.play.board import Board
-from proposer_rl.settings import SolverSettings
 from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.edits import edit_levels

@@ -2,7 +2,7 @@
 
 A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs;
 :class:`~proposer_rl.tasks.mazes.evaluation.ExactEvaluator` asks it for one number, these for all
-of them.
+of them. The first two take one level ``[]`` and action probabilities, float ``[4, H, W]``.
 """
 
 from __future__ import annotations
@@ -17,11 +17,6 @@ from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane
 
 def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
     """Probability of reaching the goal from every cell, each with the whole step limit.
-
-    Args:
-        level: A level of batch shape ``[]``.
-        policy: Action probabilities, float ``[4, H, W]``.
-        max_steps: Step limit of an episode.
 
     Returns:
         float ``[H, W]``, 1 at the goal. What it says of an obstacle has no meaning.
@@ -44,11 +39,6 @@ def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
 
 def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
     """Expected number of steps that an episode begins at every cell.
-
-    Args:
-        level: A level of batch shape ``[]``.
-        policy: Action probabilities, float ``[4, H, W]``.
-        max_steps: Step limit of an episode.
 
     Returns:
         float ``[H, W]``, 0 at the goal, where no step is taken; their sum is the expected length of
@@ -122,10 +112,7 @@ def episode_law(
 def _presence(levels: Level, policy: Tensor, max_steps: int) -> Tensor:
     """Probability that a step begins at every cell, [max_steps, *B, H*W]: none does at the goal.
 
-    Args:
-        levels: Levels ``[*B]``.
-        policy: Action probabilities, float ``[*B, 4, H*W]``.
-        max_steps: Step limit of an episode.
+    Of levels [*B] and action probabilities float [*B, 4, H*W].
     """
     width = levels.walls.shape[-1]
     start, goal = (cell_index(cell, width).unsqueeze(-1) for cell in (levels.start, levels.goal))

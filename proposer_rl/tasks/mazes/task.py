@@ -12,9 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
-from proposer_rl.settings import SolverSettings
-from proposer_rl.task import ComputeContext, EpisodeLaw, ExactTask, LevelResult, for_copies
+from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
@@ -52,19 +52,13 @@ WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
 
 
-class MazeTask(GridTask, ExactTask):
+class MazeTask(GridTask):
     """Mazes, and a U-Net that learns to solve them.
 
     Args:
-        maze: the inner environment.
-        distributions: by name.
-        target: the name of the one that the Solver is to master.
-        space: the Proposer's bins.
         network: of the Solver.
-        encoder_channels: of the convolutions with which a Proposer reads a probe.
-        evaluation: how the Solver is measured.
-        solver: the Solver's training.
-        context: device, precision and cores.
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+            :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
         make_network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
             ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
             of the settings.

@@ -15,7 +15,8 @@ from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torch import nn
 
-from proposer_rl.settings import SolverSettings, settings
+from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings

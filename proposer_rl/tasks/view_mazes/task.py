@@ -6,16 +6,16 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import RolloutPolicy
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
-from proposer_rl.settings import SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
@@ -49,15 +49,9 @@ class ViewMazeTask(GridTask):
     A policy with memory has no exact evaluation: everything that is measured is played.
 
     Args:
-        maze: the inner environment.
-        distributions: by name.
-        target: the name of the one that the Solver is to master.
-        space: the Proposer's bins.
         network: of the Solver.
-        encoder_channels: of the convolutions with which a Proposer reads a probe.
-        evaluation: how the Solver is measured.
-        solver: the Solver's training.
-        context: device, precision and cores.
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+            :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
 
     Raises:
         ValueError: naming the key, if settings that are each valid do not go together.
@@ -169,7 +163,7 @@ class ViewMazeTask(GridTask):
         for i, (name, told) in enumerate(about.items()):
             for k in range(len(copies)):
                 reached = round(float(performance["success"][k, i]) * episodes)
-                interval = binomtest(reached, episodes).proportion_ci(method="wilson")
+                interval = scipy.stats.binomtest(reached, episodes).proportion_ci(method="wilson")
                 results = {
                     "success": reached / episodes,
                     "success_low": float(interval.low),

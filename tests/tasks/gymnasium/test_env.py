@@ -15,6 +15,7 @@ from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
+from proposer_rl.tasks.gymnasium.processes import LostProcessError
 from proposer_rl.tasks.gymnasium.settings import Step, SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
@@ -77,6 +78,15 @@ def test_its_processes_end_when_a_run_does_and_leave_its_signals_alone() -> None
             process.terminate()
             process.join(60)
             assert process.exitcode == -signal.SIGTERM
+
+
+def test_a_process_that_is_lost_is_told() -> None:
+    env: Any = make(vectorization="async")
+    env.reset()
+    env._vector.processes[0].kill()
+    with pytest.raises(LostProcessError, match=r"async: a process .* was lost \(exit code \[-9\];"):
+        env.rollout(3)
+    env.close()
 
 
 def test_its_specs_hold() -> None:

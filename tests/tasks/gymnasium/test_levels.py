@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
-from proposer_rl.tasks.parameters import Bins, ParameterSpace
+from proposer_rl.tasks.parameters import Bins, ParameterSpace, points
+from proposer_rl.tasks.ranges import spaces
 from tests.tasks.gymnasium.toys import PARAMETERS
 
 BINS = {name: settings.space_bins() for name, settings in PARAMETERS.items()}
@@ -65,8 +67,7 @@ def intervals(pair: tuple[float, float]) -> Bins:
 @given(st.lists(NUMBERS, min_size=1, max_size=5, unique=True), NUMBERS)
 def test_a_value_counts_for_the_nearest_one(values: list[float], target: float) -> None:
     values = sorted(values)
-    settings = ParameterSettings(values=values, target=target)
-    shares = settings.space_bins().shares(settings.target_bins())
+    shares = points(values).shares(points([target]))
     nearest = min(abs(value - target) for value in values)
     (chosen,) = shares.nonzero().flatten().tolist()
     assert shares[chosen] == 1 and abs(values[chosen] - target) == pytest.approx(nearest)
@@ -150,6 +151,8 @@ def test_a_single_bin_lies_in_the_middle() -> None:
         ({"target": 1.0, "values": [2.0, 1.0]}, r"values=\[2.0, 1.0\] must rise"),
         ({"target": 1.0, "low": 2.0, "high": 2.0, "bins": 1}, "low=2.0 must be below high=2.0"),
         ({"target": 1.5, "values": [1, 2]}, r"target=\[1.5\] must be whole"),
+        ({"target": 4, "values": [1, 2]}, r"target=\[4\]: must be among values=\[1, 2\]"),
+        ({"target": {"values": [4], "weights": [1]}, "values": [1]}, r"target.values=\[4\]: must"),
         ({"target": [2.0, 1.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
         ({"target": [0.0, 1.0, 2.0], "low": 0.0, "high": 3.0, "bins": 2}, "must be a number or"),
         ({"target": {"distribution": "gauss"}, **RANGE}, "gauss: must be a continuous distrib"),
@@ -167,6 +170,23 @@ def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
     settings = ParameterSettings(**given_)
     with pytest.raises(ValueError, match=message):
         settings.space_bins(), settings.target_bins()
+
+
+@pytest.mark.parametrize(
+    ("target", "outside"),
+    [
+        (0.0, False), (3.0, False), (3.1, True), (-0.1, True), ([1.0, 4.0], False),
+        ([2.0, 5.0], True), ({"distribution": "norm", "loc": 9}, True),
+        ({"distribution": "norm", "loc": 2}, False), ({"values": [-1, 1], "weights": [2, 1]}, True),
+    ],
+)  # fmt: skip
+def test_a_target_beyond_the_range_is_told(target: Any, outside: bool) -> None:
+    """It may be meant, to see how far what is learnt reaches; or a typing error."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        spaces({"mass": ParameterSettings(**RANGE, target=target)})
+    assert len(told) == outside
+    assert all("outside of low=0 to high=3: is that meant?" in str(one.message) for one in told)
 
 
 def test_points_of_the_box_are_levels_of_all_of_the_range() -> None:

@@ -19,7 +19,7 @@ task:
     width: {set: argument, values: [1.0, 2.0], target: 2.0}
   success: {kind: terminated}
 """
-AXES = "".join(f"    p{i}: {{name: wind, values: [0], target: 0}}\n" for i in range(9))
+AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(9))
 PARAMETERS = "  parameters:\n"
 
 
@@ -31,12 +31,24 @@ PARAMETERS = "  parameters:\n"
         ((FIRST + FILE).encode("utf-8-sig"), "byte-order mark hides it: save the file as UTF-8"),
         (("# a note\n" + FIRST + FILE).encode(), "line.yaml must be '# @package _global_'"),
         (("# Größe\n" + FIRST + FILE).encode("latin-1"), "line.yaml: is not encoded in UTF-8"),
+        (
+            (FIRST + FILE.replace("defaults: [gymnasium, _self_]", "")).encode(),
+            "task._target_: missing: the class that makes the task; a file of one's own has it",
+        ),
         ((FIRST + FILE).encode("utf-16"), "line.yaml: is not encoded in UTF-8"),
         ((FIRST + FILE).encode("utf-16-le"), "line.yaml"),
         ((FIRST + FILE.replace("  env_id", "\tenv_id")).encode(), "line.yaml"),
         (
             (FIRST + FILE).replace("values: [1.0, 2.0]", "low: 1, high: 2, bins: 257").encode(),
             "task.parameters.width.bins=257: input should be less than or equal to 256",
+        ),
+        (
+            (FIRST + FILE.replace("target: 2.0", "target: .nan")).encode(),
+            "task.parameters.width.target=nan: must be finite",
+        ),
+        (
+            (FIRST + FILE + "  transforms: [{_target_: torchrl.envs.NoSuch}]\n").encode(),
+            "task.transforms: Error locating target 'torchrl.envs.NoSuch'",
         ),
         (
             (FIRST + FILE.replace(PARAMETERS, PARAMETERS + AXES)).encode(),
@@ -50,7 +62,8 @@ def test_a_file_that_would_be_misread_is_refused(
     folder = Path("conf/task")
     folder.mkdir(parents=True)
     (folder / "line.yaml").write_bytes(content)
-    run = ["--config-dir=conf", "task=line", "+method=target", *TINY, "hydra.run.dir=run"]
+    changed = TINY if b"defaults" in content else []  # what is not there cannot be changed
+    run = ["--config-dir=conf", "task=line", "+method=target", *changed, "hydra.run.dir=run"]
     assert train(*run) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ") and said in line

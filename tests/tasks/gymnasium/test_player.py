@@ -93,6 +93,22 @@ def steps(player: LevelPlayer, play: Play, count: int = 40) -> list[np.ndarray]:
             {n: ParameterSettings(values=[1], target=1) for n in ("gravity", "wind_power")},
             [(-5.0, 10.0), (-10.0, 2.0)],
         ),
+        pytest.param(
+            "proposer_rl.tasks.gymnasium.stumps:BipedalStumps-v0",
+            {},
+            {n: ParameterSettings(values=[1], target=1) for n in ("stump_height", "stump_spacing")},
+            [(0.5, 3.0), (2.0, 1.5)],
+            marks=NO_BOX2D,
+        ),
+        (
+            "HalfCheetah-v5",
+            {},
+            {
+                n: ParameterSettings(name=f"model.{n}", values=[1], target=1)
+                for n in ("opt.gravity.2", "body_mass.1")
+            },
+            [(-9.81, 6.0), (-6.0, 9.0)],
+        ),
         (
             "minigrid:MiniGrid-SimpleCrossingS9N1-v0",
             {"wrappers": ["minigrid.wrappers.ImgObsWrapper"]},
@@ -156,12 +172,20 @@ def test_continuous_actions_go_from_minus_one_to_one() -> None:
             {"lenght": 1},
             "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind",
         ),
-        ({"width": argument()}, {"width": -1}, "refuses width=-1: ValueError: width must be"),
-        ({"wdth": argument()}, {"wdth": 1}, "refuses wdth=1: TypeError: .* argument 'wdth'"),
+        (
+            {"width": argument()},
+            {"width": -1},
+            "refuses width=-1, seed=0: ValueError: width",
+        ),
+        (
+            {"wdth": argument()},
+            {"wdth": 1},
+            "refuses wdth=1, seed=0: TypeError: .*'wdth'",
+        ),
         (
             {"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)},
             {"a": 1},
-            "refuses a=1: TypeError",
+            r"refuses a=1, seed=0: TypeError: .* \(player.py, line",
         ),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
+from tensordict import TensorDict
 
 from proposer_rl.streams import Streams
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import (
@@ -56,6 +59,12 @@ def line_task(env_id: str, **changed: Any) -> Any:
         ({"step": rewarding(np.zeros(2))}, "the reward must be a number, not array"),
         ({"step": rewarding(np.nan)}, "a reward of nan: it must be finite"),
         ({"step": rewarding(-np.inf)}, "a reward of -inf: it must be finite"),
+        ({"step": rewarding(1e300)}, "a reward of 1e.300: it must be finite, also as float32"),
+        (
+            {"step": lambda self, a: 1 / 0},
+            r"env_id=Odd.*step raises ZeroDivisionError: .*\(test_trial.py, line \d+\), on the "
+            r"level goal=3, seed=\d+",
+        ),
         (
             {"step": lambda self, a: (*Line.step(self, a)[:2], "no", False, {})},
             "terminated must be true or false, not 'no'",
@@ -65,6 +74,10 @@ def line_task(env_id: str, **changed: Any) -> Any:
             r"reset shows an observation of shape \[3\] instead of \[2\]",
         ),
         ({"seen": lambda self: np.array([np.nan, 0.0])}, "reset shows NaN or infinity"),
+        (
+            showing(spaces.Box(-np.inf, np.inf, (2,), np.float64), np.array([1e300, 0.0])),
+            "reset shows NaN or infinity, or a number beyond float32",
+        ),
         ({"seen": lambda self: ["a", "b"]}, "which are no numbers"),
         ({"seen": lambda self: None}, "shape"),
         (
@@ -233,6 +246,94 @@ def test_a_parameter_that_changes_nothing_is_told() -> None:
         line_task(odd())
 
 
+def test_a_time_limit_of_its_own_is_the_time_limit() -> None:
+    """Also where the episode of the trial ends before it."""
+    inside = odd(step=lambda self, a: (*Line.step(self, 0)[:4], {}))
+    name = f"Limited{inside}"
+    gymnasium.register(
+        name, lambda **given: TimeLimit(gymnasium.make(inside, **given).unwrapped, 5),
+        max_episode_steps=LIMIT,
+    )  # fmt: skip
+    task = line_task(name, success=SuccessSettings(kind="survived"))
+    assert (
+        task.max_steps == 5 and task.measure(task.learner([Streams(0)]).agent)["all_success"] == 1
+    )
+
+
+@pytest.mark.parametrize(
+    ("members", "least", "said"),
+    [
+        ({"reward_range": (0.0, 1.0)}, LIMIT + 1, "error"),
+        ({"reward_range": (0.0, 1.0)}, LIMIT, None),
+        ({"reward_range": (-9.0, -1.0)}, -1, None),
+        ({"reward_range": (-9.0, -1.0)}, 0, "error"),
+        ({"step": rewarding(2.0)}, 2 * LIMIT + 1, "warning"),
+        ({"step": rewarding(2.0)}, 2 * LIMIT, None),
+        ({}, 1000, None),  # what reaching the goal pays is not seen in an episode that does not
+    ],
+)
+def test_a_return_that_is_never_reached_is_told(members: Any, least: float, said: Any) -> None:
+    pays = members.get("reward_range", (0, 0))[0]
+    step = {"step": rewarding(pays)} if pays else {}
+    rule = SuccessSettings(kind="return", least=least)
+    refused = pytest.raises(ValueError, match=f"success.least={least}: is never reached")
+    with warnings.catch_warnings(), refused if said == "error" else nullcontext():
+        warnings.simplefilter("error")
+        warned = pytest.warns(UserWarning, match=f"success.least={least}: can it be reached?")
+        with warned if said == "warning" else nullcontext():
+            line_task(odd(**{**step, **members}), success=rule)
+
+
+def test_fractions_in_the_place_of_a_whole_number_are_told() -> None:
+    fractions = {"goal": ParameterSettings(low=1.0, high=3.0, target=3.0)}
+    with pytest.warns(UserWarning, match="parameters.goal: goal is a whole number, 3, and gets"):
+        line_task(odd(goal=3), parameters=fractions)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        line_task(odd(), parameters=fractions)
+        whole = ParameterSettings(values=[1, 3], target=3)
+        line_task(odd(goal=3), parameters={"goal": whole})
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
+    """The environment is as it should be until it has been stepped often."""
+
+    def step(self: Any, action: Any) -> Any:
+        self.total = getattr(self, "total", 0) + 1
+        seen, *rest = Line.step(self, action)
+        if self.total > 3 * LIMIT and self.goal == 1.0:
+            raise RuntimeError("it has\nexploded")
+        return (seen * (np.nan if self.total > 3 * LIMIT else 1), *rest)
+
+    task = line_task(odd(step=step), vectorization=vectorization)
+    for goal, said in (
+        (1.0, "step raises RuntimeError: it has exploded"),
+        (3.0, "observation: Na"),
+    ):
+        level = TensorDict({"goal": torch.tensor([[goal]]), "seed": torch.tensor([[7]])}, [1, 1])
+        env = task.environment(level)
+        with pytest.raises(UnfitEnvironmentError, match=f"{said}.* level goal={goal:g}, seed=7$"):
+            env.rollout(5 * LIMIT, break_when_any_done=False)
+        env.close()
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_what_is_only_drawn_arrives(drawn: bool) -> None:
+    """What lies far away is not met in a short episode, but it is there to be seen."""
+    far = odd(
+        metadata={"render_modes": ["rgb_array"]},
+        hill=1.0,
+        render=lambda self: np.full((8, 8, 3), 50 * self.hill * drawn, np.uint8),
+    )
+    hill = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
+    warned = pytest.warns(UserWarning, match="parameters.hill: .* does it arrive?")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with nullcontext() if drawn else warned:
+            line_task(far, parameters=hill)
+
+
 def test_an_environment_that_the_seed_does_not_decide_is_told() -> None:
     noisy = odd(seen=lambda self: np.array([np.random.normal(), self.goal], np.float32))
     with pytest.warns(UserWarning, match="the reset's seed does not decide all of it"):
@@ -292,7 +393,8 @@ def test_actions_arrive_as_they_were_meant() -> None:
 @pytest.mark.parametrize("memory", [None, 8])
 @pytest.mark.parametrize("env_id", ["Grey-v0", "Mixed-v0", "Robot-v0"])
 def test_of_all_spaces_it_learns_with_memory_and_without(env_id: str, memory: int | None) -> None:
-    network = NetworkSettings(hidden=[8], channels=[4], memory=memory)
+    channels = None if env_id == "Robot-v0" else [4]
+    network = NetworkSettings(hidden=[8], channels=channels, memory=memory)
     task = line_task(f"tests.tasks.gymnasium.odd:{env_id}", network=network)
     learner = task.learner([Streams(0), Streams(1)])
     before = learner.snapshot()

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from proposer_rl.settings import PPOSettings, SolverSettings
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
 from proposer_rl.tasks.gymnasium.settings import (
     EvaluationSettings,
@@ -98,7 +98,7 @@ def walk_task(**changed: Any) -> GymnasiumTask:
         "parameters": PARAMETERS,
         "success": SuccessSettings(kind="terminated"),
         "reward_scale": 0.5,
-        "network": NetworkSettings(hidden=[8], channels=[4]),
+        "network": NetworkSettings(hidden=[8]),
         "evaluation": EvaluationSettings(levels=8),
         "vectorization": "sync",
         "extra": None,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Ge
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tqdm import tqdm
 
 from proposer_rl.curricula import (
@@ -22,19 +21,17 @@ from proposer_rl.curricula import (
     require,
 )
 from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.experiment.schedule import ScheduleSettings, check_headline
+from proposer_rl.experiment.tables import Log, RunTables
 from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
-from proposer_rl.runs.columns import can_reach
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
-from proposer_rl.settings import ArgumentError, NotNegative, ScheduleSettings, settings
+from proposer_rl.settings import NotNegative, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
-Log = Callable[[str, Mapping[str, Any], int], None]
-
-RECORDED_LEVELS = 8
 MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
 
 
@@ -102,7 +99,7 @@ class Experiment:
         self.updates = 0
         self.cycles = 0
         self._advances = False  # whether the Solver becomes a replica in place of training itself
-        self._log = log
+        self._tables = RunTables(task, self.seeds, folder, log)
         self._progress = progress
         self._signals = signals or StopSignals()
         self._status = status or Status()
@@ -221,7 +218,7 @@ class Experiment:
         if outcome.advance is not None:
             self.updates += outcome.advance.updates
             self._measure()
-            self._record(outcome.advance.levels, *outcome.advance.update)
+            self._tables.add_training(self.updates, outcome.advance.levels, *outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
         self._pause(due=logged or self.student.frames > spent)
 
@@ -241,16 +238,9 @@ class Experiment:
     def _log_cycle(self, improved: Mapping[str, Any] | None = None) -> bool:
         """Append the log of the cycle that has ended, and the metrics of its improvement."""
         metrics = {**self.curriculum.log(), **(improved or {})}
-        if not metrics:
-            return False
-        if "levels" in metrics:
-            shown = metrics["levels"].items()
-            metrics["levels"] = {text: self.task.record(some, None) for text, some in shown}
-        costs = {k: self.costs[k] for k in ("curriculum_frames", "evaluations")}
-        place = {"cycle": self.cycles, "updates": self.updates, **costs}
-        self.folder.append("cycles.jsonl", {**place, **metrics})
-        self._tell("cycles", metrics)
-        return True
+        if metrics:
+            self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
+        return bool(metrics)
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
@@ -271,7 +261,7 @@ class Experiment:
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
-            self._record(*played, update.metrics)
+            self._tables.add_training(self.updates, *played, update.metrics)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _plan(self) -> None:
@@ -287,46 +277,13 @@ class Experiment:
         )
 
     def _measure(self) -> None:
-        """Append a row of measurements for every copy."""
         with self._status.phase(MEASURING):
             measured = self.task.measure(self.learner.agent)
         self._headline = measured[self.schedule.headline].tolist()
-        for seed, values in self._per_copy(measured):
-            self._append("metrics.csv", seed, {**self.costs, **values})
+        self._tables.add_metrics(self.updates, measured, self.costs)
 
     def _measure_levels(self) -> None:
-        """Append what every copy reaches on each single level that it was measured on."""
-        for name, performance in self.task.evaluate(self.learner.agent).items():
-            for copy, seed in enumerate(self.seeds):
-                reached = {str(key): value[copy].tolist() for key, value in performance.items()}
-                row = {"seed": seed, "updates": self.updates, "distribution": name, **reached}
-                self.folder.append("levels.jsonl", row)
-
-    def _record(self, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase) -> None:
-        """Append how the training went and samples of its levels, for every copy."""
-        told = self.task.training_metrics(levels, rollout), metrics
-        for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
-            self._append("training.csv", seed, {**values, **training})
-        some = slice(RECORDED_LEVELS)
-        for copy, seed in enumerate(self.seeds):
-            sample = self.task.record(levels[copy, some], rollout[copy, some])
-            row = {"updates": self.updates, "seed": seed, "levels": sample}
-            self.folder.append("curriculum.jsonl", row)
-            if copy == 0:
-                self._tell("curriculum", row)
-
-    def _append(self, table: str, seed: int, values: Mapping[str, float]) -> None:
-        self.folder.append(table, {"seed": seed, "updates": self.updates, **values})
-        if seed == self.seeds[0]:
-            self._tell(Path(table).stem, values)
-
-    def _tell(self, table: str, row: Mapping[str, Any]) -> None:
-        if self._log is not None:
-            self._log(table, row, self.updates)
-
-    def _per_copy(self, values: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
-        for copy, seed in enumerate(self.seeds):
-            yield seed, {str(key): float(value) for key, value in values[copy].items()}
+        self._tables.add_levels(self.updates, self.task.evaluate(self.learner.agent))
 
     def _streams(self, *scope: str | int) -> list[Streams]:
         return [Streams(seed, *scope) for seed in self.seeds]
@@ -401,19 +358,3 @@ class Experiment:
         self._seconds_before = read.seconds
         self._started = time.monotonic()
         self._headline = [float(value) for value in state["headline"]]
-
-
-def check_headline(task: Task, schedule: ScheduleSettings) -> None:
-    """Refuse to sum runs up by what is not measured, or not reached.
-
-    Raises:
-        ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach
-            what no rate can.
-    """
-    headline, threshold, known = schedule.headline, schedule.threshold, list(task.metrics)
-    if headline not in known:
-        raise ArgumentError(f"headline={headline!r}: must be one of {known}")
-    if not can_reach(headline, threshold):
-        raise ArgumentError(
-            f"threshold={threshold:g}: must be above 0 and at most 1, as {headline} is"
-        )

@@ -1,14 +1,8 @@
-"""The contract of a task, and what all tasks share.
-
-A task is an environment in which Solvers are trained, and how they are measured there. What it
-takes as a level is its own business: a tensordict or tensorclass of any content, whose batch shape
-alone matters. K are Solvers, P the levels of one update, T its steps, E validation levels, C
-probes, N bins.
+"""The base of tasks: environments in which Solvers are trained, and how they are measured there.
 
 :class:`Task` asks for three things: levels to draw from, an environment that plays them, and a
-network; all the rest can be replaced. ``examples/own_task.py`` is a whole task in forty lines.
-Curricula that need more of a task than all of them have ask for it by name, with the optional parts
-below.
+network; all the rest can be replaced. ``examples/own_task.py`` is a whole task in forty lines. K
+are Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
 """
 
 from __future__ import annotations
@@ -16,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +24,7 @@ from torchrl.envs import EnvBase
 from proposer_rl.learning import PPO, first_episode_return, first_episode_success
 from proposer_rl.learning.episodes import mean_performance
 from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import (
     ActorCritic,
     Population,
@@ -38,85 +33,12 @@ from proposer_rl.models import (
     normal,
 )
 from proposer_rl.runs.pictures import pixels, png, written
-from proposer_rl.settings import ArgumentError, SolverSettings
 from proposer_rl.streams import Streams, each_from
-
-Levels = Any
-"""A tensordict or tensorclass of levels."""
+from proposer_rl.task.contract import ComputeContext, Distribution, LevelResult, Levels, Space
+from proposer_rl.task.features import space_features
 
 SAMPLES = 6  # levels of each distribution that a reader is shown
-MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
 NAMED = 128  # levels of a distribution that are evaluated one by one
-
-
-class NoSuccessError(ValueError):
-    """A task has no success, and it was asked for; the message is a line that says what to do."""
-
-    exit_code = 2
-
-
-class ComputeContext(NamedTuple):
-    """Where and how exactly a task computes; what makes a task is called with one.
-
-    Attributes:
-        device: where Solvers and levels live.
-        precision: of the Solvers' networks: ``"fp32"``, ``"bf16"``, or ``"auto"`` for the task's
-            choice.
-        cores: Solvers of a population computed at once on a CPU; None for all cores.
-    """
-
-    device: torch.device = torch.device("cpu")
-    precision: str = "fp32"
-    cores: int | None = None
-
-
-class Distribution(Protocol):
-    """Levels to draw from."""
-
-    def sample(self, count: int, generator: torch.Generator, /) -> Levels:
-        """Draw levels [count] on the task's device; the generator is one of the CPU."""
-
-
-class Space(Distribution, Protocol):
-    """The levels that a Proposer chooses among, in N bins; ``sample`` draws uniformly from them."""
-
-    @property
-    def axes(self) -> Mapping[str, Sequence[float]]:
-        """The values along each axis, by the axis's name.
-
-        The bins are their product, the last axis running fastest.
-        """
-
-    @property
-    def size(self) -> int:
-        """The number N of bins."""
-
-    @property
-    def coordinates(self) -> Tensor:
-        """Of each bin, scaled to [-1, 1] along every axis: float32 [N, D] on the CPU."""
-
-    def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, P] of bins, int64 [K, P], on the task's device; row k from generator k."""
-
-
-class LevelResult(NamedTuple):
-    """What one Solver reaches on one level, as ``bin/eval`` lists it.
-
-    Attributes:
-        level: the level's name.
-        solver: the Solver's number among those of a population.
-        about: what the level is like, by name.
-        results: the performance, ``success`` and ``return``, and whatever else there is, by name.
-        note: a few words for below a picture.
-        picture: draws what the Solver does there, uint8 [H, W, 3].
-    """
-
-    level: str
-    solver: int
-    about: Mapping[str, float]
-    results: Mapping[str, float]
-    note: str
-    picture: Callable[[], NDArray[np.uint8]]
 
 
 class Task(ABC):
@@ -464,112 +386,6 @@ class Task(ABC):
     def _numbers(self, levels: Levels) -> list[str]:
         """Axes of the space that are entries of the levels."""
         return [name for name in self.space.axes if name in levels.keys()]
-
-
-class ExactTask(Task):
-    """A task whose performance has gradients; see :class:`DifferentiableTask`."""
-
-    @abstractmethod
-    def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """As :meth:`DifferentiableTask.differentiable_performance`."""
-
-
-@runtime_checkable
-class DifferentiableTask(Protocol):
-    """A task whose performance has gradients: first-order gain without sampling."""
-
-    def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
-
-        Where gradients are enabled, with gradients towards the agent's parameters.
-        """
-
-
-@runtime_checkable
-class LocatedTarget(Protocol):
-    """A task whose target lies in the Proposer's space: a way from other bins to it.
-
-    Attributes:
-        target_shares: the target as shares of the bins, float [N] on the CPU; they add up to one.
-    """
-
-    target_shares: Tensor
-
-
-@runtime_checkable
-class OptimalTask(Protocol):
-    """A task that knows what could be reached: regret without an antagonist."""
-
-    def optimal_return(self, levels: Levels) -> Tensor:
-        """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
-
-
-class EpisodeLaw(NamedTuple):
-    """The law of a Solver's episodes on levels [*B], in two tables.
-
-    Attributes:
-        outcome: returns that an episode can have, float64 [*B, O].
-        probability: of each, float64 [*B, O].
-        weight: of every step that can be taken, a state with an action: the expectation of its
-            share of an episode's steps, float64 [*B, M]. So the sum of weight times any number is
-            the expectation of that number's mean over the steps of an episode.
-        reward: of the step, float64 [*B, M].
-        value: that the critic gives the state before it, float64 [*B, M].
-        next_value: the same of the state after it, 0 where the step terminates the episode.
-    """
-
-    outcome: Tensor
-    probability: Tensor
-    weight: Tensor
-    reward: Tensor
-    value: Tensor
-    next_value: Tensor
-
-
-@runtime_checkable
-class EnumerableTask(Protocol):
-    """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
-
-    def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
-        """The law of the episodes of K Solvers, each on its own levels [K, E]."""
-
-
-@runtime_checkable
-class EditableTask(Protocol):
-    """A task whose levels can be changed a little."""
-
-    def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
-
-
-def space_features(space: Any, levels: Levels) -> Tensor:
-    """Features of levels by where they lie in a space, among the bins or beside them.
-
-    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
-    unless there are more than :data:`MANY_BINS`.
-
-    Args:
-        space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
-            coordinates of levels [*B]: float [*B, D].
-        levels: [*B].
-
-    Returns:
-        float64 [*B, 1 + 2 D + N] on the CPU.
-
-    Raises:
-        ArgumentError: if the space cannot locate levels.
-    """
-    if not hasattr(space, "locate"):
-        raise ArgumentError(
-            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
-            "from which a model of outcomes tells them apart"
-        )
-    c, places = space.locate(levels).double().cpu(), space.coordinates.double()
-    parts = [torch.ones_like(c[..., :1]), c, c.square()]
-    if len(places) <= MANY_BINS:
-        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
-        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
-    return torch.cat(parts, -1)
 
 
 def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:

@@ -1,0 +1,88 @@
+"""What an experiment writes into its folder, and tells a logger of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+
+from proposer_rl.runs.folder import RunFolder
+from proposer_rl.task import Task
+
+Log = Callable[[str, Mapping[str, Any], int], None]
+"""Receives each row of the first copy: its table, its values and its update."""
+
+RECORDED_LEVELS = 8
+
+
+class RunTables:
+    """The tables of K Solvers that are trained side by side.
+
+    Args:
+        task: which says how levels are recorded.
+        seeds: K of them.
+        folder: that the tables are in.
+        log: is told the rows of the first copy; None for nobody.
+    """
+
+    def __init__(
+        self, task: Task, seeds: Sequence[int], folder: RunFolder, log: Log | None
+    ) -> None:
+        self._task, self._seeds, self._folder, self._log = task, seeds, folder, log
+
+    def add_metrics(
+        self, updates: int, measured: TensorDictBase, costs: Mapping[str, float]
+    ) -> None:
+        """A row for every copy of what it reaches, [K], and has cost."""
+        for seed, values in self._per_copy(measured):
+            self._append("metrics.csv", updates, seed, {**costs, **values})
+
+    def add_levels(self, updates: int, reached: Mapping[str, TensorDictBase]) -> None:
+        """What every copy reaches on each evaluation level, [K, E] by distribution."""
+        for name, performance in reached.items():
+            for copy, seed in enumerate(self._seeds):
+                values = {str(key): value[copy].tolist() for key, value in performance.items()}
+                row = {"seed": seed, "updates": updates, "distribution": name, **values}
+                self._folder.append("levels.jsonl", row)
+
+    def add_training(
+        self, updates: int, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase
+    ) -> None:
+        """How an update went, [K], and samples of its levels, [K, P], for every copy."""
+        told = self._task.training_metrics(levels, rollout), metrics
+        for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
+            self._append("training.csv", updates, seed, {**values, **training})
+        some = slice(RECORDED_LEVELS)
+        for copy, seed in enumerate(self._seeds):
+            sample = self._task.record(levels[copy, some], rollout[copy, some])
+            row = {"updates": updates, "seed": seed, "levels": sample}
+            self._folder.append("curriculum.jsonl", row)
+            if copy == 0:
+                self._tell("curriculum", row, updates)
+
+    def add_cycle(
+        self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
+    ) -> None:
+        """What a curriculum tells of the cycle that has ended; of its levels, records."""
+        told = dict(metrics)
+        if "levels" in told:
+            shown = told["levels"].items()
+            told["levels"] = {text: self._task.record(some, None) for text, some in shown}
+        spent = {name: costs[name] for name in ("curriculum_frames", "evaluations")}
+        self._folder.append("cycles.jsonl", {"cycle": cycle, "updates": updates, **spent, **told})
+        self._tell("cycles", told, updates)
+
+    def _append(self, table: str, updates: int, seed: int, values: Mapping[str, float]) -> None:
+        self._folder.append(table, {"seed": seed, "updates": updates, **values})
+        if seed == self._seeds[0]:
+            self._tell(Path(table).stem, values, updates)
+
+    def _tell(self, table: str, row: Mapping[str, Any], updates: int) -> None:
+        if self._log is not None:
+            self._log(table, row, updates)
+
+    def _per_copy(self, values: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
+        for copy, seed in enumerate(self._seeds):
+            yield seed, {str(key): float(value) for key, value in values[copy].items()}

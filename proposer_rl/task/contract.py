@@ -1,0 +1,161 @@
+"""What a task is made of, and what curricula may ask of some tasks beside.
+
+K are Solvers, P the levels of one update, E validation levels, N bins. What a task takes as a level
+is its own business: a tensordict or tensorclass of any content, whose batch shape alone matters.
+Curricula that need more of a task than all of them have ask for it by name, with the optional parts
+at the end; a task has one by having its members.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.models import ActorCritic
+
+Levels = Any
+"""A tensordict or tensorclass of levels."""
+
+
+class NoSuccessError(ValueError):
+    """A task has no success, and it was asked for; the message is a line that says what to do."""
+
+    exit_code = 2
+
+
+class ComputeContext(NamedTuple):
+    """Where and how exactly a task computes; what makes a task is called with one.
+
+    Attributes:
+        device: where Solvers and levels live.
+        precision: of the Solvers' networks: ``"fp32"``, ``"bf16"``, or ``"auto"`` for the task's
+            choice.
+        cores: Solvers of a population computed at once on a CPU; None for all cores.
+    """
+
+    device: torch.device = torch.device("cpu")
+    precision: str = "fp32"
+    cores: int | None = None
+
+
+class Distribution(Protocol):
+    """Levels to draw from."""
+
+    def sample(self, count: int, generator: torch.Generator, /) -> Levels:
+        """Draw levels [count] on the task's device; the generator is one of the CPU."""
+
+
+class Space(Distribution, Protocol):
+    """The levels that a Proposer chooses among, in N bins; ``sample`` draws uniformly from them."""
+
+    @property
+    def axes(self) -> Mapping[str, Sequence[float]]:
+        """The values along each axis, by the axis's name.
+
+        The bins are their product, the last axis running fastest.
+        """
+
+    @property
+    def size(self) -> int:
+        """The number N of bins."""
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Of each bin, scaled to [-1, 1] along every axis: float32 [N, D] on the CPU."""
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
+        """Levels [K, P] of bins, int64 [K, P], on the task's device; row k from generator k."""
+
+
+class LevelResult(NamedTuple):
+    """What one Solver reaches on one level, as ``bin/eval`` lists it.
+
+    Attributes:
+        level: the level's name.
+        solver: the Solver's number among those of a population.
+        about: what the level is like, by name.
+        results: the performance, ``success`` and ``return``, and whatever else there is, by name.
+        note: a few words for below a picture.
+        picture: draws what the Solver does there, uint8 [H, W, 3].
+    """
+
+    level: str
+    solver: int
+    about: Mapping[str, float]
+    results: Mapping[str, float]
+    note: str
+    picture: Callable[[], NDArray[np.uint8]]
+
+
+@runtime_checkable
+class DifferentiableTask(Protocol):
+    """A task whose performance has gradients: first-order gain without sampling."""
+
+    def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
+        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
+
+        Where gradients are enabled, with gradients towards the agent's parameters.
+        """
+
+
+@runtime_checkable
+class LocatedTarget(Protocol):
+    """A task whose target lies in the Proposer's space: a way from other bins to it.
+
+    Attributes:
+        target_shares: the target as shares of the bins, float [N] on the CPU; they add up to one.
+    """
+
+    target_shares: Tensor
+
+
+@runtime_checkable
+class OptimalTask(Protocol):
+    """A task that knows what could be reached: regret without an antagonist."""
+
+    def optimal_return(self, levels: Levels) -> Tensor:
+        """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
+
+
+class EpisodeLaw(NamedTuple):
+    """The law of a Solver's episodes on levels [*B], in two tables.
+
+    Attributes:
+        outcome: returns that an episode can have, float64 [*B, O].
+        probability: of each, float64 [*B, O].
+        weight: of every step that can be taken, a state with an action: the expectation of its
+            share of an episode's steps, float64 [*B, M]. So the sum of weight times any number is
+            the expectation of that number's mean over the steps of an episode.
+        reward: of the step, float64 [*B, M].
+        value: that the critic gives the state before it, float64 [*B, M].
+        next_value: the same of the state after it, 0 where the step terminates the episode.
+    """
+
+    outcome: Tensor
+    probability: Tensor
+    weight: Tensor
+    reward: Tensor
+    value: Tensor
+    next_value: Tensor
+
+
+@runtime_checkable
+class EnumerableTask(Protocol):
+    """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
+
+    def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
+        """The law of the episodes of K Solvers, each on its own levels [K, E]."""
+
+
+@runtime_checkable
+class EditableTask(Protocol):
+    """A task whose levels can be changed a little."""
+
+    def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
+        """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
