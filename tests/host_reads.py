@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
+from unittest.mock import patch
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+
+from proposer_rl.models import population
 
 # They hand numbers from the device to Python, or to the host to find the shape of their result.
 READS = {
@@ -19,7 +22,19 @@ class HostRead(AssertionError):
 
 
 class NoHostReads(TorchDispatchMode):
-    """Refuses operations for which a GPU's host would have to wait, wherever the tensors are."""
+    """Refuses operations for which a GPU's host would have to wait, wherever the tensors are.
+
+    What is done otherwise where numbers are at hand is done as on a GPU meanwhile.
+    """
+
+    def __enter__(self) -> Self:
+        self._elsewhere = patch.object(population, "at_hand", return_value=False)
+        self._elsewhere.start()
+        return super().__enter__()  # type: ignore[no-any-return]
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        self._elsewhere.stop()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         refuse_host_reads(func, args)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,17 @@ import torch
 
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from research.benchmarks.__main__ import main
-from research.benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
+from research.benchmarks.jaxued_peer import LEAN, TRAINING, WAYS, WRAPPER
 from research.benchmarks.peer import jaxued_maze, played
+from research.benchmarks.results import Options
 from research.benchmarks.teacher import beside_syllabus
 from research.benchmarks.timing import threads
 from research.benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
+from research.benchmarks.view_training import SMALL, on_these_cores
 from tests.commands import call
 from tests.tasks.view_mazes.oracles import random_levels
 
+TRIED = Options(repeats=1, precision="fp32", size="tiny")
 DRAWINGS = ["v#..\n.#G.", "..<#\nG...", "G#.^\n....", "...G\n.>#."]
 JAXUED = os.environ.get("JAXUED_PYTHON")
 real = pytest.mark.skipif(not JAXUED, reason="JAXUED_PYTHON names no interpreter that has jaxued")
@@ -45,7 +49,7 @@ open({note!r}, "w").write(str(os.getpid()))
 for line in sys.stdin:
     if {dies}:
         sys.exit(3)
-    seconds = {{"wrapper": 0.5, "lean": 0.25}}[line.strip()]
+    seconds = {{"wrapper": 0.5, "lean": 0.25, "training": 0.125}}[line.strip()]
     print(json.dumps({{"seconds": seconds, "reward": {reward}}}), flush=True)
 """
 
@@ -78,7 +82,10 @@ def has_ended(note: Path) -> bool:
         (["view", "--jaxued", "nowhere/python"], "--jaxued nowhere/python: No such file"),
         (["view", "--jaxued", sys.executable], "No module named 'jaxued'; must be an interpreter"),
         (["view", "--jaxued", "/bin/echo"], "--jaxued /bin/echo: it does not run Python; must be"),
-        (["meta", "levels", "--jaxued", "p"], "is for the benchmark view, not for meta, levels"),
+        (
+            ["meta", "levels", "--jaxued", "p"],
+            "is for the benchmark view and view_training, not for meta, levels",
+        ),
         (["--jaxued", "p", "--device", "meta"], "measured on the CPU; give --device cpu, not meta"),
         (
             ["teacher", "--syllabus", sys.executable],
@@ -130,6 +137,18 @@ def test_rows_hold_the_times_of_the_process_s_own_clock(fake) -> None:
     assert has_ended(note)
 
 
+def test_training_beside_a_peer_is_frames_by_either_one_s_clock(fake) -> None:
+    program, note = fake()
+    with threads(1):
+        result = on_these_cores(SMALL, replace(TRIED, jaxued=program))
+    ours, theirs, relative = result.rows
+    settings = SMALL.config.solver
+    frames = settings.batch_size * settings.ppo.horizon
+    assert theirs.value.median == frames / 0.125
+    assert relative.value.median == pytest.approx(0.125 / ours.samples["update"][0])
+    assert "0, jax 0, on 1 core(s)" in result.notes[0] and has_ended(note)
+
+
 def test_what_syllabus_says_of_its_calls_becomes_rows(tmp_path: Path) -> None:
     program = tmp_path / "fake"
     said = {"syllabus": "0", "seconds": {"one": [0.004, 0.001, 0.002], "other": [1.0]}}
@@ -178,3 +197,15 @@ def test_jaxued_plays_what_minigrid_plays() -> None:
         for way in WAYS:
             seconds, reward = peer.play(way)
             assert seconds > 0 and reward == pytest.approx(expected, abs=1e-3)
+
+
+@real
+def test_jaxued_s_training_learns_to_walk_ahead() -> None:
+    """As a Solver does that is trained: more reward on levels whose goal is in sight."""
+    levels = ViewLevel.from_text([">..G", ">.G."])
+    settings = replace(SMALL.config.solver.ppo, learning_rate=3e-3, entropy_coeff=0.0)
+    numbers = asdict(settings) | SMALL.config.task["network"]
+    actions = torch.zeros(64, 2, dtype=torch.int64)
+    with threads(1), jaxued_maze(str(JAXUED), levels, actions, 12, numbers) as peer:
+        rewards = [peer.play(TRAINING)[1] for _ in range(60)]
+    assert sum(rewards[-5:]) > 2 * sum(rewards[:5])

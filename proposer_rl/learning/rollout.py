@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning.continued import ContinuedEpisodes
-from proposer_rl.models import ActorCritic, draw, uniform_noise
+from proposer_rl.models import ActorCritic, draw, population, uniform_noise
 from proposer_rl.settings import ArgumentError
 
 
@@ -47,8 +47,11 @@ class RolloutCollector:
         self._horizon = horizon
         self._level = _LevelAside(*agent.level_keys)
         self._policy = RolloutPolicy(agent)
+        acted_in = self.episodes or env
+        if agent.level_keys:
+            acted_in = _WithoutLevel(acted_in, self._level, auto_unwrap=False)
         self._collector = Collector(
-            _WithoutLevel(self.episodes or env, self._level, auto_unwrap=False),
+            acted_in,
             self._policy,
             frames_per_batch=env.batch_size.numel() * horizon,
             total_frames=-1,
@@ -80,12 +83,14 @@ class RolloutCollector:
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
         """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
-        self._policy.begin(inputs["noise"], self._level, self.memory)
+        level = self._level if self._agent.level_keys else None
+        self._policy.begin(inputs["noise"], level, self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
             self.memory = self._policy.memory
         set_next_values(self._agent, rollout, self._policy.context)
-        return TensorDict({"rollout": rollout, "level": self._level.entries})
+        entries = TensorDict({}, rollout.batch_size[:-1]) if level is None else level.entries
+        return TensorDict({"rollout": rollout, "level": entries})
 
 
 @torch.no_grad()
@@ -103,10 +108,28 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
     """Write the values after each of the steps [*B, T], whose level has this context [*B].
 
-    With the memory that is there after each step.
+    With the memory that is there after each step. Where an episode goes on, that is the value
+    before the next step; an agent that reads each step for itself is not asked again for those.
     """
-    after = agent.decode(steps.get("next").select(*agent.step_keys), context)
-    steps.set(("next", agent.value_key), after.get(agent.value_key))
+    after, key = steps.get("next").select(*agent.step_keys), agent.value_key
+    value = steps.get(key)
+    if agent.level_keys or not population.at_hand(value):  # to count is to wait
+        steps.set(("next", key), agent.decode(after, context).get(key))
+        return
+    shape = (1 if agent.copies is None else agent.copies, -1)
+    unknown = steps.get(("next", "done")).squeeze(-1).clone()
+    unknown[..., -1] = True
+    unknown = unknown.reshape(shape)
+    # As many of each replica as of that which has most: those that are known come out the same.
+    most = int(unknown.sum(1).max())
+    which = unknown.byte().argsort(dim=1, descending=True, stable=True)[:, :most]
+    rows = (torch.arange(len(which)).unsqueeze(1), which)
+    asked = after.reshape(shape)[rows]
+    if agent.copies is None:
+        asked = asked.squeeze(0)
+    values = torch.cat([value[..., 1:, :], value[..., -1:, :]], -2).reshape(*unknown.shape, 1)
+    values[rows] = agent.decode(asked, context).get(key).reshape(*which.shape, 1)
+    steps.set(("next", key), values.view(value.shape))
 
 
 class RolloutPolicy(TensorDictModuleBase):

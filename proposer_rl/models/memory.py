@@ -13,6 +13,7 @@ from torchrl.modules import LSTMCell, recurrent_mode
 
 from proposer_rl.models.actor_critic import ActorCritic, categorical
 from proposer_rl.models.population import Population
+from proposer_rl.models.recurrence import distinct, through_time
 from proposer_rl.models.unet import orthogonal_
 
 MEMORY = ("recurrent_state_h", "recurrent_state_c")
@@ -27,7 +28,9 @@ class MemoryNetwork(nn.Module):
     by side, and the memory of those that begin is set to zero.
 
     Args:
-        encoder: maps observations [N, ...] to features [N, F].
+        encoder: maps observations [N, ...] to features [N, F]. If it has ``codes``, which maps them
+            to numbers int64 [N] that are equal only where they are, those that are seen more than
+            once are encoded once.
         features: number F of them.
         actions: number A of actions.
         memory: width M of the LSTM.
@@ -65,14 +68,23 @@ class MemoryNetwork(nn.Module):
         Returns:
             Logits [N, T, A], values [N, T, 1], and the memory after every step, [N, T, M] twice.
         """
-        batch = begins.shape[:2]
-        features = self.encoder(*(x.flatten(0, 1) for x in observed)).unflatten(0, batch)
-        after = []
-        for x, kept in zip(features.unbind(1), (~begins).to(features).unbind(1), strict=True):
-            hidden, cell = self.cell(x, (hidden * kept, cell * kept))
-            after.append((hidden, cell))
-        hiddens, cells = (torch.stack(steps, 1) for steps in zip(*after, strict=True))
-        return self.policy(hiddens), self.value(hiddens), hiddens, cells
+        count, steps = begins.shape[:2]
+        seen = tuple(x.flatten(0, 1) for x in observed)
+        if steps == 1:
+            kept = (~begins[:, 0]).to(hidden)
+            after = self.cell(self.encoder(*seen), (hidden * kept, cell * kept))
+            hiddens, cells = (memory.unsqueeze(0) for memory in after)
+        else:
+            rows = torch.arange(count * steps, device=begins.device)
+            codes = getattr(self.encoder, "codes", None)
+            if codes is not None:
+                kinds, rows = distinct(codes(*seen))
+                seen = tuple(x[kinds] for x in seen)
+            turns = rows.view(count, steps).T, begins.transpose(0, 1)
+            hiddens, cells = through_time(self.cell, self.encoder(*seen), *turns, (hidden, cell))
+        outputs = self.policy(hiddens), self.value(hiddens), hiddens, cells
+        logits, values, hiddens, cells = (output.transpose(0, 1) for output in outputs)
+        return logits, values, hiddens, cells
 
 
 def memory_actor_critic(

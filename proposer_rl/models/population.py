@@ -90,6 +90,11 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def at_hand(tensor: Tensor) -> bool:
+    """Whether a tensor's numbers can be read without waiting for a device."""
+    return tensor.device.type == "cpu"
+
+
 def use_device(device: torch.device) -> None:
     """Make a GPU the current one, and let its fp32 products round their factors to TF32.
 

@@ -46,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--jaxued",
         metavar="PYTHON",
-        help="an interpreter that has jaxued: view measures its maze in JAX, too, on the CPU",
+        help="an interpreter that has jaxued: view and view_training measure it, too, on the CPU",
     )
     parser.add_argument(
         "--syllabus",

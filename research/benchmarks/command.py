@@ -115,9 +115,9 @@ def _options(arguments: argparse.Namespace) -> Options:
                 f"--jaxued {arguments.jaxued}: JAX is measured on the CPU; give --device cpu, not "
                 f"{device}"
             )
-        _check_peer("jaxued", arguments.jaxued, JAXUED, "view", arguments.names)
+        _check_peer("jaxued", arguments.jaxued, JAXUED, ("view", "view_training"), arguments.names)
     if arguments.syllabus is not None:
-        _check_peer("syllabus", arguments.syllabus, SYLLABUS, "teacher", arguments.names)
+        _check_peer("syllabus", arguments.syllabus, SYLLABUS, ("teacher",), arguments.names)
     if arguments.runs:
         _check_runs(arguments.runs, arguments.names)
     unknown = [name for name in arguments.environments if name not in ENVIRONMENTS]
@@ -137,10 +137,13 @@ def _options(arguments: argparse.Namespace) -> Options:
     )
 
 
-def _check_peer(peer: str, python: str, program: str, benchmark: str, names: list[str]) -> None:
-    if names and benchmark not in names:
+def _check_peer(
+    peer: str, python: str, program: str, benchmarks: tuple[str, ...], names: list[str]
+) -> None:
+    if names and not set(benchmarks) & set(names):
         raise ConfigError(
-            f"--{peer} {python}: is for the benchmark {benchmark}, not for {', '.join(names)}"
+            f"--{peer} {python}: is for the benchmark {' and '.join(benchmarks)}, not for "
+            f"{', '.join(names)}"
         )
     try:
         said_by(python, program)

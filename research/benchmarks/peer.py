@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,9 +25,9 @@ class Peer(NamedTuple):
 
     Attributes:
         about: its versions and cores, for a reader.
-        play: given one of :data:`research.benchmarks.jaxued_peer.WAYS`, plays all actions; the
-        seconds by
-            the process's own clock, and the sum of rewards.
+        play: given one of :data:`research.benchmarks.jaxued_peer.WAYS`, plays all actions, given
+            ``TRAINING`` makes an update; the seconds by the process's own clock, and the sum of
+            rewards.
     """
 
     about: str
@@ -52,7 +52,13 @@ def said_by(python: str, program: str, *arguments: object) -> dict[str, Any]:
 
 
 @contextmanager
-def jaxued_maze(python: str, levels: ViewLevel, actions: Tensor, max_steps: int) -> Iterator[Peer]:
+def jaxued_maze(
+    python: str,
+    levels: ViewLevel,
+    actions: Tensor,
+    max_steps: int,
+    numbers: Mapping[str, float] | None = None,
+) -> Iterator[Peer]:
     """A process that has jaxued's maze in memory, with as many cores as torch has threads.
 
     Args:
@@ -60,6 +66,7 @@ def jaxued_maze(python: str, levels: ViewLevel, actions: Tensor, max_steps: int)
         levels: N of one size.
         actions: int64 [T, N], of ours, which are jaxued's first three.
         max_steps: of an episode.
+        numbers: of PPO and the network, for training.
 
     Yields:
         The process; it is killed in the end.
@@ -69,7 +76,8 @@ def jaxued_maze(python: str, levels: ViewLevel, actions: Tensor, max_steps: int)
     """
     with TemporaryDirectory() as folder:
         file = Path(folder) / "played.npz"
-        np.savez(file, **played(levels, actions, max_steps))
+        arrays = played(levels, actions, max_steps)
+        np.savez(file, **arrays, numbers=np.asarray(json.dumps(numbers)))
         command = [python, ISOLATED, PROGRAM, str(file), str(torch.get_num_threads())]
         # Unbuffered, so that nothing is left to be written when it has ended.
         with subprocess.Popen(

@@ -21,6 +21,7 @@ from research.benchmarks.results import Options, Result
 from research.benchmarks.solver import against_plain, in_both_precisions, overhead, population
 from research.benchmarks.teacher import teacher_calls
 from research.benchmarks.view import view_steps
+from research.benchmarks.view_training import view_training
 
 
 class Benchmark(NamedTuple):
@@ -44,6 +45,7 @@ BENCHMARKS = {
     "environment": Benchmark("environment steps against Gymnasium", environment_steps),
     "processes": Benchmark("environments of Gymnasium in several processes", in_processes),
     "view": Benchmark("steps in the view maze against MiniGrid", view_steps),
+    "view_training": Benchmark("training in the view maze, beside jaxued's PPO", view_training),
     "evaluation": Benchmark("exact evaluation against a Solver update", exact_evaluation),
     "overhead": Benchmark("what of a Solver update is not the network", overhead),
     "precision": Benchmark("a Solver update in bf16 against fp32", in_both_precisions),

@@ -119,8 +119,7 @@ class GymnasiumEnv(EnvBase):
         """
         if entry.dtype == np.uint8:
             return entry
-        with np.errstate(over="ignore"):
-            numbers = entry.astype(np.float32, copy=False)
+        numbers = entry.astype(np.float32, copy=False)
         finite = np.isfinite(numbers)
         if not finite.all():
             first = int(finite.reshape(len(finite), -1).all(-1).argmin())

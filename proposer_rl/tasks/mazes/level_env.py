@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from proposer_rl.models import population
 from proposer_rl.tasks.mazes.levels import Level
 
 ENDS = ("done", "terminated", "truncated")
@@ -85,25 +86,46 @@ class LevelEnv(EnvBase):
         self._next_levels.update_(levels)
         self._waiting = True
 
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """As TorchRL's, without its checks of what this environment has written itself."""
+        after, given = self._step(tensordict), tensordict.get("next", None)
+        if given is not None:  # by the policy, such as what it remembers
+            after.update(given.exclude(*after.keys()))
+        tensordict.set("next", after)
+        return tensordict, self.maybe_reset(self._step_mdp(tensordict))
+
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sends the agents of finished mazes back to their starts.
 
-        As TorchRL's, but without asking first whether there are any, which would wait for the
-        device.
+        As TorchRL's, but without asking a GPU first whether there are any, which would have to be
+        waited for.
         """
         if self._waiting:
             return super().maybe_reset(tensordict)
         done = tensordict.get("done")  # [*B, 1]
+        ended = done.flatten().nonzero().squeeze(1) if population.at_hand(done) else None
+        if ended is not None and not len(ended):
+            return tensordict
         after = tensordict.copy()
         for key, first in self._first().items():
             if key in tensordict.keys() and key not in self._constant:
-                ended = done.reshape(*self.batch_size, *[1] * (first.ndim - self.batch_dims))
-                after.set(key, first.where(ended, tensordict.get(key)))
+                after.set(key, self._begun(first, tensordict.get(key), done, ended))
         after.set("step_count", tensordict.get("step_count") * ~done)
         for key in ENDS:
             after.set(key, torch.zeros_like(done))
         self._agent = after.get("agent")
         return after
+
+    def _begun(self, first: Tensor, standing: Tensor, done: Tensor, ended: Tensor | None) -> Tensor:
+        """What stands in mazes, as at first where they are done."""
+        if ended is None:
+            more = [1] * (first.ndim - self.batch_dims)
+            return first.where(done.reshape(*self.batch_size, *more), standing)
+        flat = (x.reshape(-1, *x.shape[self.batch_dims :]) for x in (standing, first))
+        rows, begun = flat
+        return rows.index_copy(0, ended, begun[ended]).view(standing.shape)
 
     def to(self, device: torch.device | str | int) -> Self:
         """Moves the environment and its levels to a device."""
@@ -137,7 +159,8 @@ class LevelEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(self.batch_size)
         if mask is None:
-            self._play(self._next_levels.clone())
+            if self._waiting:
+                self._play(self._next_levels.clone())
             self._waiting = False
         elif self._waiting:
             self._play(self._next_levels.where(mask, self._levels))
@@ -156,12 +179,12 @@ class LevelEnv(EnvBase):
         cut off.
         """
         step_count = tensordict.get("step_count") + 1
-        truncated = (step_count >= self.max_steps) & ~terminated
+        late = step_count >= self.max_steps
         return {
             "step_count": step_count,
-            "done": terminated | truncated,
+            "done": terminated | late,
             "terminated": terminated,
-            "truncated": truncated,
+            "truncated": late > terminated,
         }
 
     def _set_seed(self, seed: int | None) -> None:

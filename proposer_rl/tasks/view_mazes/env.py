@@ -82,8 +82,10 @@ class ViewMazeEnv(LevelEnv):
         objects = torch.where(walls, WALL, EMPTY).to(torch.uint8)
         goal = cell_index(levels.goal + RIM, width).reshape(count, 1)
         self._objects = objects.scatter_(1, goal, GOAL).flatten()
-        self._origin = torch.arange(count, device=device).view(self.batch_size) * (rows * width)
-        self._moves, self._ahead, self._seen = _directions(width, device)
+        rim = RIM * (width + 1)  # before the first cell of a grid
+        each = torch.arange(count, device=device).view(self.batch_size)
+        self._origin = each * (rows * width) + rim
+        self._meaning, self._seen = _directions(width, device)
         self._first_view = self._view(self._place(levels.start), levels.direction)
 
     def _first(self) -> dict[str, Tensor]:
@@ -95,23 +97,22 @@ class ViewMazeEnv(LevelEnv):
         }
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action, direction = tensordict.get("action"), tensordict.get("direction")
-        forward = action == FORWARD
-        turned = (direction + torch.where(action == LEFT, -1, 1)) & 3
-        direction = torch.where(forward, direction, turned)
-        place = self._place(tensordict.get("agent"))
-        ahead = place + self._ahead.take(direction)
+        agent, turn = tensordict.get("agent"), len(AHEAD) - 1
+        does = torch.add(tensordict.get("action"), tensordict.get("direction"), alpha=turn)
+        meant = self._meaning.index_select(0, does.flatten()).view(*does.shape, 4)
+        direction, place = meant[..., 0], self._place(agent)
+        ahead = place + meant[..., 1]
         there = self._objects.take(ahead)
-        moved = forward & (there != WALL)
+        moved = there != WALL
         place = torch.where(moved, ahead, place)
-        terminated = (forward & (there == GOAL)).unsqueeze(-1)
-        self._agent = tensordict.get("agent") + self._moves[direction] * moved.unsqueeze(-1)
+        terminated = (there == GOAL).unsqueeze(-1)
+        self._agent = torch.addcmul(agent, meant[..., 2:], moved.unsqueeze(-1))
         ends = self._after(terminated, tensordict)
         reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
         return TensorDict(
             {
                 "view": self._view(place, direction),
-                "direction": direction,
+                "direction": direction.contiguous(),
                 "agent": self._agent,
                 "is_init": torch.zeros_like(terminated),
                 **ends,
@@ -122,7 +123,7 @@ class ViewMazeEnv(LevelEnv):
         )
 
     def _place(self, agent: Tensor) -> Tensor:
-        return cell_index(agent + RIM, self._width) + self._origin
+        return cell_index(agent, self._width) + self._origin
 
     def _view(self, place: Tensor, direction: Tensor) -> Tensor:
         seen = self._seen.index_select(0, direction.flatten())  # [N, 25]
@@ -133,21 +134,25 @@ class ViewMazeEnv(LevelEnv):
 
 
 @cache
-def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """What a direction means in a line of grids of some width, of each of the four.
+def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """What actions and directions mean in a line of grids of some width.
 
     Made once: from numbers of the host, which a recorded reset must not ask for.
 
     Returns:
-        The move forward [4, 2], the change of place that it makes [4], and the changes of place
-        from the agent to the cells that it sees, int32 [4, 25].
+        Of each action in each direction, int64 [4 * 3, 4]: the direction after it, the change of
+        place if nothing is in the way, and the move; and the changes of place from the agent to the
+        cells that it sees, of each direction, int32 [4, 25].
     """
-    ahead = torch.tensor(AHEAD)
+    ahead, none = torch.tensor(AHEAD), torch.zeros(len(AHEAD), 2, dtype=torch.int64)
+    each = torch.arange(len(AHEAD))
+    turned = torch.stack([(each - 1) % len(AHEAD), (each + 1) % len(AHEAD), each], 1)
+    moves = torch.stack([none, none, ahead], 1).flatten(0, 1)
     right = ahead.roll(-1, 0)
     across, along = torch.meshgrid(
         torch.arange(VIEW) - AGENT[0], AGENT[1] - torch.arange(VIEW), indexing="ij"
     )
     seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
+    meaning = torch.cat([turned.view(-1, 1), cell_index(moves, width).unsqueeze(1), moves], 1)
     # int32: half the memory to go through.
-    tables = ahead, cell_index(ahead, width), cell_index(seen, width).flatten(1).int()
-    return tuple(table.to(device) for table in tables)  # type: ignore[return-value]
+    return meaning.to(device), cell_index(seen, width).flatten(1).int().to(device)

@@ -37,6 +37,12 @@ class ViewEncoder(nn.Module):
         nn.init.orthogonal_(self.direction.weight, 2**0.5)
         self.features = channels * (VIEW - 2) ** 2 + direction
 
+    def codes(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Numbers of what is seen, int64 [N], equal where views and directions are."""
+        digits = ((view & WALL) >> 1) | ((view & GOAL) >> 2)
+        base = 4 ** torch.arange(VIEW**2, device=view.device)
+        return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
+
     def forward(self, view: Tensor, direction: Tensor) -> Tensor:
         """Features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
         colour = (view == WALL) * GREY + (view == GOAL) * GREEN
