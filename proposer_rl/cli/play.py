@@ -62,10 +62,12 @@ def _run(options: argparse.Namespace) -> None:
 def open_session(folder: Path) -> Session:
     """What there is to see of the run in a folder."""
     settings_file(folder)  # before what takes seconds to import
+    from proposer_rl.cli.config import saved_config
     from proposer_rl.cli.outcome import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
 
+    saved_config(folder)  # a folder that is no run's has no checkpoints either
     stored = stored_run(folder)
     return Session(
         folder=folder,
