@@ -33,7 +33,7 @@ class Children:
             the lowest difference of mean return and mean absolute advantage (``easy``).
 
     Attributes:
-        reads: entries of an outcome that the choice of the parents needs.
+        reads: entries of an outcome by which parents are chosen.
 
     Raises:
         ArgumentError: if there are to be edits and nothing makes them.

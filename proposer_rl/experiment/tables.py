@@ -65,7 +65,7 @@ class RunTables:
     def add_cycle(
         self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
     ) -> None:
-        """What a curriculum tells of the cycle that has ended; of its levels, records."""
+        """What a curriculum logs of the cycle that has ended; of its levels, records."""
         told = dict(metrics)
         if "levels" in told:
             shown = told["levels"].items()
