@@ -13,7 +13,7 @@ SMOKE = ("+scale=smoke", "compute.progress=false", "hydra.run.dir=run")
     [
         (["+method=learning_progress", "curriculum.fast=1"], "curriculum.fast=1: input should be"),
         (["+method=alp_gmm", "curriculum.refit=300"], "warmup=250: a mixture is fitted"),
-        (["+method=currot", "curriculum.epsilon=nan"], "curriculum.epsilon=nan: input should"),
+        (["+method=currot", "curriculum.epsilon=nan"], "curriculum.epsilon=nan: must be finite"),
         (["+method=currot", "compute.collector=multiprocess"], "this method trains no replicas"),
     ],
 )
