@@ -18,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import metadata
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -146,7 +147,8 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
-        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, "task.levels=2")
+        few = ["task.levels=2", "solver.ppo.epochs=1", "pool.candidates=4"]
+        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, *few)
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
         yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
@@ -224,8 +226,12 @@ def _end_with(function: Callable[..., None], *given: Any) -> None:
 
 
 def _main() -> None:
-    import proposer_rl.cli.run  # noqa: F401
 
+    # Of the tests' folder nothing else can be imported.
+    spec = spec_from_file_location("composing", Path(__file__).with_name("composing.py"))
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(composing := module_from_spec(spec))
+    composing.remember()
     assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
     for line in sys.stdin:
         extra, site, folder = json.loads(line)

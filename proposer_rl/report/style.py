@@ -164,7 +164,7 @@ def render(drawing: Drawing) -> Drawn:
                 handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
             )
         png = _render(figure, "png")
-        figure.set_layout_engine("none")  # it stands
+        figure.set_layout_engine(None)  # it stands
         return Drawn(_render(figure, "svg"), png)
 
 
