@@ -117,7 +117,7 @@ def _curriculum(
 ) -> Curriculum:
     def tell(done: int) -> None:
         if status is not None:
-            status.tick("training the replicas", done)
+            status.tell("training the replicas", done)
 
     def on_update(done: int) -> None:
         tell(done)
