@@ -44,7 +44,8 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
             tensordict. All inputs keep their shapes.
 
     Returns:
-        A function whose outputs are nobody else's. It raises a GraphError where it cannot be recorded.
+        A function whose outputs are nobody else's. It raises a GraphError where it cannot be
+        recorded.
     """
     with warnings.catch_warnings():
         # Tensordicts are no pytrees from here on, which nothing here takes them for.
