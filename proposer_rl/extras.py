@@ -4,21 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-def check_extra(extra: str) -> None:
-    """Refuse what is no extra of this package.
-
-    Raises:
-        ValueError: naming those that there are.
-    """
-    known = metadata.metadata("proposer_rl").get_all("Provides-Extra", [])
-    if extra not in known:
-        raise ValueError(f"extra={extra!r}: must be one of {', '.join(known)}, or null")
 
 
 def install_command(extra: str) -> str:

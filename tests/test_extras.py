@@ -61,10 +61,3 @@ def test_a_launcher_that_is_missing_is_told_from_one_that_there_is_not() -> None
         assert explained(error) == line
     error = MissingConfigException("Could not find it", "hydra/launcher/jobs", ["basic"])
     assert explained(error) == "hydra/launcher/jobs: unknown; choose one of: basic"
-
-
-def test_an_extra_that_there_is_not_is_refused() -> None:
-    for extra in EXTRAS:
-        extras.check_extra(extra)
-    with pytest.raises(ValueError, match="extra='nonsense': must be one of .*box2d"):
-        extras.check_extra("nonsense")

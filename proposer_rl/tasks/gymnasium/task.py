@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
-from proposer_rl.extras import check_extra, install_command
+from proposer_rl.extras import install_command
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.streams import Streams
@@ -94,8 +94,6 @@ class GymnasiumTask(Task):
         transforms: list[Any] | None = None,
         train_seeds: Annotated[int, Ge(1), Le(LARGEST_SEED - 1)] | None = None,
     ) -> None:
-        if extra is not None:
-            check_extra(extra)
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
         success.check()
