@@ -17,7 +17,6 @@ from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
 from proposer_rl.report.records import words
-from proposer_rl.report.scores import check_names, generalisation_table, read_scores
 from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
@@ -25,6 +24,7 @@ from proposer_rl.report.tables import Table, escape_markdown
 from proposer_rl.report.tidy import STUDY
 from proposer_rl.runs.folder import write_atomically
 from research.claims import GAIN, TITLE, Evidence, own_claims, paper_claims, rules
+from research.generalisation import check_names, generalisation_table, read_scores
 from research.ranking import (
     SITUATIONS,
     STEADY,
@@ -78,7 +78,7 @@ def write_pages(
         needs: what methods need, for runs that do not tell.
         threshold: see :func:`~proposer_rl.report.build.write_report`.
         baseline: the same.
-        scores: of the runs on further levels, as ``bin/eval`` writes them; None for none.
+        scores: of the runs on further levels, by ``bin/research scores``; None for none.
         seconds: of the methods, as ``bin/bench curricula --runs`` writes them; none for what the
             runs took.
 
@@ -282,7 +282,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--threshold", type=number(float), help="of sample efficiency")
     parser.add_argument("--baseline", metavar="METHOD", help="as the report calls it")
     parser.add_argument(
-        "--scores", type=Path, metavar="FILE", help="of these runs on further levels, by bin/eval"
+        "--scores", type=Path, metavar="FILE", help="of these runs, by bin/research scores"
     )
     parser.add_argument(
         "--seconds",

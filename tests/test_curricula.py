@@ -17,7 +17,6 @@ from proposer_rl.curricula import (
     Student,
     TaskStudent,
 )
-from proposer_rl.curricula.proposer import explained_share
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, agent_weights, load_agent
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.rewards import log_success_gain
@@ -122,27 +121,6 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
     assert np.shape(metrics["histogram"]) == (2, 2)  # fractions, lengths
     assert np.sum(metrics["histogram"]) == K * L * P
     assert not (weights(curriculum) == before).all()
-
-
-def test_the_explained_share_is_that_of_a_linear_model() -> None:
-    actions = torch.randn(8, 3, 2, generator=torch.Generator().manual_seed(0))
-    mean = actions.mean(1)
-    gains = 0.1 + mean @ torch.tensor([0.5, -1.0])
-    assert explained_share(actions, gains) == pytest.approx(1)
-    generator = torch.Generator().manual_seed(1)
-    noise = [explained_share(actions, torch.randn(8, generator=generator)) for _ in range(2000)]
-    assert abs(sum(noise) / 2000) < 0.03  # on average nothing, where there is nothing
-    noisy = gains + torch.randn(8, generator=generator)
-    _, squares, *_ = np.linalg.lstsq(np.c_[np.ones(8), mean.numpy()], noisy.numpy())
-    share = 1 - (squares[0] / 5) / noisy.numpy().var(ddof=1)
-    assert explained_share(actions, noisy) == pytest.approx(share, abs=1e-5)
-
-
-def test_the_explained_share_is_unknown_where_it_cannot_be_told() -> None:
-    gains = torch.randn(4)
-    assert explained_share(torch.zeros(4, 2, 6, dtype=torch.int64), gains) is None
-    assert explained_share(torch.randn(4, 1, 3), gains) is None
-    assert explained_share(torch.randn(4, 1, 2), torch.zeros(4)) is None
 
 
 @pytest.mark.parametrize("advance", ["train", "best", "random"])

@@ -13,11 +13,9 @@ from omegaconf import OmegaConf
 from submitit.core.utils import UncompletedJobError
 
 from proposer_rl.cli.config import RunConfig
-from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report.progress import PLAN, Left, left
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.lock import locked
 from proposer_rl.runs.signals import Interrupted
@@ -109,79 +107,6 @@ def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
     assert len(after) == 4 and before.items() <= after.items()
     said = capsys.readouterr().out
     assert said.count("finished before, nothing to do") == 1 and "4 runs: 4 finished" in said
-    told = [line for line in said.splitlines() if line.startswith("sweep: ")]
-    left = [line.partition(",")[0] for line in told]
-    assert left == [f"sweep: {n} of 4 runs left" for n in (3, 2, 1, 0)]
-
-
-PLANNED = """
-hydra:
-  sweeper: {{params: {{seed: "range(0,2)", +method: "perf_gain,target", +scale: "{scale}"}}}}
-  overrides: {{task: [+sweep=medium, {given}]}}
-"""
-
-
-def finished(folder: Path, seconds: float, *overrides: str) -> None:
-    folder.mkdir(parents=True)
-    (folder / "config.json").touch()
-    facts = {"overrides": overrides, "seconds": seconds}
-    (folder / "summary.json").write_text(json.dumps(facts))
-
-
-@pytest.mark.parametrize(
-    ("given", "more"),
-    [
-        # Of the plan's command, and of a run of the same settings.
-        ([], []),
-        (["compute.cores=1"], ["logger=wandb", "compute.threads=1", "hydra.run.dir=x"]),
-        (["precision=auto"], ["precision=fp32"]),
-        (["solver.ppo.learning_rate=1e-3"], ["solver.ppo.learning_rate=0.001"]),
-        (["solver.ppo.normalize_advantage=false"], ["solver.ppo.normalize_advantage=False"]),
-        (["+ablation=paper_literal"], ["+ablation=paper_literal"]),
-        (["'pool.simplest={a: [0, 1]}'"], ["pool.simplest={a:[0,1]}"]),
-        (["'schedule.updates=${pool.keep}'"], ["schedule.updates=256"]),
-    ],
-)
-@pytest.mark.parametrize("scale", ["medium", "${scale}"])
-def test_a_run_counts_as_finished_if_it_was_given_the_same(
-    scale: str, given: list[str], more: list[str], tmp_path: Path
-) -> None:
-    """Made by the sweep or by a command of its own; not with anything more, less or else."""
-    (tmp_path / PLAN).write_text(PLANNED.format(scale=scale, given=", ".join(given)))
-    own = ["+method=perf_gain", "+scale=medium", *more]
-    others = {
-        "+ablation=other": [*own, "seed=0", "+ablation=other"],
-        "+filter=learnability": [*own, "seed=0", "+filter=learnability"],
-        "another number": [*own, "seed=0", "pool.capacity=7"],
-        "another method": ["+method=sfl", *own[1:], "seed=0"],
-        "another seed": [*own, "seed=7"],
-        "less": ["+scale=medium", *more, "seed=0"],
-    }
-    for name, overrides in others.items():
-        finished(tmp_path / name, 1000.0, *overrides)
-    # Four are left, of which two are like one that took 1000 seconds with another seed.
-    assert left(tmp_path, planned(tmp_path)) == Left(4, 4, pytest.approx(4000), 1)
-    finished(tmp_path / "alone", 10.0, "seed=0", *reversed(own))
-    finished(tmp_path / "of the sweep", 20.0, *own, "seed=1", "+sweep=medium")
-    mean = (6 * 1000 + 30) / 8
-    assert left(tmp_path, planned(tmp_path)) == Left(2, 4, pytest.approx(2 * mean), 1)
-
-
-def test_what_is_computed_alike_counts_where_it_is_swept(tmp_path: Path) -> None:
-    plan = PLANNED.format(scale="medium", given='"compute.threads=1,2"')
-    (tmp_path / PLAN).write_text(plan)
-    own = ["+method=target", "+scale=medium", "seed=0"]
-    finished(tmp_path / "one", 9.0, *own, "compute.threads=1")
-    found = left(tmp_path, planned(tmp_path))
-    assert found is not None and (found.runs, found.of) == (7, 8)
-
-
-def test_a_sweep_of_seeds_alone_is_that_of_its_method(tmp_path: Path) -> None:
-    plan = PLANNED.format(scale="medium", given="+method=target")
-    (tmp_path / PLAN).write_text(plan)
-    for seed, method in enumerate(["target", "perf_gain"]):
-        finished(tmp_path / method, 9.0, f"+method={method}", "+scale=medium", f"seed={seed}")
-    assert left(tmp_path, planned(tmp_path)) == Left(1, 2, pytest.approx(9.0), 1)
 
 
 def test_a_failed_run_is_listed_and_tried_again(

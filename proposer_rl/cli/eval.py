@@ -28,11 +28,10 @@ def _run(options: argparse.Namespace) -> None:
             raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
         if file is not None and not file.parent.is_dir():
             raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
-    from proposer_rl.cli.compare import compare, of_several
     from proposer_rl.cli.evaluate import list_levels
 
     try:
-        (compare if of_several(options) else list_levels)(options)
+        list_levels(options)
     except ValueError as error:
         raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
 
@@ -44,22 +43,14 @@ def _parser() -> argparse.ArgumentParser:
         "can, on levels of any size where it has files of them.",
         epilog="docs/how_to/levels.md describes such files and the sets that come along.",
     )
-    parser.add_argument(
-        "checkpoint",
-        nargs="+",
-        type=Path,
-        help="a run's folder, or one of its checkpoints; several folders of runs, or one with runs "
-        "in it, for a table of methods, which takes no checkpoints",
-    )
+    parser.add_argument("checkpoint", type=Path, help="a run's folder, or one of its checkpoints")
     parser.add_argument(
         "--levels",
         metavar="FILE|NAME",
-        nargs="+",
-        default=[],
         help="a distribution of the run such as id or ood; where the task has files of levels also "
         "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
         "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
-        "on another one; several for a table of methods, of runs' folders",
+        "on another one",
     )
     parser.add_argument(
         "--max-steps",
@@ -69,11 +60,7 @@ def _parser() -> argparse.ArgumentParser:
         "that are none of a distribution 2 for each move of the shortest path if this is more)",
     )
     parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        help="a file for the rows that ends in .json or .csv; of several runs their means, and "
-        "those that are in it are not computed again",
+        "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"
     )
     parser.add_argument(
         "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
-from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.scores import read_scores
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.task import LevelResult
@@ -52,9 +48,7 @@ class Evaluation(NamedTuple):
 
 def list_levels(options: argparse.Namespace) -> None:
     """Evaluate one run, print its levels one by one, and write what was asked for."""
-    (checkpoint,), name = options.checkpoint, next(iter(options.levels), None)
-    _refuse_table(options.output)
-    evaluation = evaluate(load(checkpoint), name, options.max_steps)
+    evaluation = evaluate(load(options.checkpoint), options.levels, options.max_steps)
     _print(evaluation)
     if options.output is not None and options.output.suffix == ".csv":
         rows = evaluation.rows()
@@ -64,13 +58,6 @@ def list_levels(options: argparse.Namespace) -> None:
         write_rows(evaluation.rows(), options.output)
     if options.pictures is not None:
         write_atomically(options.pictures, _sheet(evaluation))
-
-
-def _refuse_table(output: Path | None) -> None:
-    """Scores of several runs, which may have taken hours, are not written over by those of one."""
-    with suppress(UnreadableRun):
-        if output is not None and output.is_file() and read_scores(output):
-            raise ConfigError(f"--output {output}: has scores of several runs; name another file")
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:

@@ -18,7 +18,6 @@ examples:
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
-  bin/report sweeps/medium --publish results/medium   the runs as a study, for others to go on from
   bin/report outputs results/medium        your runs beside published ones
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
@@ -29,11 +28,7 @@ the figures as far as they got, not in the comparisons, and the report says so."
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if options.publish is not None and (options.threshold, options.baseline) != (None, None):
-        parser.error("--publish: writes runs, so neither --threshold nor --baseline has a meaning")
-    command(partial(_run, options))
+    command(partial(_run, _parser().parse_args(arguments)))
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -41,13 +36,6 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.records import printable
 
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
-    if options.publish is not None:
-        from proposer_rl.report.publish import publish
-
-        written, left_out = publish(options.folder, options.publish)
-        said = [*left_out, f"Runs: {written} in {options.publish}"]
-        print(*map(printable, said), sep="\n")
-        return
     from proposer_rl.report.build import write_report
 
     page = write_report(
@@ -71,16 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth"
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
+    parser.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"
-    )
-    where.add_argument(
-        "--publish",
-        type=Path,
-        metavar="FOLDER",
-        help="write the finished runs there as a study instead: a few tables without checkpoints "
-        "and pictures of levels, small enough for a repository, and read as any runs are",
     )
     parser.add_argument(
         "--threshold",

@@ -9,13 +9,12 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, RenderableType
 from rich.live import Live
-from rich.text import Text
 
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import command
-from proposer_rl.report.progress import PLAN, find_progress, left
+from proposer_rl.report.progress import find_progress
 from proposer_rl.report.terminal import overview, screen
 
 EPILOG = """\
@@ -46,13 +45,7 @@ def _run(options: argparse.Namespace) -> None:
 def draw(folder: Path) -> RenderableType:
     """The folder's run as a screen, or its runs as a table."""
     found = find_progress(folder)
-    shown = screen(found[0]) if len(found) == 1 else overview(found)
-    if not (folder / PLAN).exists():
-        return shown
-    from proposer_rl.cli.sweep import planned  # only now: it takes a while
-
-    rest = left(folder, planned(folder))
-    return shown if rest is None else Group(shown, Text(rest.text()))
+    return screen(found[0]) if len(found) == 1 else overview(found)
 
 
 def _parser() -> argparse.ArgumentParser:

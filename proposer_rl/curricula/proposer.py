@@ -227,35 +227,6 @@ class ProposerTrainer:
             **gains,
             "total_reward": rewards.tolist(),
             "reward_sd": float(rewards.std(correction=0)),
-            "reward_explained": explained_share(rollout["action"], rewards),
             **{key: float(value) for key, value in training.items()},
             "histogram": proposed.unflatten(0, sides).tolist(),
         }
-
-
-def explained_share(action: Tensor, rewards: Tensor) -> float | None:
-    """Share of the variance of total rewards that a linear function of the actions explains.
-
-    A hint, for nothing, of how much of the reward a Proposer can learn from: with adjustment for
-    the number of coefficients it is 0 on average where the actions do not matter, and at most 1.
-    ``research/signal.py`` measures the same without supposing linearity.
-
-    Args:
-        action: [K, T, D]; the mean over the T steps counts.
-        rewards: float [K].
-
-    Returns:
-        The adjusted coefficient of determination; None where actions are no numbers, or too many
-        for K copies to tell.
-    """
-    if not action.is_floating_point():
-        return None
-    copies, directions = action.shape[0], action.shape[-1]
-    spare = copies - 1 - directions
-    if spare < 1 or float(rewards.var()) == 0:
-        return None
-    actions, rewards = action.mean(1).cpu().double(), rewards.cpu().double()
-    design = torch.cat([torch.ones(copies, 1, dtype=torch.double), actions], 1)
-    fitted = design @ torch.linalg.lstsq(design, rewards[:, None]).solution
-    residual = (rewards - fitted[:, 0]).square().sum() / spare
-    return float(1 - residual / rewards.var())

@@ -32,8 +32,6 @@ from proposer_rl.settings import NotNegative, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
-MEASURING, IMPROVING, TRAINING = "measuring", "improving the curriculum", "training the Solver"
-
 
 @settings
 class _Counted:
@@ -98,7 +96,6 @@ class Experiment:
         self.folder = folder
         self.updates = 0
         self.cycles = 0
-        self._advances = False  # whether the Solver becomes a replica in place of training itself
         self._tables = RunTables(task, self.seeds, folder, log)
         self._progress = progress
         self._signals = signals or StopSignals()
@@ -158,17 +155,14 @@ class Experiment:
         )
 
         def show() -> None:
-            doing = self._status.activity().text()
-            text = ", ".join(filter(None, [self._headline_text(), doing]))
+            text = ", ".join(filter(None, [self._headline_text(), self._status.doing]))
             bar.set_postfix_str(text, refresh=sys.stderr.isatty())
 
         with bar, self._status.of_run(self.folder.path, show):
-            self._plan()
             if not resumed:
                 self._measure()
             while self.updates < self.schedule.updates:
                 before = self.updates
-                self._plan()
                 cycle = self.updates // self.schedule.cycle_length
                 with located(f"cycle {cycle}, after {self.updates} Solver updates"):
                     if self.updates >= self.cycles * self.schedule.cycle_length:
@@ -214,7 +208,6 @@ class Experiment:
             outcome = self._improved(self.curriculum)
         logged = self._log_cycle(outcome.metrics)
         self.cycles += 1
-        self._advances = outcome.advance is not None
         if outcome.advance is not None:
             self.updates += outcome.advance.updates
             self._measure()
@@ -227,8 +220,8 @@ class Experiment:
         while True:
             before = deepcopy(self._state())  # improving may change a curriculum's state in place
             try:
-                with self._status.phase(IMPROVING):
-                    return curriculum.improve(self.student, streams)
+                self._status.tell("improving the curriculum")
+                return curriculum.improve(self.student, streams)
             except StopRequested:
                 self._save(before)
                 self._signals.deliver()
@@ -244,17 +237,17 @@ class Experiment:
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
-        with self._status.phase(TRAINING):
-            if self._continued is not None:
-                update, credits = self._continued.update(streams)
-                played = self._continued.shown
-            else:
-                batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
-                self.learner.env.set_levels(batch.levels)
-                update = self.learner.update([stream.generator("actions") for stream in streams])
-                self.learner.check()
-                credits = [(batch, outcome_of(update.rollout))]
-                played = batch.levels, update.rollout
+        self._status.tell("training the Solver")
+        if self._continued is not None:
+            update, credits = self._continued.update(streams)
+            played = self._continued.shown
+        else:
+            batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
+            self.learner.env.set_levels(batch.levels)
+            update = self.learner.update([stream.generator("actions") for stream in streams])
+            self.learner.check()
+            credits = [(batch, outcome_of(update.rollout))]
+            played = batch.levels, update.rollout
         for credit in credits:
             self.curriculum.observe(self.student, *credit)
         self.updates += 1
@@ -264,21 +257,9 @@ class Experiment:
             self._tables.add_training(self.updates, *played, update.metrics)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
-    def _plan(self) -> None:
-        """Say what is left of the schedule."""
-        updates, length = self.schedule.updates, self.schedule.cycle_length
-        left = updates - self.updates
-        self._status.plan(
-            {
-                TRAINING: 0 if self._advances else left,
-                IMPROVING: -(-updates // length) - self.cycles,
-                MEASURING: -(-left // self.schedule.evaluate_every),
-            }
-        )
-
     def _measure(self) -> None:
-        with self._status.phase(MEASURING):
-            measured = self.task.measure(self.learner.agent)
+        self._status.tell("measuring")
+        measured = self.task.measure(self.learner.agent)
         self._headline = measured[self.schedule.headline].tolist()
         self._tables.add_metrics(self.updates, measured, self.costs)
 

@@ -34,20 +34,26 @@ FIGURES, TABLES = "figures", "tables"
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     curves.learning_curves,
     curves.cost_curves,
-    curves.worst_levels,
-    curves.worst_curves,
-    curves.level_by_level,
     curves.difficulty,
-    curves.gains_of_replicas,
     pictures.heat_maps,
     pictures.along_training,
     pictures.side_by_side,
     pictures.recorded_by_curricula,
-    curves.diagnostics,
 )
 
 # These are no charts, so that the page has them as pictures.
 STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
+
+
+# What is to be said of means over the worst share of the levels, by whether they are exact.
+SELECTION = {
+    True: "The measurements are exact, so that no second evaluation is needed: to sort the levels "
+    "by what is averaged selects no luck.",
+    False: "The measurements are sampled, and the levels are sorted by what is averaged: selection "
+    "bias makes the means too low, the more the smaller the share.",
+    None: "The runs do not say whether their measurements are exact. If they are sampled, "
+    "selection bias makes the means too low, the more the smaller the share.",
+}
 
 
 def read_checked(
@@ -162,6 +168,7 @@ def _section(
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
         "single": bool(data["levels"]),
+        "selection": SELECTION[study.example.task.exact],
         "methods": methods,
         "figures": figures,
         "tables": tables,

@@ -96,12 +96,6 @@ def measured(study: Study) -> dict[str, Measure]:
     }
 
 
-def worst_tenths(study: Study) -> list[Measure]:
-    """Of what was measured along training that on the worst tenth of the levels."""
-    every = measured(study)
-    return [every[n] for name in study.measurements if (n := f"{name}_worst10") in every]
-
-
 def trained(study: Study) -> list[Measure]:
     """The task's statistics of the batches."""
     names = dict.fromkeys(name for run in study.runs for name in run.statistics)

@@ -122,7 +122,7 @@ def _read_folder(folder: Path) -> list[Run]:
 
 
 def _read_study(folder: Path) -> list[Run]:
-    """Runs as :func:`~proposer_rl.report.tidy.write_study` wrote them; they lie in the folder."""
+    """The runs of a study, as ``bin/research publish`` writes it; they lie in the folder."""
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
     for row in read_table(folder / STUDY).to_dict("records"):

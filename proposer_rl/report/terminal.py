@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from proposer_rl.report.progress import Progress
+from proposer_rl.report.progress import Progress, duration
 from proposer_rl.report.records import (
     GAINS,
     PLACE,
@@ -26,7 +26,6 @@ from proposer_rl.report.records import (
 )
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.status import duration
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"

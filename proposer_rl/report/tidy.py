@@ -1,4 +1,4 @@
-"""A study as data: runs in a few tidy tables, small enough for a repository and read as runs are.
+"""Runs in a few tidy tables: of a report, and of a study, which is read as runs are.
 
 A study's folder has ``runs.csv.gz``, a row for each run with its settings and facts as JSON, and
 the tables ``metrics``, ``training``, ``cycles`` and ``levels``, each a row for what a run recorded
@@ -8,18 +8,17 @@ Every number is written so that it reads back bit for bit.
 
 from __future__ import annotations
 
-import gzip
 import io
 import json
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
 
 from proposer_rl.report.records import encoded
 from proposer_rl.report.runs import Run
-from proposer_rl.runs.folder import read_bounded, write_atomically
+from proposer_rl.runs.folder import read_bounded
 
 STUDY = "runs.csv.gz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
@@ -67,28 +66,6 @@ def to_csv(table: pd.DataFrame) -> bytes:
         index=False, lineterminator="\n", float_format=lambda x: repr(float(x)).removesuffix(".0")
     )
     return encoded(text)
-
-
-def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
-    """Write the tables of a study; those of a former one are replaced."""
-    listed = [
-        {
-            "run": name,
-            "method": run.method,
-            "ablation": run.ablation,
-            "updates": run.updates,
-            "config": json.dumps(run.config),
-            "facts": json.dumps(dict(run.facts)),
-        }
-        for name, run in dict(runs).items()
-    ]
-    written = {"runs": pd.DataFrame(listed), **tables(runs)}
-    for name in NAMES:
-        if name not in written:
-            (folder / f"{name}.csv.gz").unlink(missing_ok=True)
-    for name, table in reversed(written.items()):  # what makes it a study comes last
-        packed = gzip.compress(to_csv(table), 9, mtime=0)
-        write_atomically(folder / f"{name}.csv.gz", packed)
 
 
 def read_table(file: Path) -> pd.DataFrame:

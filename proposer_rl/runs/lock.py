@@ -1,4 +1,4 @@
-"""One process at a time in a run's folder, or at a file that several add to."""
+"""One process at a time in a run's folder."""
 
 from __future__ import annotations
 
@@ -49,22 +49,6 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-@contextmanager
-def taking_turns(file: Path) -> Iterator[None]:
-    """Wait until no other process does what is done to a file inside.
-
-    Args:
-        file: beside which ``.NAME.lock`` is made; that stays, as a lock has to.
-
-    Raises:
-        StorageError: if the folder cannot be written to.
-    """
-    with storage(file):
-        held = FileLock(file.with_name(f".{file.name}.lock")).acquire()
-    with held:
-        yield
 
 
 def _holder(folder: Path) -> str:

@@ -109,9 +109,8 @@ def test_the_page_says_what_was_run_and_what_is_unfinished(report: Path) -> None
 
 def test_there_are_figures_and_tables_for_other_tools(report: Path) -> None:
     figures = {path.name for path in (report.parent / "figures").iterdir()}
-    names = ("learning_curves", "cost", "worst_levels", "difficulty", "gains", "proposals")
-    more = ("worst_share", "level_by_level", "recorded")
-    for name in (*names, *more, "levels", "samples", "diagnostics"):
+    names = ("learning_curves", "cost", "difficulty", "proposals")
+    for name in (*names, "recorded", "levels", "samples"):
         for suffix in ("svg", "png"):
             assert f"tiny_scale_2_4_mazes_{name}.{suffix}" in figures
     for name in ("methods", "comparisons", "runs", "metrics", "training", "cycles", "levels"):
@@ -246,9 +245,8 @@ def test_the_report_is_built_for_any_task(tmp_path: Path, capsys) -> None:
         write_rockets(tmp_path / "runs" / f"t{seed}", "target", seed)
     page = write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
     figures = {path.name for path in (page.parent / "figures").iterdir()}
-    for name in ("learning_curves", "cost", "difficulty", "gains", "proposals", "levels"):
+    for name in ("learning_curves", "cost", "difficulty", "proposals", "levels", "samples"):
         assert f"{name}.svg" in figures
-    assert {"samples.svg", "diagnostics.svg"} <= figures and "worst_levels.svg" not in figures
     text = Tags(page.read_text(encoding="utf-8")).text
     assert "Tiny scale, rockets" in text and "updates to 12.5 target return" in text
     drawn = json.dumps([data["measures"] for data in page_data(page)])

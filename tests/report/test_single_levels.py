@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from proposer_rl.report import build
 from proposer_rl.report.charts import charts
-from proposer_rl.report.curves import difficulty, level_by_level, worst_curves
+from proposer_rl.report.curves import difficulty
 from proposer_rl.report.measures import worst, worst_means
 from proposer_rl.report.outcomes import group_table
 from proposer_rl.report.statistics import median_interval, median_of
@@ -79,16 +80,12 @@ def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
     [(True, "no second evaluation"), (False, "selection bias makes"), (None, "do not say")],
 )
 def test_the_page_says_whether_selection_bias_is_in_it(
-    exact: bool | None, text: str, tmp_path: Path
+    exact: bool | None, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawing = worst_curves(study_of(tmp_path, exact))
-    assert drawing is not None and text in drawing.caption and len(drawing.panels) == 2
-
-
-def test_methods_are_drawn_against_the_baseline(tmp_path: Path) -> None:
-    drawing = level_by_level(study_of(tmp_path))
-    assert drawing is not None and len(drawing.panels) == 1
-    assert drawing.title.endswith("against domain_randomization")
+    monkeypatch.setattr(build, "DRAWINGS", [])
+    study_of(tmp_path / "runs", exact)
+    page = build.write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
+    assert text in page.read_text(encoding="utf-8")
 
 
 def test_the_page_has_what_every_method_reaches_on_each_level(tmp_path: Path) -> None:
@@ -119,7 +116,6 @@ def test_levels_of_runs_that_are_not_at_the_horizon_do_not_count(tmp_path: Path)
 def test_without_single_levels_there_is_no_figure(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target")
     study = read_studies([tmp_path / "a"], None)[0][0]
-    assert worst_curves(study) is None and level_by_level(study) is None
     assert not worst(study)
     assert not any("IQM" in name for name in group_table(study).columns)
 
@@ -131,6 +127,5 @@ def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
     (tmp_path / "bare" / "training.csv").unlink()
     study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
     assert set(study.legend) == {"target", "plr"}
-    for draw in (worst_curves, difficulty):
-        drawing = draw(study)
-        assert drawing is not None and drawing.legend == {"target": study.legend["target"]}
+    drawing = difficulty(study)
+    assert drawing is not None and drawing.legend == {"target": study.legend["target"]}

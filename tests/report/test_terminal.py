@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from proposer_rl.cli.sweep import planned
 from proposer_rl.cli.watch import main
-from proposer_rl.report.progress import Left, find_progress, left, read_progress
+from proposer_rl.report.progress import duration, find_progress, read_progress
 from proposer_rl.report.terminal import BLOCKS, sparkline
 from tests.report.folders import TASK, cycle, write_run
 
@@ -65,19 +63,25 @@ def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
     assert "4 runs: 1 finished, 1 failed, 1 unfinished, 1 starting" in text
 
 
-def test_a_run_says_what_it_is_doing(tmp_path: Path, capsys) -> None:
+def test_a_run_says_what_it_is_doing_and_how_long_the_rest_takes(tmp_path: Path, capsys) -> None:
+    """As long for each update as those so far."""
     folder = write_run(tmp_path / "run", finished=False)
-    said = {"doing": "training the copies", "done": 37, "of": 100, "seconds_left": 18000.0}
-    (folder / "progress.json").write_text(json.dumps({**said, "at_least": False}))
-    text = " ".join(watch(capsys, str(folder)).split())
-    assert "ago: training the copies 37/100, about 5 h left" in text
+    run = read_progress(folder).runs[0]
+    planned = json.loads((folder / "run.json").read_text()) | {"planned_updates": 5 * run.updates}
+    (folder / "run.json").write_text(json.dumps(planned))
+    text = "training the copies 37/100"
+    assert "left" not in watch(capsys, str(folder))  # it is interrupted, for all we know
+    (folder / "progress.json").write_text(json.dumps({"doing": text}))
+    doing, left = read_progress(folder).activity.split(", about ")
+    assert doing == text and left.endswith(" s left")
+    assert float(left.split()[0]) == pytest.approx(4 * run.last("seconds"), abs=30)
     write_run(tmp_path / "other")
-    assert "about 5 h left" in watch(capsys, str(tmp_path))
+    assert f"run: {text}, about" in watch(capsys, str(tmp_path))
 
 
 @pytest.mark.parametrize(
     "content",
-    ["{", "[]", '{"doing": "x\\u001b", "done": 1}', "[" * 3000, "x" * 5000, '{"doing": NaN}'],
+    ["{", "[]", '{"doing": 1}', "[" * 3000, "x" * 5000, '{"doing": NaN}'],
 )
 def test_what_a_run_says_may_be_anything(content: str, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
@@ -99,71 +103,6 @@ def test_the_age_is_that_of_the_newest_file(tmp_path: Path) -> None:
     old = read_progress(folder).age
     (folder / "metrics.csv").touch()
     assert old > 1e8 and read_progress(folder).age < 60
-
-
-PLAN = """
-hydra:
-  sweeper: {params: {seed: "range(0,3)", +method: "target,plr,sfl", +scale: quick}}
-  overrides: {task: ["+sweep=x", "seed=4,5", compute.threads=1]}
-"""
-
-
-def write_planned(folder: Path, method: str, seed: int, **options: Any) -> Path:
-    overrides = ["compute.threads=1", "+scale=quick", f"+method={method}", f"seed={seed}"]
-    return write_run(folder / f"{method}{seed}", method, facts={"overrides": overrides}, **options)
-
-
-def finish(folder: Path, seconds: float) -> None:
-    overrides = json.loads((folder / "run.json").read_text())["overrides"]
-    (folder / "summary.json").write_text(json.dumps({"overrides": overrides, "seconds": seconds}))
-
-
-def test_a_sweep_says_how_long_the_rest_will_take(tmp_path: Path, capsys) -> None:
-    """Of six runs three are to be made; one goes on, and of one method nothing has finished."""
-    (tmp_path / "multirun.yaml").write_text(PLAN)
-    runs = [("target", 4, 100.0), ("plr", 4, 1000.0), ("plr", 5, 3000.0)]
-    for method, seed, seconds in runs:
-        finish(write_planned(tmp_path, method, seed), seconds)
-        assert "sweep: " in watch(capsys, str(tmp_path))  # of the first run, too
-    assert sorted(planned(tmp_path)) == sorted(
-        (f"seed={seed}", f"+method={method}", "+scale=quick", "+sweep=x", "compute.threads=1")
-        for seed in (4, 5)
-        for method in ("target", "plr", "sfl")
-    )
-    # target: 100; sfl twice: the mean of all, 4100 / 3
-    assert left(tmp_path, planned(tmp_path)) == Left(3, 6, pytest.approx(100 + 8200 / 3), 1)
-    for seed in (4, 5):
-        folder = write_planned(tmp_path, "sfl", seed, finished=False)
-        (folder / "progress.json").touch()
-    text = " ".join(watch(capsys, str(tmp_path)).split())
-    assert "sweep: 3 of 6 runs left, about 24 min, 2 at a time" in text  # (100 + 8200 / 3) / 2
-    (folder / "error.json").write_text("{}")  # it has failed since, and is to be made anew
-    text = " ".join(watch(capsys, str(tmp_path)).split())
-    assert "sweep: 3 of 6 runs left, about 47 min, 1 at a time" in text
-    for name in ("progress.json", "error.json"):
-        (folder / name).unlink()
-    write_planned(tmp_path, "target", 5, finished=False)
-    for path in tmp_path.iterdir():
-        if path.is_dir():
-            finish(path, 1.0)
-    assert "sweep: 0 of 6 runs left" in watch(capsys, str(tmp_path))
-
-
-@pytest.mark.parametrize(
-    "plan",
-    [
-        "[",
-        "hydra: 3",
-        "hydra: {sweeper: {params: {a: 'range(0,1000000000)'}}, overrides: {task: []}}",
-        "hydra: {sweeper: {params: {}}, overrides: {task: [+ablation=glob(*)]}}",
-        "hydra: {sweeper: {params: {a: '{{{'}}, overrides: {task: []}}",
-        "hydra: {sweeper: {params: !!python/object:os.system {}}, overrides: {task: []}}",
-    ],
-)
-def test_a_plan_may_be_anything(plan: str, tmp_path: Path, capsys) -> None:
-    write_run(tmp_path / "a")
-    (tmp_path / "multirun.yaml").write_text(plan)
-    assert planned(tmp_path) == [] and "sweep:" not in watch(capsys, str(tmp_path))
 
 
 @pytest.mark.parametrize("arguments", [["missing"], ["."]])
@@ -193,3 +132,11 @@ def test_names_are_no_markup_and_steer_no_terminal(tmp_path: Path, capsys) -> No
     text = watch(capsys, str(tmp_path / "a"))
     assert "[/x], seed 0" in text and "[/red] success" in text and "rows: [b]x[/b]" in text
     assert "\x1b" not in text + watch(capsys, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "0 s"), (119, "119 s"), (120, "2 min"), (7199, "120 min"), (18_000, "5 h"), (2e5, "2 d")],
+)
+def test_durations_are_in_the_unit_that_reads_best(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -17,17 +17,17 @@ from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.report.curves import cost_curves, learning_curves
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.scores import (
+from proposer_rl.report.studies import Study, read_studies
+from proposer_rl.report.style import Drawing
+from proposer_rl.report.tables import escape_markdown
+from research.claims import own_claims
+from research.generalisation import (
     Score,
     check_names,
     generalisation_table,
     read_scores,
     write_scores,
 )
-from proposer_rl.report.studies import Study, read_studies
-from proposer_rl.report.style import Drawing
-from proposer_rl.report.tables import escape_markdown
-from research.claims import own_claims
 from research.pages import CHOICE, CLAIMS, main
 from research.ranking import EXACT, STEADY, budgets, choices, needs_of
 from research.timing import read_timing, timed

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from proposer_rl.runs.folder import StorageError
-from proposer_rl.runs.lock import InUseError, locked, taking_turns
+from proposer_rl.runs.lock import InUseError, locked
 
 
 def test_a_folder_is_locked_until_the_end_and_can_be_locked_again(tmp_path: Path) -> None:
@@ -43,30 +41,4 @@ def test_no_folder(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(StorageError, match=r"cannot write .*/\.lock: "), locked(file):
-        raise AssertionError("locked a file")
-
-
-COUNT = """
-import sys
-from pathlib import Path
-from proposer_rl.runs.lock import taking_turns
-file = Path(sys.argv[1])
-for _ in range(100):
-    with taking_turns(file):
-        file.write_text(str(int(file.read_text()) + 1))
-"""
-
-
-def test_processes_that_take_turns_lose_nothing(tmp_path: Path) -> None:
-    (file := tmp_path / "count").write_text("0")
-    command = [sys.executable, "-c", COUNT, str(file)]
-    children = [subprocess.Popen(command) for _ in range(3)]
-    assert [child.wait() for child in children] == [0, 0, 0]
-    assert file.read_text() == "300"
-
-
-def test_no_folder_to_take_turns_in(tmp_path: Path) -> None:
-    file = tmp_path / "no" / "table.csv"
-    (tmp_path / "no").touch()
-    with pytest.raises(StorageError, match=r"cannot write .*/table\.csv: "), taking_turns(file):
         raise AssertionError("locked a file")

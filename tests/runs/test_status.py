@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from proposer_rl.runs.status import FILE, Activity, Status, duration
+from proposer_rl.runs.status import FILE, Status
 
 
 class Clock:
@@ -16,67 +16,24 @@ class Clock:
     def __call__(self) -> float:
         return self.now
 
-    def pass_(self, seconds: float) -> None:
-        self.now += seconds
-
-
-def test_the_rest_is_what_is_left_times_what_it_took(tmp_path: Path) -> None:
-    """A run of three cycles of five updates, each cycle after twelve parts of an improvement."""
-    clock, left = Clock(), {"improve": 3, "update": 15}
-    status = Status(parts=12, clock=clock)
-    end = 3 * (12 * 7 + 5 * 2)
-    with status.of_run(tmp_path, lambda: None):
-        for cycle in range(3):
-            status.plan(left)
-            with status.phase("improve"):
-                for part in range(12):
-                    clock.pass_(7)
-                    status.tick("training the copies", part + 1)
-                    seconds, all_known = status.remaining()
-                    # In the first cycle nothing is known of updates: it takes at least the rest.
-                    updates = 30 if cycle == 0 else 0
-                    assert seconds == pytest.approx(end - clock.now - updates)
-                    assert all_known == (cycle > 0)
-            for _ in range(5):
-                with status.phase("update"):
-                    clock.pass_(2)
-            left = {"improve": left["improve"] - 1, "update": left["update"] - 5}
-            assert status.remaining() == (pytest.approx(end - clock.now), True)
-    assert status.remaining()[0] == 0
-
 
 def test_the_file_says_what_is_going_on_and_is_gone_at_the_end(tmp_path: Path) -> None:
     clock, shown = Clock(), []
     status = Status(parts=4, clock=clock)
-    status.plan({"improve": 2, "update": 1})
-    status.tick("before there is a folder", 1)
-    with status.of_run(tmp_path, lambda: shown.append(status.activity().text())):
-        with status.phase("improve"):
-            for part in range(3):
-                clock.pass_(10)
-                status.tick("training the copies", part + 1)
-            written = Activity(**json.loads((tmp_path / FILE).read_text()))
-            assert written == Activity("training the copies", 3, 4, 50.0, True)
-        with status.phase("update"):  # at once: nothing is written more often than once a second
-            assert json.loads((tmp_path / FILE).read_text())["done"] == 3
+    status.tell("before there is a folder", 1)
+    with status.of_run(tmp_path, lambda: shown.append(status.doing)):
+        status.tell("improving")
+        for part in range(6):
+            clock.now += 10
+            status.tell("training the copies", part)
+        status.tell("at once")  # nothing is written more often than once a second
+        assert json.loads((tmp_path / FILE).read_text()) == {"doing": "training the copies 4/4"}
     assert shown == [
-        "improve",
-        *(f"training the copies {n}/4, at least {s} left" for n, s in ((1, "70 s"), (2, "60 s"))),
-        "training the copies 3/4, at least 50 s left",
+        "improving",
+        "training the copies",
+        *(f"training the copies {n}/4" for n in (1, 2, 3, 4, 4)),
     ]
     assert not list(tmp_path.iterdir())
-
-
-def test_nothing_is_said_of_a_rest_whose_largest_part_is_unknown(tmp_path: Path) -> None:
-    clock = Clock()
-    status = Status(clock=clock)
-    status.plan({"measure": 9, "improve": 9})
-    with status.of_run(tmp_path, lambda: None):
-        with status.phase("measure"):
-            clock.pass_(1)
-        assert status.activity() == Activity("", 0, 0, 8.0, True)
-        with status.phase("improve"):
-            assert status.activity() == Activity("improve", 0, 0, None, True)
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, ArithmeticError])
@@ -84,12 +41,13 @@ def test_a_run_that_stops_or_breaks_does_nothing_any_more(
     stop: type[BaseException], tmp_path: Path
 ) -> None:
     status = Status(clock=(clock := Clock()))
-    with pytest.raises(stop), status.of_run(tmp_path, lambda: None), status.phase("update"):
+    with pytest.raises(stop), status.of_run(tmp_path, lambda: None):
+        status.tell("update")
         assert json.loads((tmp_path / FILE).read_text())["doing"] == "update"
         raise stop
     assert not list(tmp_path.iterdir())
-    clock.pass_(10)
-    status.tick("cleaning up", 1)
+    clock.now += 10
+    status.tell("cleaning up", 1)
     assert not list(tmp_path.iterdir())
 
 
@@ -100,11 +58,3 @@ def test_why_a_run_broke_is_told_though_its_folder_cannot_be_changed(tmp_path: P
         folder.rename(tmp_path / "moved")
         folder.touch()  # what is in a file cannot be removed
         raise ArithmeticError
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0, "0 s"), (119, "119 s"), (120, "2 min"), (7199, "120 min"), (18_000, "5 h"), (2e5, "2 d")],
-)
-def test_durations_are_in_the_unit_that_reads_best(seconds: float, text: str) -> None:
-    assert duration(seconds) == text

@@ -1,29 +1,52 @@
-"""Finished runs as a study, without checkpoints, pictures and this machine's folders."""
+"""Finished runs as a study: a folder of a few tables, small enough for a repository.
+
+Checkpoints, pictures of levels and this machine's folders are left out. A study is read as runs
+are, by ``bin/report`` and ``bin/research pages``.
+"""
 
 from __future__ import annotations
 
+import argparse
+import gzip
 import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from proposer_rl.cli.errors import command
+from proposer_rl.report.curves import learning_curves
 from proposer_rl.report.page import document, report_command, section
+from proposer_rl.report.pictures import heat_maps
 from proposer_rl.report.reading import OutputError, find_runs, read_run
-from proposer_rl.report.records import anywhere, encoded
+from proposer_rl.report.records import anywhere, encoded, printable
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
-from proposer_rl.report.tidy import STUDY, write_study
+from proposer_rl.report.style import in_few_colours, render
+from proposer_rl.report.tidy import NAMES, STUDY, tables, to_csv
 from proposer_rl.runs.folder import write_atomically
 
-MARK = "<!-- All below is written by bin/report --publish. -->"
+MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (
     "`runs.csv.gz` has a row for each run, with its settings and facts as JSON; `metrics.csv.gz`, "
     "`training.csv.gz`, `cycles.csv.gz` and `levels.csv.gz` what was recorded at each evaluation, "
     "of the batches, by the curricula and on every single level at the end: "
     '`pandas.read_csv("metrics.csv.gz")`.'
 )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    command(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> None:
+    written, left_out = publish(options.folder, options.output)
+    print(*map(printable, [*left_out, f"Runs: {written} in {options.output}"]), sep="\n")
 
 
 def publish(folders: Sequence[Path], output: Path) -> tuple[int, list[str]]:
@@ -39,7 +62,7 @@ def publish(folders: Sequence[Path], output: Path) -> tuple[int, list[str]]:
     """
     occupied = output.is_dir() and any(output.iterdir()) and not (output / STUDY).is_file()
     if (output.exists() and not output.is_dir()) or occupied:
-        raise OutputError(f"--publish: {output} is no study; give a new folder")
+        raise OutputError(f"-o {output}: is no study; give a new folder")
     found, notes = {}, []
     for name, runs in _named(folders).items():
         if all(run.finished for run in runs):
@@ -55,15 +78,33 @@ def publish(folders: Sequence[Path], output: Path) -> tuple[int, list[str]]:
     return len(found), notes
 
 
+def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
+    """Write the tables of a study; those of a former one are replaced."""
+    listed = [
+        {
+            "run": name,
+            "method": run.method,
+            "ablation": run.ablation,
+            "updates": run.updates,
+            "config": json.dumps(run.config),
+            "facts": json.dumps(dict(run.facts)),
+        }
+        for name, run in dict(runs).items()
+    ]
+    written = {"runs": pd.DataFrame(listed), **tables(runs)}
+    for name in NAMES:
+        if name not in written:
+            (folder / f"{name}.csv.gz").unlink(missing_ok=True)
+    for name, table in reversed(written.items()):  # what makes it a study comes last
+        packed = gzip.compress(to_csv(table), 9, mtime=0)
+        write_atomically(folder / f"{name}.csv.gz", packed)
+
+
 def write_page(folder: Path) -> None:
     """Write a study's ``README.md`` and its figures from its tables.
 
     What the page says above :data:`MARK` is its authors' and stays.
     """
-    from proposer_rl.report.curves import learning_curves
-    from proposer_rl.report.pictures import heat_maps
-    from proposer_rl.report.style import in_few_colours, render
-
     studies, _ = read_studies([folder], None)
     file, parts = folder / "README.md", []
     title = f"# {folder.name.replace('_', ' ').capitalize()}"
@@ -94,7 +135,7 @@ def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
             for name, runs in own.items():
                 if name in found:
                     places = f"{found[name][0].folder}, {runs[0].folder}"
-                    raise OutputError(f"--publish: two runs are called {name}: {places}")
+                    raise OutputError(f"two runs are called {name}: {places}")
                 found[name] = runs
     return found
 
@@ -118,3 +159,14 @@ def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
     found: dict[str, Any] = json.loads(anywhere(text))
     return found
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="bin/research publish", description=__doc__)
+    parser.add_argument("folder", nargs="+", type=Path, help="of runs or studies")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the study's folder")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

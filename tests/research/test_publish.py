@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from proposer_rl.cli.report import main
-from proposer_rl.report import publish
+from proposer_rl.cli.report import main as report
 from proposer_rl.report.curves import learning_curves
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.studies import read_studies
+from research import publish
+from research.publish import main
 from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 SECRET = "/home/somebody/code"
@@ -51,7 +52,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def published(runs: Path, output: Path) -> Path:
-    main([str(runs), "--publish", str(output)])
+    main([str(runs), "-o", str(output)])
     return output
 
 
@@ -72,7 +73,7 @@ def test_tables_of_the_study_are_those_of_the_runs(
     light = published(runs, tmp_path / "light")
     tables = {}
     for name, folder in {"before": runs, "after": light}.items():
-        main([str(folder), "-o", str(tmp_path / name), "-q"])
+        report([str(folder), "-o", str(tmp_path / name), "-q"])
         tables[name] = contents(tmp_path / name / "tables") | contents(tmp_path / name / "figures")
     assert {"levels.csv", "cycles.csv", "metrics.csv"} < tables["before"].keys()
     assert tables["after"] == tables["before"]
@@ -172,19 +173,16 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(SystemExit) as end:
-        main([str(runs), "--publish", "new", "--threshold", "0.5"])
-    assert end.value.code == 2 and "--publish: writes runs" in capsys.readouterr().err
     wrong = {
-        "runs is no study; give a new folder": [runs, runs],
-        "--publish: two runs are called target_0: ": [runs, tmp_path / "other", "new"],
-        "mine is no study": [runs, tmp_path / "mine"],
-        "file is no study": [runs, tmp_path / "file"],
+        "runs: is no study; give a new folder": [runs, runs],
+        "two runs are called target_0: ": [runs, tmp_path / "other", "new"],
+        "mine: is no study": [runs, tmp_path / "mine"],
+        "file: is no study": [runs, tmp_path / "file"],
     }
     for message, (*folders, output) in wrong.items():
         before = contents(tmp_path)
         with pytest.raises(SystemExit) as end:
-            main([*map(str, folders), "--publish", str(output)])
+            main([*map(str, folders), "-o", str(output)])
         assert end.value.code == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line

@@ -54,7 +54,7 @@ def write_scores(scores: Iterable[Score]) -> bytes:
 
 
 def read_scores(file: Path) -> list[Score]:
-    """Scores as ``bin/eval`` writes them for several runs."""
+    """Scores as ``bin/research scores`` writes them."""
     try:
         rows = csv.DictReader(io.StringIO(read_bounded(file, LARGEST_FILE).decode()))
         return [
@@ -71,7 +71,7 @@ def read_scores(file: Path) -> list[Score]:
             for row in rows
         ]
     except (csv.Error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UnreadableRun(f"{file}: holds no scores of runs as bin/eval writes them") from error
+        raise UnreadableRun(f"{file}: holds no scores of runs of bin/research scores") from error
 
 
 def stored_name(levels: str) -> str:

@@ -1,4 +1,7 @@
-"""Several runs on sets of levels: a table of methods, of their means."""
+"""Finished runs on sets of levels: a table of methods, of their means.
+
+With ``-o`` a line for each Solver and set is added to a file; what is in it is not computed again.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from tqdm import tqdm
 
-from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.errors import ConfigError, command
 from proposer_rl.cli.evaluate import Evaluation, evaluate, load
-from proposer_rl.report.reading import begun, find_runs
+from proposer_rl.report.reading import find_runs
 from proposer_rl.report.runs import Run
-from proposer_rl.report.scores import (
+from proposer_rl.report.studies import read_studies
+from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
+from proposer_rl.runs.folder import storage, write_atomically
+from research.generalisation import (
     LONGEST_NAME,
     Score,
     check_names,
@@ -31,45 +38,41 @@ from proposer_rl.report.scores import (
     whole,
     write_scores,
 )
-from proposer_rl.report.studies import read_studies
-from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
-from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.lock import taking_turns
 
 
-def of_several(options: argparse.Namespace) -> bool:
-    """Whether ``bin/eval`` was asked about several runs or sets of levels."""
-    if len(options.checkpoint) > 1 or len(options.levels) > 1:
-        return True
-    (path,) = options.checkpoint
-    if not path.is_dir() or (path / "config.json").exists():
-        return False
-    return next(begun(path), None) is not None
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    options = _parser().parse_args(arguments)
+    command(lambda: compare(options.folder, options.levels, options.output))
 
 
-def compare(options: argparse.Namespace) -> None:
-    """Print a table of methods; what the output has of it is not computed again."""
-    _check_comparison(options)
-    output, names = options.output, options.levels
-    studies, notes = read_studies(find_runs(options.checkpoint), None)
+def compare(folders: Sequence[Path], names: Sequence[str], output: Path | None) -> None:
+    """Print a table of methods.
+
+    Args:
+        folders: of runs, or with runs in them.
+        names: of sets of levels, as ``bin/eval`` takes them.
+        output: a file for the scores; None for none.
+    """
+    _check(names, output)
+    studies, notes = read_studies(find_runs(folders), None)
     scores = _stored(output)
     runs = whole(group for study in studies for group in study.groups)
     if not runs:
-        raise ConfigError(
-            f"{', '.join(map(str, options.checkpoint))}: no run is finished; several runs or sets "
-            "of levels are compared at the runs' ends, only one run on one set before"
-        )
+        raise ConfigError(f"{', '.join(map(str, folders))}: no run is finished")
     going = {run.folder for study in studies for run in study.runs} - {run.folder for run in runs}
     notes += [f"left out: {folder.name}: not finished" for folder in sorted(going)]
     check_names(runs)
     failures = 0
     for run in tqdm(runs, leave=False, disable=None):
         try:
-            missing = _missing(run, names, scores, options.max_steps)
+            missing = _missing(run, names, scores)
         except (ConfigError, CheckpointError) as error:  # of older code, say: the others count
             if len(runs) == (failures := failures + 1):
                 raise
             notes.append(f"left out: {error}")
+        except ValueError as error:
+            raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
         else:
             scores = _added(missing, scores, output)
     for note in notes:
@@ -84,29 +87,18 @@ def compare(options: argparse.Namespace) -> None:
         Console().print(table)
 
 
-def _check_comparison(options: argparse.Namespace) -> None:
-    """Refuse what several runs or sets of levels cannot be asked for, before anything is read."""
-    output, names = options.output, options.levels
-    for path in options.checkpoint:
-        if path.is_file():
-            raise ConfigError(
-                f"{path}: is a file; several runs or sets of levels take folders of runs only: "
-                "give a checkpoint alone, with one set"
-            )
-    if options.pictures is not None:
-        raise ConfigError("--pictures: give one run and one set of levels")
-    if not names:
-        raise ConfigError("--levels: name the sets of levels on which several runs are compared")
+def _check(names: Sequence[str], output: Path | None) -> None:
+    """Refuse what cannot be, before anything is read."""
     for name in names:
         if name != (stored := stored_name(name)):
             raise ConfigError(
-                f"--levels {stored:.80}: the table of several runs takes names of one line, of at "
-                f"most {LONGEST_NAME} printable characters"
+                f"--levels {stored:.80}: must be of one line, of at most {LONGEST_NAME} printable "
+                "characters"
             )
     if output is not None and output.suffix != ".csv":
-        raise ConfigError(f"--output {output}: the scores of several runs are written as .csv")
-    if options.max_steps is not None and output is not None:
-        raise ConfigError(f"--max-steps: --output {output} does not record it; leave one out")
+        raise ConfigError(f"--output {output}: must end in .csv")
+    if output is not None and not output.parent.is_dir():
+        raise ConfigError(f"--output {output}: there is no folder {output.parent}")
 
 
 def _stored(output: Path | None) -> list[Score]:
@@ -121,15 +113,13 @@ def _added(new: list[Score], scores: list[Score], output: Path | None) -> list[S
     places = {score[:4] for score in new}
     if output is None or not new:
         return [score for score in scores if score[:4] not in places] + new
-    with taking_turns(output):
+    with storage(output), FileLock(output.with_name(f".{output.name}.lock")):
         scores = _added(new, _stored(output), None)
         write_atomically(output, write_scores(scores))
     return scores
 
 
-def _missing(
-    run: Run, names: Sequence[str], scores: list[Score], max_steps: int | None
-) -> list[Score]:
+def _missing(run: Run, names: Sequence[str], scores: list[Score]) -> list[Score]:
     """Scores of a run that are missing, or were of something else."""
     missing: list[Score] = []
     loaded = None
@@ -137,7 +127,7 @@ def _missing(
         digest, known = _digest(run.folder, name), scored(run, scores, name)
         if known is None or digest not in ("", known.digest):
             loaded = loaded or load(run.folder)
-            missing += _summed(evaluate(loaded, name, max_steps), name, digest)
+            missing += _summed(evaluate(loaded, name), name, digest)
     return missing
 
 
@@ -168,3 +158,17 @@ def _summed(evaluation: Evaluation, name: str, digest: str) -> list[Score]:
         place = (run.folder.name, seed, evaluation.updates, name, len(own))
         summed.append(Score(*place, success, means["return"], digest))
     return summed
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="bin/research scores", description=__doc__)
+    parser.add_argument("folder", nargs="+", type=Path, help="of a run, or with runs in it")
+    parser.add_argument(
+        "--levels", nargs="+", required=True, metavar="FILE|NAME", help="sets, as bin/eval has them"
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="ends in .csv")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
