@@ -154,7 +154,8 @@ def render(drawing: Drawing) -> Drawn:
     width, height = drawing.size
     legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
     with rc_context(SETTINGS):
-        figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
+        size = (width * columns, height * rows + legend)
+        figure = Figure(figsize=size, dpi=DPI, layout="constrained")
         grid = figure.subfigures(rows, columns, squeeze=False)
         for draw, part in zip(drawing.panels, grid.flat, strict=False):
             draw(part)
@@ -163,9 +164,11 @@ def render(drawing: Drawing) -> Drawn:
             figure.legend(
                 handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
             )
-        png = _render(figure, "png")
-        figure.set_layout_engine(None)  # it stands
-        return Drawn(_render(figure, "svg"), png)
+        layout = figure.get_layout_engine()
+        assert layout is not None
+        layout.execute(figure)
+        figure.set_layout_engine(None)  # with one, every file would be drawn twice
+        return Drawn(_render(figure, "svg"), _render(figure, "png"))
 
 
 def in_few_colours(png: bytes) -> bytes:
