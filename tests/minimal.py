@@ -11,11 +11,12 @@ from __future__ import annotations
 import json
 import os
 import sys
+import sysconfig
 import traceback
 import venv
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib import metadata
 from importlib.util import module_from_spec, spec_from_file_location
@@ -47,6 +48,16 @@ def make_environment(folder: Path, wheel: Path, extras: list[str]) -> dict[str, 
         names = closure(project, extra) - always if extra else always
         _link({name: metadata.distribution(name) for name in names}, sites[extra])
     return sites
+
+
+def share_bytecode(prefix: str, sites: Iterable[Path]) -> None:
+    """Let environments find the linked files compiled that this one keeps below a folder."""
+    ours = Path(prefix + sysconfig.get_path("purelib"))
+    ours.mkdir(parents=True, exist_ok=True)
+    for site in sites:
+        place = Path(prefix + str(site))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to(ours)
 
 
 def closure(project: metadata.Distribution, extra: str) -> set[str]:
