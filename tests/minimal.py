@@ -207,7 +207,9 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
 def _run(extra: str) -> None:
     from proposer_rl.cli import run
     from proposer_rl.recipes import available
+    from proposer_rl.report import build
 
+    build.DRAWINGS = build.DRAWINGS[:2]
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
     for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
