@@ -207,12 +207,14 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
 def _run(extra: str) -> None:
     from proposer_rl.cli import run
     from proposer_rl.recipes import available
-    from proposer_rl.report import build
 
-    build.DRAWINGS = build.DRAWINGS[:2]
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
     for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
+        if name == "report":
+            from proposer_rl.report import build
+
+            build.DRAWINGS = build.DRAWINGS[::3]  # curves, maps, and what was recorded
         if name == "play":
             _play(command, arguments)
         else:
