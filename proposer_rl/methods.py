@@ -250,7 +250,7 @@ def proposer(
         settings, make_task, tell = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
         copies = CopiesInWorkers(learner, make_env, settings, tell)
-    return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
+    return ProposerTrainer(learner, copies).curriculum(config.own_action)
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:
