@@ -185,7 +185,7 @@ class LearnedCurriculum(Curriculum):
             streams: of the cycle, K of them.
 
         Returns:
-            What there is to tell of it, as :meth:`Curriculum.log` gives it.
+            Its metrics, as :meth:`Curriculum.log` gives them.
         """
         return {}
 
