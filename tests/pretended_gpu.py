@@ -2,7 +2,8 @@
 
 Its numbers are the CPU's. Where another device is registered, torch behaves differently all over
 the process, so what is to run on it has a process of its own: ``python -m tests.pretended_gpu``.
-It knows no autocast, pinned memory, streams or graphs.
+It knows no autocast, pinned memory or streams, and of graphs what may not be in them: numbers that
+go from a device to the other.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+from tests.host_reads import refuse_host_reads
 
 NAME = "pretended"
 CPU = torch.device("cpu")
@@ -79,6 +82,8 @@ def dispatch(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         RuntimeError: where it would mix devices.
     """
     name = func.overloadpacket.__name__
+    if Recorded.now:
+        _refuse_to_record(func, name, args, kwargs)
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
     there = [tensor for tensor in tensors if isinstance(tensor, There)]
     asked = kwargs.get("device")
@@ -125,6 +130,39 @@ def _refuse_to_mix(
         raise RuntimeError(f"{func}: a generator of the CPU for a tensor on the device")
 
 
+class Recorded:
+    """A function that a GPU would replay as a graph from its third call on.
+
+    Attributes:
+        now: whether one is being called that would have been recorded.
+    """
+
+    now = False
+
+    def __init__(self, function: Any) -> None:
+        self._function, self._calls = function, 0
+
+    def __call__(self, *given: Any) -> Any:
+        self._calls += 1
+        Recorded.now = self._calls > 1  # the first call makes constants
+        try:
+            return self._function(*given)
+        finally:
+            Recorded.now = False
+
+
+def _refuse_to_record(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    there = isinstance(args[0], There) if args else False
+    asked = kwargs.get("device")
+    if name == "_to_copy" and asked is not None and _is_there(asked) != there:
+        raise RuntimeError(f"{func}: recorded, and goes from one device to the other")
+    if there and (name == "_local_scalar_dense" or name in INDEXING):
+        refuse_host_reads(func, args)
+        indices = args[1] if name in INDEXING else []
+        if any(isinstance(i, Tensor) and not isinstance(i, There) for i in indices):
+            raise RuntimeError(f"{func}: recorded, with indices on the CPU")
+
+
 def _here(value: Any) -> Any:
     return value.here if isinstance(value, There) else value
 
@@ -152,10 +190,13 @@ def register() -> None:
 def train(folder: Path, overrides: list[str]) -> None:
     """As the command does, on the device; the folder is that of the run."""
     from proposer_rl.cli.build import build, parts
+    from proposer_rl.learning import graphs
     from proposer_rl.runs.folder import RunFolder
     from proposer_rl.runs.signals import StopSignals
     from tests.tiny import composed
 
+    graphs.has_graphs = lambda device: device.type == NAME
+    graphs.replayed = Recorded
     config, signals = composed(*overrides, f"compute.device={NAME}"), StopSignals()
     build(config, parts(config, signals), RunFolder(folder), signals).run()
 

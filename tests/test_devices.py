@@ -33,6 +33,7 @@ CALLED = {
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
+    "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
 }
 
 Run = Callable[..., str]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -77,9 +78,15 @@ def make_task(config: RunConfig) -> Task:
     device = _device(compute.device)
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
-    context = ComputeContext(device, config.precision, compute.cores)
+    context = ComputeContext(device, config.precision, compute.cores, compute.graphs)
     with key("task", "task."):
         task: Task = _made(task_maker(config.task), config.solver, context, str(device))
+    if task.device.type != device.type:
+        warnings.warn(
+            f"this run is computed on {task.device.type} instead of {device.type}, since that is "
+            "where the task makes its levels",
+            stacklevel=2,
+        )
     return task
 
 
@@ -170,7 +177,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
         devices = [str(_device(name, "worker_devices")) for name in devices]
     cores = compute.cores or max(1, available_cores() // count)
     settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
-    context = ComputeContext(precision=task.precision, cores=cores)
+    context = ComputeContext(precision=task.precision, cores=cores, graphs=compute.graphs)
     make = partial(_made, task_maker(config.task), config.solver, context)
     return Workers(settings, make)
 

@@ -103,6 +103,7 @@ class ComputeSettings:
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
+        graphs: replay on a GPU what can be recorded as CUDA graphs.
         threads: CPU threads of one operation; None leaves torch's choice.
         cores: replicas of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
@@ -113,6 +114,7 @@ class ComputeSettings:
     """
 
     device: str = "auto"
+    graphs: bool = True
     threads: Annotated[int, Ge(1), Le(1024)] | None = None
     cores: Annotated[int, Ge(1), Le(1024)] | None = None
     collector: Literal["single", "multiprocess", "ray"] = "single"

@@ -67,6 +67,10 @@ class CopiesClipLoss(ClipPPOLoss):
             log_explained_variance=False,
             **numbers,
         )
+        if numbers.get("clip_value") is not None:
+            # TorchRL asks its tensor whether it is zero, and waits.
+            del self._buffers["clip_value"]
+            self.clip_value = numbers["clip_value"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The terms and diagnostics of transitions [*B, T]."""

@@ -90,7 +90,8 @@ class Minibatches:
             ACTED_VALUE,
             strict=False,
         )
-        rows = (order,) if not lead else (torch.arange(len(order)).unsqueeze(-1), order)
+        copies = torch.arange(len(order), device=order.device).unsqueeze(-1)
+        rows = (copies, order) if lead else (order,)
         shape = (*used.shape[:lead], self._count)
         if self._sequences:
             level, used = level.reshape(shape)[rows], used.reshape(*shape, used.shape[-1])

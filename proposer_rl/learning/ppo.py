@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
+from proposer_rl.learning import graphs
 from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.gradients import clip_gradients_
@@ -36,7 +37,12 @@ from proposer_rl.learning.losses import (
 from proposer_rl.learning.minibatches import Minibatches
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.settings import PPOSettings
-from proposer_rl.learning.snapshot import complete_adam, restore_snapshot, take_snapshot
+from proposer_rl.learning.snapshot import (
+    complete_adam,
+    restore_snapshot,
+    set_learning_rate,
+    take_snapshot,
+)
 from proposer_rl.learning.statistics import Statistics
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
@@ -188,8 +194,7 @@ class PPO:
         first = not self._gradient_steps
         self.statistics.before(rollout, level, first=first)
         steps = rollout.exclude(*self.agent.level_keys)
-        for group in self._adam.param_groups:
-            group["lr"] = self.learning_rate
+        set_learning_rate(self._adam, self.learning_rate)
         if self.settings.anneal_clip:
             self._loss.clip_epsilon.fill_(self.settings.clip_epsilon * self.left)
         orders = self._minibatches.draw(generators)
@@ -252,6 +257,21 @@ class PPO:
             context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
         set_next_values(self.agent, rollout, context)
         return rollout
+
+    def replay(self, *, rollouts: bool) -> PPO:
+        """From here on replay training on a GPU as a CUDA graph, which changes no number.
+
+        Args:
+            rollouts: whether acting is replayed, too. The environment then reads nothing back from
+                the device, and new levels come to where the old ones were.
+
+        Returns:
+            Itself.
+        """
+        self.train = graphs.replayed(self.train)  # type: ignore[method-assign]
+        if rollouts and not self.settings.continue_episodes:
+            self.collector.act = graphs.replayed(self.collector.act)  # type: ignore[method-assign]
+        return self
 
     def check(self, first: int = 0) -> None:
         """Check what was trained on last; this waits for the device, training does not.

@@ -13,8 +13,16 @@ from proposer_rl.models import ActorCritic
 
 
 def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
-    """Torch's Adam whose state, usually made at the first step, is there from the beginning."""
-    adam = Adam(parameters, lr=learning_rate, eps=eps, fused=True)
+    """Torch's Adam whose state, usually made at the first step, is there from the beginning.
+
+    On a GPU its learning rate is a tensor there, so that a graph of its steps reads what it is set
+    to (:func:`set_learning_rate`).
+    """
+    rate: float | Tensor = learning_rate
+    on_gpu = parameters[0].is_cuda
+    if on_gpu:
+        rate = torch.tensor(learning_rate, device=parameters[0].device)
+    adam = Adam(parameters, lr=rate, eps=eps, fused=True, capturable=on_gpu)
     for parameter in parameters:
         adam.state[parameter] = {
             "step": torch.zeros((), device=parameter.device),
@@ -22,6 +30,15 @@ def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps:
             "exp_avg_sq": torch.zeros_like(parameter),
         }
     return adam
+
+
+def set_learning_rate(adam: Adam, learning_rate: float) -> None:
+    """Of the next steps."""
+    for group in adam.param_groups:
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(learning_rate)
+        else:
+            group["lr"] = learning_rate
 
 
 def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:

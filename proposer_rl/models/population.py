@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -96,11 +97,17 @@ def at_hand(tensor: Tensor) -> bool:
 
 
 def use_device(device: torch.device) -> None:
-    """Make a GPU the current one, and let its fp32 products round their factors to TF32.
+    """Make a GPU the current one, whose fp32 products round their factors to TF32.
 
-    Without a GPU it does nothing.
+    What it computes is the same every time: sums are not taken in the order in which threads come
+    to be done. Without a GPU nothing is changed.
     """
     if device.type == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        # It warns of running sums, which are taken in disorder along a single long row alone.
+        warnings.filterwarnings("ignore", message="cumsum_cuda_kernel does not have")
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
         if device.index is not None:  # Ray's workers see none but their own
             torch.cuda.set_device(device)
         torch.set_float32_matmul_precision("high")

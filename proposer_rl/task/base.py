@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO, first_episode_return, first_episode_success
+from proposer_rl.learning import PPO, first_episode_return, first_episode_success, graphs
 from proposer_rl.learning.episodes import mean_performance
 from proposer_rl.learning.rollout import RolloutCollector
 from proposer_rl.learning.settings import SolverSettings
@@ -56,7 +57,8 @@ class Task(ABC):
         target: the name of the one that is to be mastered.
         space: what a Proposer chooses among.
         solver: the Solver's training.
-        context: device, precision and cores.
+        context: precision and cores; whether there are graphs. Its device is what the task's levels
+            are made on: where they are, everything is computed.
         measured_on: names of the distributions that Solvers are measured on; None for all.
         levels: fixed evaluation levels E of each of them, the same in every run.
         seed: from which they are drawn, and the actions of the evaluations' episodes.
@@ -78,6 +80,9 @@ class Task(ABC):
         reward_scale: that rewards of training were multiplied with; returns are given without it.
         batched: as of :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
+        replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
+            ``"rollouts"`` in an environment whose new levels come to where the old ones were, and
+            of the methods ``"performance"``, ``"probe"`` and ``"measure"``.
         batch_size: levels P of an update of one Solver.
         evaluated_on: the fixed evaluation levels [E], by the distributions' names.
 
@@ -94,6 +99,7 @@ class Task(ABC):
     reward_scale: float = 1.0
     batched: bool | None = None
     episodes_at_once: int | None = None
+    replayed: Sequence[str] = ()
 
     def __init__(
         self,
@@ -113,7 +119,6 @@ class Task(ABC):
     ) -> None:
         names = list(distributions if measured_on is None else measured_on)
         check_names(distributions, target, names)
-        self.device = torch.device(context.device)
         self.precision = "fp32" if context.precision == "auto" else context.precision
         self.batch_size = solver.batch_size
         self.distributions: Mapping[str, Any] = dict(distributions)
@@ -127,6 +132,11 @@ class Task(ABC):
         self._levels, self._seed = levels, seed
         self._measured = dict(measured or {"levels": [levels, seed], "target": target})
         self.evaluated_on = {name: self.evaluation_levels(name) for name in names}
+        self.device = _place(self.evaluated_on[names[0]])
+        self._graphs = context.graphs and graphs.has_graphs(self.device)
+        if self._graphs:
+            for name in set(self.replayed) - {"rollouts"}:
+                setattr(self, name, graphs.ReplayedOfAgents(getattr(self, name)))
 
     @abstractmethod
     def environment(self, levels: Levels) -> EnvBase:
@@ -161,7 +171,8 @@ class Task(ABC):
         # A placeholder of the right shape; every update sets its own levels.
         level = next(iter(self.evaluated_on.values()))[:1]
         env = self.environment(level.expand(copies, self.batch_size))
-        return PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
+        ppo = PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
+        return ppo.replay(rollouts="rollouts" in self.replayed) if self._graphs else ppo
 
     def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:
         """Where the Solvers of a learner play levels [K, P] that they do not train on.
@@ -398,6 +409,12 @@ def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distr
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
     """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
     return levels.expand(agent.copies, levels.batch_size[-1])
+
+
+def _place(levels: Levels) -> torch.device:
+    """Where levels are."""
+    leaves = tree_leaves(levels.to_dict())
+    return leaves[0].device if leaves else torch.device("cpu")
 
 
 def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:

@@ -37,11 +37,13 @@ class ComputeContext(NamedTuple):
         precision: of the Solvers' networks: ``"fp32"``, ``"bf16"``, or ``"auto"`` for the task's
             choice.
         cores: Solvers of a population computed at once on a CPU; None for all cores.
+        graphs: whether a GPU replays what can be recorded as CUDA graphs.
     """
 
     device: torch.device = torch.device("cpu")
     precision: str = "fp32"
     cores: int | None = None
+    graphs: bool = True
 
 
 class Distribution(Protocol):

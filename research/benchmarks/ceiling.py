@@ -127,7 +127,7 @@ def against_convolutions(options: Options) -> Result:
                 samples={"update": seconds[dtype], "convolutions": ceiling},
             )
         )
-        plain = Solvers(scale.task(options, f"precision={dtype}"))
+        plain = Solvers(scale.task(options, f"precision={dtype}", "compute.graphs=false"))
         for _ in range(2):
             plain.update()
         title = f"Where a Solver update goes, {dtype}"

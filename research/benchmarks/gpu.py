@@ -26,8 +26,12 @@ def gpu_targets(options: Options) -> Result:
 
 
 def _update(scale: Scale, options: Options) -> list[Row]:
-    """One Solver in both precisions; and how long the host is busy."""
-    ways = {options.precision: [], "fp32 (TF32)": ["precision=fp32"]}
+    """One Solver in both precisions, and without graphs; and how long the host is busy."""
+    ways = {
+        options.precision: [],
+        "fp32 (TF32)": ["precision=fp32"],
+        f"{options.precision}, without graphs": ["compute.graphs=false"],
+    }
     updates = {name: Solvers(scale.task(options, *way)).update for name, way in ways.items()}
     seconds = interleave(updates, options.repeats, options.device)
     rows = [
@@ -60,7 +64,7 @@ def _runs(scale: Scale, options: Options) -> list[Row]:
         made.learner.restore(start)
         scale.run(options, made, f"schedule.updates={schedule.cycle_length}")
 
-    one_cycle()  # PyTorch chooses its kernels here
+    one_cycle()  # PyTorch chooses its kernels here, and graphs are recorded
     size = f"{schedule.updates} updates"
     whole = time_once(lambda: target.run(options, plain), options.device)
     several = cycles * time_once(one_cycle, options.device)

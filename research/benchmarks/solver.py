@@ -16,6 +16,7 @@ from research.benchmarks.scales import NARROW, PAPER, TINY, Scale, Solvers, pape
 from research.benchmarks.timing import interleave, ratio, threads, total
 
 SMALL_BATCH = 16
+UNREPLAYED = "compute.graphs=false"
 
 
 def against_plain(options: Options) -> Result:
@@ -141,8 +142,9 @@ def overhead(options: Options) -> Result:
     scale = paper(options)
     rows = []
     for precision in precisions(options):
+        # Both called as they are: on a GPU the network alone would not be replayed.
         own = f"precision={precision}"
-        solvers = Solvers(scale.task(options, own))
+        solvers = Solvers(scale.task(options, own, UNREPLAYED))
         agent = solvers.ppo.agent
         level = solvers.ppo.env.reset().select(*agent.level_keys)
         with torch.no_grad():

@@ -10,6 +10,7 @@ from itertools import product
 import torch
 from tqdm import tqdm
 
+from proposer_rl.learning.graphs import WARM_UPS
 from research.benchmarks.results import Spread
 
 Timings = dict[str, list[float]]
@@ -19,7 +20,7 @@ def interleave(
     candidates: Mapping[str, Callable[[], object]],
     repeats: int,
     device: str = "cpu",
-    warmup: int = 1,
+    warmup: int | None = None,
 ) -> Timings:
     """Time every candidate once per round, in turn.
 
@@ -27,11 +28,14 @@ def interleave(
         candidates: what to call, by name.
         repeats: rounds that count.
         device: whose queue is waited for before and after each call.
-        warmup: rounds before them that do not count.
+        warmup: rounds before them that do not count; None for one, or on a GPU for as many as it
+            takes until everything has been recorded.
 
     Returns:
         Seconds of each candidate, one number per round.
     """
+    if warmup is None:
+        warmup = 1 if torch.device(device).type == "cpu" else WARM_UPS + 1
     seconds: Timings = {name: [] for name in candidates}
     turns = [*product(range(warmup + repeats), candidates)]
     bar = tqdm(turns, "timing", leave=False, disable=None)

@@ -471,8 +471,12 @@ def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
 
 @pytest.mark.parametrize("copies", [1, 2])
 @pytest.mark.parametrize("observe_agent", [False, True])
-def test_an_update_never_waits_for_the_device(observe_agent: bool, copies: int) -> None:
-    ppo = learner(copies, observe_agent=observe_agent, batched=True)
+@pytest.mark.parametrize("clip_value", [None, 0.2])
+def test_an_update_never_waits_for_the_device(
+    clip_value: float | None, observe_agent: bool, copies: int
+) -> None:
+    settings = replace(SETTINGS, clip_value=clip_value)
+    ppo = learner(copies, settings, observe_agent=observe_agent, batched=True)
     train(ppo, 1)  # constants are made
     with NoHostReads():
         ppo.env.set_levels(levels_on_hand := ppo.env.levels.clone())

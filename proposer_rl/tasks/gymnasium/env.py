@@ -36,7 +36,8 @@ class GymnasiumEnv(EnvBase):
     ``is_init``, bool [*B, 1], whether the step begins one. ``reward`` is scaled.
 
     Args:
-        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B].
+        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B]. Their
+            device is that of the states.
         make: makes one environment.
         parameters: what differs between levels, by name.
         success: whether the last step of an episode says that it was one.
@@ -56,7 +57,7 @@ class GymnasiumEnv(EnvBase):
         vectorization: Vectorization = "sync",
         once: bool = False,
     ) -> None:
-        super().__init__(batch_size=levels.batch_size)
+        super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
         self._reward_scale = reward_scale
         self._once = once
         self._plays = plays(levels, once)
@@ -80,7 +81,7 @@ class GymnasiumEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        options = None if mask is None else {"reset_mask": mask.reshape(-1).numpy()}
+        options = None if mask is None else {"reset_mask": mask.reshape(-1).cpu().numpy()}
         seen, _ = self._vector.reset(options=options)
         # Of these TorchRL takes over only the entries of the environments that are reset.
         none = np.zeros(self._vector.num_envs, np.bool_)
@@ -109,7 +110,7 @@ class GymnasiumEnv(EnvBase):
             key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
             for key, entry in {**numbers, **entries}.items()
         }
-        return TensorDict(tensors, self.batch_size)
+        return TensorDict(tensors, self.batch_size).to(self.device)
 
     def _finite(self, name: str, entry: NDArray[Any]) -> NDArray[Any]:
         """Numbers [n, ...] as float32; bytes as they are.
@@ -143,7 +144,7 @@ class GymnasiumEnv(EnvBase):
         }
         self.observation_spec = Composite(
             **observed, success=flag, is_init=flag.clone(), shape=batch
-        )
+        ).to(self.device)
         if isinstance(acts, spaces.Discrete):
             self.action_spec = Categorical(int(acts.n), shape=batch)
         elif isinstance(acts, spaces.MultiDiscrete):
@@ -151,9 +152,10 @@ class GymnasiumEnv(EnvBase):
             self.action_spec = MultiCategorical(options, (*batch, len(options)))
         else:
             self.action_spec = Unbounded((*batch, *(acts.shape or ())))
-        self.reward_spec = Unbounded((*batch, 1))
+        self.action_spec = self.action_spec.to(self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(ends, shape=batch)
+        self.done_spec = Composite(ends, shape=batch).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: what is random belongs to the levels."""
@@ -171,5 +173,5 @@ def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:
 
 def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
     """Actions [n, ...] of a policy as environments of a space take them."""
-    taken = actions.numpy()
+    taken = actions.cpu().numpy()
     return taken + space.start if isinstance(space, spaces.Discrete) else taken

@@ -105,12 +105,13 @@ class GymnasiumTask(Task):
         self._transforms = _checked_transforms(transforms or [])
         self._envs: dict[torch.Size, EnvBase] = {}
         train = range(LARGEST_SEED) if train_seeds is None else range(train_seeds)
-        space, target = spaces(parameters, seeds=train)
+        space, target = spaces(parameters, seeds=train, device=context.device)
         self._test: Mapping[str, ParameterSpace] = {}
         distributions = {"target": target, "all": space}
         if train_seeds is not None:
             distributions["train"] = space
-            both = spaces(parameters, seeds=range(train_seeds, LARGEST_SEED))
+            test = range(train_seeds, LARGEST_SEED)
+            both = spaces(parameters, seeds=test, device=context.device)
             self._test = dict(zip(("all", "target"), both, strict=True))
         if parameters:
             self.edit = space.edit
@@ -119,7 +120,7 @@ class GymnasiumTask(Task):
             target="target",
             space=space,
             solver=solver,
-            context=context._replace(device=torch.device("cpu")),
+            context=context,
             levels=evaluation.levels,
             seed=evaluation.seed,
             episodes=evaluation.episodes,

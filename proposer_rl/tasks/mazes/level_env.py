@@ -159,7 +159,8 @@ class LevelEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(self.batch_size)
         if mask is None:
-            if self._waiting:
+            # A graph of a reset takes up what is there when it is replayed.
+            if self._waiting or not population.at_hand(self._next_levels.walls):
                 self._play(self._next_levels.clone())
             self._waiting = False
         elif self._waiting:

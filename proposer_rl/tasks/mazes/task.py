@@ -99,6 +99,10 @@ class MazeTask(GridTask):
             context = context._replace(precision=precision)
         self._network = network
         self._make_network = make_network
+        self.exact_performance = evaluation.evaluator == "exact"
+        self.replayed = ("rollouts", "probe", "measure")
+        if self.exact_performance:
+            self.replayed += ("performance",)
         super().__init__(
             maze=maze,
             distributions=distributions,
@@ -120,7 +124,6 @@ class MazeTask(GridTask):
         self._rules = (maze.max_steps, maze.step_penalty)
         self._sampled = ExactEvaluator(*self._rules)
         self._greedy = ExactEvaluator(*self._rules, greedy=True)
-        self.exact_performance = evaluation.evaluator == "exact"
         self._evaluator: ExactEvaluator | RolloutEvaluator = (
             self._sampled
             if self.exact_performance

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from proposer_rl.models import population
 from proposer_rl.settings import signed
 
 LEVEL = ("position", "width", "friction")
@@ -74,13 +75,23 @@ class PointMassEnv(EnvBase):
         self.reward_spec = Unbounded((*batch, 1), device=self.device)
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch).to(self.device)
+        mass = torch.tensor([START[0], 0.0, START[1], 0.0, *[0.0] * len(LEVEL)])
+        self._first = mass.to(self.device).repeat(*batch, 1)
         self.set_levels(levels)
 
     def set_levels(self, levels: TensorDictBase) -> None:
         """Play these levels [*B]; each mass from its next reset on."""
-        level = torch.stack([levels[name].float() for name in LEVEL], -1).to(self.device)
-        mass = level.new_tensor([START[0], 0.0, START[1], 0.0])
-        self._first = torch.cat([mass.expand(*self.batch_size, 4), level], -1)
+        self._first[..., -len(LEVEL) :] = torch.stack([levels[n].float() for n in LEVEL], -1)
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """As TorchRL's, but without asking a GPU first whether any episode is over."""
+        done = tensordict["done"]
+        if population.at_hand(done):
+            return super().maybe_reset(tensordict)
+        begun = self._reset()
+        return tensordict.copy().update(
+            {key: begun[key].where(done, tensordict[key]) for key in begun.keys()}
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)

@@ -59,6 +59,7 @@ class PointMassTask(Task):
 
     title, noun, batched = "point mass", "gates", True
     key = "The wall with its gate, the goal (orange), and the way of the mass."
+    replayed = ("rollouts",)
 
     def __init__(
         self,

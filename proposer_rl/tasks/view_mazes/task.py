@@ -63,6 +63,7 @@ class ViewMazeTask(GridTask):
     fewest_steps = staticmethod(fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
     steps_name = "fewest_actions"
+    replayed = ("rollouts",)
     counting = ", turns included"
     text_key = "> v < ^ start and direction, G goal, • the Solver's episode"
 

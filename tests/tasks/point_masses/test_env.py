@@ -9,8 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import check_env_specs
 
+from proposer_rl.models import population
 from proposer_rl.tasks.point_masses.env import PointMassEnv
 
 DOWN, UP, RIGHT = (0.0, -1.0), (0.0, 1.0), (1.0, 0.0)
@@ -166,3 +168,25 @@ def test_new_levels_begin_with_the_next_reset_of_each() -> None:
     state = env.reset(state.set("_reset", torch.tensor([[False], [True]])))
     assert state["observation"][:, 4:].tolist() == [[0.0, 1.0, 0.0], [2.0, 3.0, 1.0]]
     assert state["step_count"].flatten().tolist() == [1, 0]
+
+
+def test_on_a_gpu_finished_episodes_begin_again_without_a_look(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As TorchRL's own resets, which ask the device first whether there are any."""
+    levels, rollouts = gates((0, 8, 0), (4, 0.5, 1), (-2, 1, 4)), []
+    for at_hand in (True, False):
+        monkeypatch.setattr(population, "at_hand", lambda _, answer=at_hand: answer)
+        env = PointMassEnv(levels, max_steps=15)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(60, break_when_any_done=False, policy=DownOrAside()))
+    assert rollouts[0]["next", "done"].sum() > 9
+    assert rollouts[0]["next", "terminated"].any()
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+class DownOrAside(nn.Module):
+    """Pushes at random, and mostly towards the wall."""
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        return tensordict.set("action", torch.rand(*tensordict.batch_size, 2) * 2 - 1.6)

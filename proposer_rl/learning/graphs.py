@@ -1,0 +1,90 @@
+"""Functions of tensordicts as CUDA graphs, by tensordict's ``CudaGraphModule``.
+
+Thousands of small kernels cost a GPU less time than it takes Python to ask for them one by one; a
+graph asks for all of them at once. It repeats kernels on the memory that they were recorded with
+and runs no Python. So a function that is recorded reads nothing back from the device, and what it
+reads and changes besides its inputs (weights, an optimiser's state, the levels that an environment
+plays) stays where it is.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CudaGraphModule
+from torch.utils._pytree import tree_leaves
+
+from proposer_rl.settings import ArgumentError
+
+WARM_UPS = 2  # calls of the function itself, in the last of which it is recorded
+
+
+def has_graphs(device: torch.device) -> bool:
+    """Whether functions on a device can be replayed."""
+    return device.type == "cuda"
+
+
+def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDictBase]:
+    """The same function on a GPU, replayed from its third call on.
+
+    Args:
+        function: from a tensordict, and further objects, which are the same in every call, to a
+            tensordict. All inputs keep their shapes.
+
+    Returns:
+        A function whose outputs are nobody else's. It raises an ArgumentError where it cannot be
+        recorded.
+    """
+    with warnings.catch_warnings():
+        # Tensordicts are no pytrees from here on, which nothing here takes them for.
+        warnings.filterwarnings("ignore", message="Tensordict is registered in PyTree")
+        logging.getLogger("tensordict").setLevel(logging.WARNING)  # a line for each graph
+        module = CudaGraphModule(function, warmup=WARM_UPS, in_keys=[])
+
+    def call(inputs: TensorDictBase, *others: object) -> TensorDictBase:
+        if module.counter < WARM_UPS:
+            # It keeps the inputs that it records, which later replays write over, and so would what
+            # came of them.
+            try:
+                return module(inputs.clone(), *others).clone()
+            except RuntimeError as error:
+                name, why = getattr(function, "__qualname__", function), str(error).split("\n")[0]
+                raise ArgumentError(
+                    f"graphs=True: {name} cannot be recorded as a CUDA graph: {why}"
+                ) from error
+        return module(inputs, *others)
+
+    return call
+
+
+class ReplayedOfAgents:
+    """A function of agents and tensordicts, recorded for each agent and each size of its inputs.
+
+    Args:
+        function: of an agent, of levels where there are any, and of what has no say in the result,
+            such as a generator that nothing is drawn from.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._graphs: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
+
+    def __call__(self, agent: Any, *given: Any) -> Any:
+        """As the function."""
+        inputs = TensorDict({"levels": given[0]} if given else {})
+        size = tuple(entry.shape for entry in tree_leaves(inputs.to_dict()))
+        graphs = self._graphs.setdefault(agent, {})
+        if size not in graphs:
+            graphs[size] = replayed(self._apply)
+        # The agent is no part of what is recorded, and so is not kept alive by it.
+        return graphs[size](inputs, agent, *given[1:])["result"]
+
+    def _apply(self, inputs: TensorDictBase, agent: Any, *others: Any) -> TensorDictBase:
+        levels = [inputs["levels"]] if "levels" in inputs.keys() else []
+        return TensorDict({"result": self._function(agent, *levels, *others)})
