@@ -25,6 +25,12 @@ from proposer_rl.settings import ArgumentError
 WARM_UPS = 2  # calls of the function itself, in the last of which it is recorded
 
 
+class GraphError(ArgumentError):
+    """A function cannot be recorded; the message is one line."""
+
+    exit_code = 2
+
+
 def has_graphs(device: torch.device) -> bool:
     """Whether functions on a device can be replayed."""
     return device.type == "cuda"
@@ -38,7 +44,7 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
             tensordict. All inputs keep their shapes.
 
     Returns:
-        A function whose outputs are nobody else's. It raises an ArgumentError where it cannot be
+        A function whose outputs are nobody else's. It raises a GraphError where it cannot be
         recorded.
     """
     with warnings.catch_warnings():
@@ -55,8 +61,9 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
                 return module(inputs.clone(), *others).clone()
             except RuntimeError as error:
                 name, why = getattr(function, "__qualname__", function), str(error).split("\n")[0]
-                raise ArgumentError(
-                    f"graphs=True: {name} cannot be recorded as a CUDA graph: {why}"
+                raise GraphError(
+                    f"graphs=True: {name} cannot be recorded as a CUDA graph, graphs=False does "
+                    f"without: {why}"
                 ) from error
         return module(inputs, *others)
 

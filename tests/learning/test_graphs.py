@@ -6,8 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from proposer_rl.cli.errors import exit_code
 from proposer_rl.learning import graphs
-from proposer_rl.settings import ArgumentError
 
 pytestmark = pytest.mark.filterwarnings("ignore:This module is instantiated on a machine without")
 
@@ -30,8 +30,9 @@ def test_what_cannot_be_recorded_is_named() -> None:
     def reads(inputs: TensorDictBase) -> TensorDictBase:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    with pytest.raises(ArgumentError, match=r"graphs=True: .*reads cannot be recorded"):
+    with pytest.raises(graphs.GraphError, match=r"graphs=True: .*reads cannot be recorded") as told:
         graphs.replayed(reads)(TensorDict())
+    assert exit_code(told.value) == 2
 
 
 def test_each_agent_and_each_size_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

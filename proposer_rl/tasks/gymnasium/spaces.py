@@ -51,7 +51,7 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
     """What makes observations plain, and their space; None where they are."""
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
         return None
-    parts = dict(_leaves(space))
+    parts = dict(leaves(space))
     for name, part in parts.items():
         if not isinstance(
             part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
@@ -158,7 +158,7 @@ def _actions(space: spaces.Space[Any]) -> Change | None:
     """What makes actions of plain ones, and the space of those; None where they are plain."""
     if isinstance(space, spaces.Discrete):
         return None
-    parts = dict(_leaves(space))
+    parts = dict(leaves(space))
     if all(_is_continuous(part) for part in parts.values()):
         boxes = [_Scaled(cast(spaces.Box, part)) for part in parts.values()]
         new: spaces.Space[Any] = spaces.Box(
@@ -231,12 +231,12 @@ def _chosen(space: spaces.Space[Any], choices: Array) -> Any:
     return (shaped + start).astype(space.dtype)
 
 
-def _leaves(space: spaces.Space[Any], name: str = "") -> Iterator[tuple[str, spaces.Space[Any]]]:
+def leaves(space: spaces.Space[Any], name: str = "") -> Iterator[tuple[str, spaces.Space[Any]]]:
     """The parts of a space that are no dictionaries or tuples, by their dotted names."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         within = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
         for part, inner in within:
-            yield from _leaves(inner, f"{name}.{part}" if name else str(part))
+            yield from leaves(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, space
 

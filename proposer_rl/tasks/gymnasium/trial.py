@@ -28,8 +28,10 @@ from proposer_rl.tasks.gymnasium.player import (
     wrapper_of,
 )
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
+from proposer_rl.tasks.gymnasium.spaces import leaves
 from proposer_rl.tasks.parameters import Bins
 
+EXACT = 2**24  # up to which float32 has all whole numbers
 SHORT = 64  # steps of an episode in which levels are compared
 RESETS = 3  # after which a level must still be there
 
@@ -124,6 +126,8 @@ def _check_wrappers(
         try:
             player = LevelPlayer(some, parameters, play)
             _check_spaces(player)
+            if count == len(make.wrappers):
+                _tell_misleading(player.observation_space)
             first, second = (list(_played(player, SHORT)) for _ in range(2))
             player.close()
         except (ImportError, gymnasium.error.Error, WrapperError):
@@ -304,6 +308,24 @@ def _check_spaces(player: LevelPlayer) -> None:
         (player.action_space, check_action_space),
     ):
         check(space)
+
+
+def _tell_misleading(space: spaces.Space[Any]) -> None:
+    """Tell what a network gets otherwise than somebody may think."""
+    for name, part in leaves(space):
+        if name.split(".")[-1] == "action_mask":
+            warnings.warn(
+                f"{name}: is shown to the Solver as numbers; actions are not masked", stacklevel=2
+            )
+        if isinstance(part, spaces.Box) and part.dtype.kind in "iu":
+            largest = max(abs(int(part.low.min())), abs(int(part.high.max())))
+            whole = np.iinfo(part.dtype)
+            if EXACT < largest < max(-whole.min, whole.max):
+                warnings.warn(
+                    f"{name or 'observation'}: whole numbers up to {largest:,} lose digits beyond "
+                    f"{EXACT:,}, since a network gets them as float32",
+                    stacklevel=2,
+                )
 
 
 def _alike(one: list[_Played], other: list[_Played]) -> bool:

@@ -295,6 +295,27 @@ def test_fractions_in_the_place_of_a_whole_number_are_told() -> None:
         line_task(odd(goal=3), parameters={"goal": whole})
 
 
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        (
+            showing(
+                spaces.Dict({"x": spaces.Box(0, 1, (1,)), "action_mask": spaces.MultiBinary(2)}),
+                {"x": np.zeros(1, np.float32), "action_mask": np.ones(2, np.int8)},
+            ),
+            "action_mask: .* actions are not masked",
+        ),
+        (
+            showing(spaces.Box(0, 2**30, (2,), np.int64), np.zeros(2, np.int64)),
+            "observation: whole numbers up to 1,073,741,824 lose digits beyond 16,777,216",
+        ),
+    ],
+)
+def test_what_a_network_gets_otherwise_is_told(members: dict[str, Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message):
+        line_task(odd(**members))
+
+
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
     """The environment is as it should be until it has been stepped often."""
