@@ -89,7 +89,7 @@ def _easiness(student: Student, outcome: TensorDictBase) -> Tensor:
     rollout = outcome["rollout"]
     ended = episodes(rollout)
     loss = Scorer("l1_value_loss", "episodes")
-    lost = loss.of_rollouts(student, [rollout], *unseen(ended.ended.shape)).score
+    lost = loss.of_rollouts(student, [rollout], unseen(ended.ended.shape)).score
     return lost - (ended.total / ended.ended.clamp(1)).cpu()
 
 

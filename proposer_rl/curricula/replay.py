@@ -34,7 +34,6 @@ from proposer_rl.curricula.batches import (
     unpacked,
 )
 from proposer_rl.curricula.buffer import (
-    SEEN,
     ReplayRule,
     draw_slots,
     empty_buffer,
@@ -165,7 +164,7 @@ class ReplayCurriculum(Curriculum):
             if new is not None:
                 levels[~replayed] = new[~replayed]
         buffer = dict(self.buffer.items())
-        known = {name: buffer[name].gather(1, slots) for name in (*SEEN, "key", "reached")}
+        known = {name: buffer[name].gather(1, slots) for name in ("best", "key", "reached")}
         reached = buffer["reached"]
         mean = reached.where(reached.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return self._inbox.batch(
@@ -174,7 +173,6 @@ class ReplayCurriculum(Curriculum):
             replayed=each.expand(copies, count),
             key=known["key"],
             best=known["best"].where(each, -torch.inf),
-            solved=known["solved"] & each,
             before=known["reached"].where(each, mean.nan_to_num(-torch.inf)),
         )
 
@@ -185,7 +183,7 @@ class ReplayCurriculum(Curriculum):
         evidence = {"level": moved(batch.levels, CPU)}
         evidence |= {name: notes[name] for name in ("slot", "replayed", "key")}
         if self.scorer.from_episodes:
-            known = (notes[name] for name in (*SEEN, "before"))
+            known = notes["best"], notes["before"]
             evidence |= self.scorer.of_outcome(student, outcome, *known)._asdict()
             evidence["reached"] = outcome["return"].float()
         evidence |= self._children.evidence(student, outcome)
@@ -323,7 +321,6 @@ class ReplayCurriculum(Curriculum):
                 slots,
                 scored.score.where(there, -torch.inf),
                 scored.best.where(there, -torch.inf),
-                scored.solved & there,
                 None if reached is None else reached.where(there, -torch.inf),
             )
         if not bool(replayed.all()):

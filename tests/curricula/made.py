@@ -135,7 +135,6 @@ MADE: dict[str, Make] = {
     "ncc": ncc,
     "gradients": lambda: replay("gradient_norm", "exact"),
     "policy gradients": lambda: replay("gradient_norm"),
-    "negative advantages": lambda: replay("mean_negative_advantage"),
     "law": lambda: replay("max_mc", "exact"),
     "sfl": selection,
     "sfl from episodes": lambda: selection("episodes"),

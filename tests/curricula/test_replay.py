@@ -170,7 +170,7 @@ def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     lived = live(replay(), learner, [0], range(1))
     rollout, taught = lived.updates[-1].rollout, TaskStudent(TASK, learner)
     loss = Scorer("l1_value_loss", "episodes")
-    lost = loss.of_rollouts(taught, [rollout], *unseen((1, P))).score[0]
+    lost = loss.of_rollouts(taught, [rollout], unseen((1, P))).score[0]
     easy = _easiness(taught, outcome_of(rollout))
     after = rollout["next"][0]
     for p in range(P):
