@@ -29,8 +29,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula import slots as rows
-from proposer_rl.curricula.batches import CPU, moved
-from proposer_rl.curricula.keys import level_keys
+from proposer_rl.curricula.batches import CPU, level_keys, moved
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]

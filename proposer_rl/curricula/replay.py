@@ -28,6 +28,7 @@ from proposer_rl.curricula.batches import (
     CPU,
     device_of,
     fresh_levels,
+    level_keys,
     levels_at,
     moved,
     packed,
@@ -43,7 +44,6 @@ from proposer_rl.curricula.buffer import (
 )
 from proposer_rl.curricula.children import Children, Edit, Parents, lineage
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.keys import level_keys
 from proposer_rl.curricula.scores import Scored, Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
+from proposer_rl.curricula.batches import level_keys
 from proposer_rl.curricula.buffer import (
     ReplayRule,
     draw_slots,
@@ -22,7 +23,6 @@ from proposer_rl.curricula.buffer import (
     score_weights,
     staleness_weights,
 )
-from proposer_rl.curricula.keys import level_keys
 
 # Five levels of a buffer; the same in every test that says "the table".
 SCORE = torch.tensor([0.9, 0.1, 0.5, 0.5, -0.2], dtype=torch.float64)
