@@ -247,7 +247,7 @@ def proposer(
         settings, make_task = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
         copies = CopiesInWorkers(learner, make_env, settings)
-    return ProposerTrainer(learner, copies).curriculum(config.own_action)
+    return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from signal import SIG_DFL, SIGTERM, signal
@@ -13,8 +14,10 @@ import pytest
 import torch
 
 from proposer_rl.curricula import (
+    Advance,
     Batch,
     Curriculum,
+    Improvement,
     LearnedCurriculum,
     SamplingCurriculum,
     TaskStudent,
@@ -141,10 +144,10 @@ class Costly(LearnedCurriculum):
         self.events.append(("observe",))
         self.observed += 1
 
-    def improve(self, student, streams) -> dict:
+    def improve(self, student, streams) -> Improvement:
         self.events.append(("improve",))
         student.spend(frames=1000, evaluations=100)
-        return {"own": ["improved"]}
+        return Improvement({"own": ["improved"]})
 
     def log(self) -> dict:
         observed, self.observed = self.observed, 0
@@ -184,9 +187,8 @@ def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> Non
     class Silent(Costly):
         crashes = False
 
-        def improve(self, student, streams) -> dict:
-            super().improve(student, streams)
-            return {}
+        def improve(self, student, streams) -> Improvement:
+            return replace(super().improve(student, streams), metrics={})
 
         def propose(self, student, count, streams) -> Batch:
             if self.crashes:
@@ -247,6 +249,25 @@ def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:
         assert len(row["levels"]["some"]) == 2 and "picture" in row["levels"]["some"][0]
 
 
+class Jumps(LearnedCurriculum):
+    """Trains the Solver itself: an update of its own takes the cycle's place."""
+
+    def improve(self, student, streams) -> Improvement:
+        levels = TASK.target.sample(P, streams[0].generator("levels"))[None]
+        student._learner.env.set_levels(levels)
+        update = student._learner.update([streams[0].generator("actions")])
+        return Improvement({}, advance=Advance(2, levels, update))
+
+
+def test_an_advance_takes_the_updates_of_its_cycle(tmp_path: Path) -> None:
+    run = experiment(tmp_path, 0, curriculum=Jumps())
+    summary = run.run()
+    assert [row["updates"] for row in read_csv(tmp_path / "metrics.csv")] == [0, 2, 4, 6]
+    assert [row["updates"] for row in read_csv(tmp_path / "training.csv")] == [2, 4, 6]
+    assert summary["updates"] == 6 and run.cycles == 3
+    assert all((entry["step"] == 2 * 3).all() for entry in run.learner.snapshot().values())
+
+
 class Stopped(Costly):
     """A signal comes in the middle of its second improvement."""
 
@@ -257,7 +278,7 @@ class Stopped(Costly):
         self.signals = signals
         self.begun = torch.zeros(())
 
-    def improve(self, student, streams) -> dict:
+    def improve(self, student, streams) -> Improvement:
         # What is begun here must be undone, also what has changed in place.
         self.begun += 1
         levels = TASK.target.sample(P, streams[0].generator("levels"))[None]

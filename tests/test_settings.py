@@ -52,7 +52,7 @@ def first_cycle(*overrides: str) -> str:
         [entry.double().sum().item() for entry in ppo.snapshot().values(True, True)]
         for ppo in (learner, curriculum.trainer.learner)
     ]
-    return json.dumps([outcome, student.evaluations, levels, learnt])
+    return json.dumps([outcome.metrics, student.evaluations, levels, learnt])
 
 
 def test_the_same_settings_give_the_same_numbers() -> None:
@@ -78,6 +78,7 @@ KEYS = [
     ("proposer.probe_levels=1", []),
     ("proposer.observes=[return]", []),
     ("proposer.own_action=sample", []),
+    ("proposer.advance=best", []),
     ("proposer.advantage=gae", [EPISODE]),  # of one action both are the reward, standardised
     ("proposer.context=4", []),
     ("proposer.hidden=4", []),

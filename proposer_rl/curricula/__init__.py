@@ -23,8 +23,10 @@ from proposer_rl.curricula.buffer import (
 )
 from proposer_rl.curricula.combinators import Filtered, Mixed, Schedule
 from proposer_rl.curricula.contract import (
+    Advance,
     Batch,
     Curriculum,
+    Improvement,
     Inbox,
     LearnedCurriculum,
     outcome_of,
@@ -45,12 +47,14 @@ from proposer_rl.curricula.transport import TransportCurriculum
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 __all__ = [
+    "Advance",
     "Batch",
     "BinCurriculum",
     "Curriculum",
     "Filtered",
     "FirstOrderCurriculum",
     "FirstOrderProposer",
+    "Improvement",
     "Inbox",
     "LearnedCurriculum",
     "LearningProgressCurriculum",

@@ -19,7 +19,7 @@ T steps, N bins. A loop that trains one student has K = 1.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -28,7 +28,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import levels_at, packed, restored, saved, unpacked
 from proposer_rl.curricula.student import Student
-from proposer_rl.learning import first_episode_return, first_episode_success
+from proposer_rl.learning import Update, first_episode_return, first_episode_success
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
@@ -166,6 +166,34 @@ class Curriculum:
         """Let go of all that is held outside of this process."""
 
 
+@dataclass
+class Advance:
+    """Updates that the student has got from a curriculum itself, instead of the cycle's.
+
+    Attributes:
+        updates: how many.
+        levels: those of the last one, [K, P].
+        update: the last one's rollout, [K, P, T], and metrics.
+    """
+
+    updates: int
+    levels: Levels
+    update: Update
+
+
+@dataclass
+class Improvement:
+    """What a curriculum did before a cycle.
+
+    Attributes:
+        metrics: as :meth:`Curriculum.log` gives them.
+        advance: None if the student is as it was.
+    """
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+    advance: Advance | None = None
+
+
 class LearnedCurriculum(Curriculum):
     """A curriculum that trains something before a cycle, such as a Proposer or one of its parts.
 
@@ -175,7 +203,7 @@ class LearnedCurriculum(Curriculum):
 
     trains_replicas: bool = False
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Prepare for the next cycle, whose first proposal has not been made.
 
         After whatever it raises may come :meth:`Curriculum.load_state_dict`, and a repeated call.
@@ -183,11 +211,8 @@ class LearnedCurriculum(Curriculum):
         Args:
             student: as it is before the cycle.
             streams: of the cycle, K of them.
-
-        Returns:
-            Its metrics, as :meth:`Curriculum.log` gives them.
         """
-        return {}
+        return Improvement()
 
 
 class Inbox:

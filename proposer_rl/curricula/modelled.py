@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.combinators import Combinator
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, Inbox
 from proposer_rl.curricula.outcome_model import Labels, OutcomeModel
 from proposer_rl.curricula.student import ABILITIES, Student
 from proposer_rl.settings import Positive, checked
@@ -85,7 +85,7 @@ class Modelled(Combinator):
         self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
         self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Improve the curriculum, by what the model says of the student."""
         return super().improve(_Answering(student, self._predict), streams)
 

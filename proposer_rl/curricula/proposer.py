@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.contract import Batch, LearnedCurriculum
+from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedCurriculum
 from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
@@ -62,18 +62,18 @@ class ProposerCurriculum(LearnedCurriculum):
         self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
         if self.trains_replicas:
-            self.needs += ("snapshot",)
+            self.needs += ("snapshot", "restore")
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Draw the levels through which the student is seen, and let the trainer train."""
         (stream,) = streams
         self._proposed = 0
         if self.trainer is not None:
             return self.trainer.train(student, stream)
         self.view.draw_levels(stream)
-        return {}
+        return Improvement()
 
     @torch.no_grad()
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -144,12 +144,19 @@ class ProposerTrainer:
             horizon is the number of steps of that environment's episodes.
         copies: where the replicas are rolled out; None for the learner's own environment, in this
             process.
+        advance: ``"train"``: the student trains on new proposals; ``"best"`` or ``"random"``: it
+            becomes the replica with the greatest total reward, or any, with its optimiser.
 
     Raises:
         ValueError: for an environment of another kind, or a horizon other than the episode's.
     """
 
-    def __init__(self, learner: PPO, copies: Copies | None = None) -> None:
+    def __init__(
+        self,
+        learner: PPO,
+        copies: Copies | None = None,
+        advance: Literal["train", "best", "random"] = "train",
+    ) -> None:
         env = learner.env
         if not isinstance(env, SolverTrainingEnv):
             raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
@@ -161,6 +168,7 @@ class ProposerTrainer:
         self.learner = learner
         self.env = env
         self.copies = copies or CopiesHere(learner)
+        self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
         """The curriculum of this Proposer while it learns."""
@@ -175,7 +183,7 @@ class ProposerTrainer:
             trainer=self,
         )
 
-    def train(self, student: Student, stream: Streams) -> dict[str, Any]:
+    def train(self, student: Student, stream: Streams) -> Improvement:
         """Roll K replicas of the student out and train the Proposer on their rewards."""
         env = self.env
         rollout = self.copies.roll_out(student.snapshot()[0], stream)
@@ -184,12 +192,26 @@ class ProposerTrainer:
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         copies = len(rewards)
+        # A replica that the student becomes is the student's own training.
+        trained = copies - (self.advance != "train")
         student.spend(
-            frames=copies * env.frames_per_update * env.meta_episode_length,
+            frames=trained * env.frames_per_update * env.meta_episode_length,
             # Every replica after each of its actions, and all of them once at the start.
             evaluations=copies * (env.steps + 1) * env.view.validation_levels,
         )
-        return self._metrics(rollout, rewards, training)
+        metrics = self._metrics(rollout, rewards, training)
+        return Improvement(metrics, self._advance(student, rewards, stream))
+
+    def _advance(self, student: Student, rewards: Tensor, stream: Streams) -> Advance | None:
+        if self.advance == "train":
+            return None
+        best = int(rewards.argmax())
+        if self.advance == "random":
+            generator = stream.generator("advance")
+            best = int(torch.randint(len(rewards), (), generator=generator))
+        trained = self.copies.trained(best)
+        student.restore(trained.solver)
+        return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 
     def _metrics(
         self, rollout: TensorDictBase, rewards: Tensor, training: TensorDict

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from proposer_rl.curricula import (
     Curriculum,
+    Improvement,
     LearnedCurriculum,
     TaskStudent,
     outcome_of,
@@ -202,15 +203,19 @@ class Experiment:
     def _improve(self) -> None:
         """Begin a cycle."""
         spent = self.student.frames
-        improved: dict[str, Any] = {}
+        outcome = Improvement()
         if isinstance(self.curriculum, LearnedCurriculum):
-            improved = self._improved(self.curriculum)
-        logged = self._log_cycle(improved)
+            outcome = self._improved(self.curriculum)
+        logged = self._log_cycle(outcome.metrics)
         self.cycles += 1
+        if outcome.advance is not None:
+            self.updates += outcome.advance.updates
+            self._measure()
+            self._tables.add_training(self.updates, outcome.advance.levels, *outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
         self._pause(due=logged or self.student.frames > spent)
 
-    def _improved(self, curriculum: LearnedCurriculum) -> dict[str, Any]:
+    def _improved(self, curriculum: LearnedCurriculum) -> Improvement:
         streams = self._streams("cycle", self.cycles)
         while True:
             before = deepcopy(self._state())  # improving may change a curriculum's state in place

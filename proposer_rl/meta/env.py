@@ -47,6 +47,9 @@ class SolverTrainingEnv(EnvBase):
         on_update: called after every update with the number of those that the episode has had,
             e.g. by a progress bar; what it raises ends the episode.
 
+    Attributes:
+        last_training: levels [K, P] of the last update, and what came of it.
+
     Raises:
         ValueError: if the Solvers are no population, or a length is out of range.
     """
@@ -146,6 +149,7 @@ class SolverTrainingEnv(EnvBase):
         with torch.enable_grad(), located(place):
             update = self.solvers.update(generators)
             self.solvers.check(self._copies.start)
+        self.last_training = (levels, update)
         self._updates += 1
         before, _ = self._seen
         if measure:

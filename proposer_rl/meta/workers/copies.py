@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector
 
 from proposer_rl.learning import PPO, DivergedError
+from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
     WorkersError,
@@ -99,6 +100,13 @@ class CopiesInWorkers:
         rollout = rollout.exclude("collector").to(self._env.device)
         rollout.names = [None, "time"]
         return self._proposer.complete(rollout)
+
+    def trained(self, copy: int) -> Trained:
+        """See :meth:`~proposer_rl.meta.copies.Copies.trained`."""
+        assert self._collector is not None, "there has been no episode"
+        orders = [(copy,)] * len(self._shares)
+        results: list[Trained | None] = self._collector.map_fn("env.trained", orders)
+        return next(filter(None, results)).to(self._env.device)
 
     def close(self) -> None:
         """End the workers; the next episode starts others."""

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
+from proposer_rl.meta.copies import Trained, taken_out
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.models import ActorCritic, uniform_noise, use_device
 from proposer_rl.streams import Streams
@@ -29,6 +30,13 @@ class WorkerEnv(SolverTrainingEnv):
         """See :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
         super().fork(solver, streams)
+
+    def trained(self, copy: int) -> Trained | None:
+        """A replica as its last update has left it, on the CPU; None if another worker has it."""
+        if copy not in self._copies:
+            return None
+        own = taken_out(self, copy - self._copies.start).to("cpu")
+        return own._replace(solver=own.solver.consolidate())  # one thing to send, not hundreds
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:
