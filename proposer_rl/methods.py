@@ -67,13 +67,10 @@ class Workers(NamedTuple):
     Attributes:
         settings: how many there are, and where.
         make_task: makes the task in one of them, given its device; can be pickled.
-        tell: called now and then with the number of updates that all replicas have had of an
-            episode.
     """
 
     settings: WorkerSettings
     make_task: Callable[[str], Task]
-    tell: Callable[[int], None] = lambda done: None
 
 
 class Components(NamedTuple):
@@ -247,9 +244,9 @@ def proposer(
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
     copies = None
     if components.workers is not None:
-        settings, make_task, tell = components.workers
+        settings, make_task = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
-        copies = CopiesInWorkers(learner, make_env, settings, tell)
+        copies = CopiesInWorkers(learner, make_env, settings)
     return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
 
 

@@ -32,7 +32,7 @@ from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import ERROR, FEWEST, Estimate, holm, mean_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 from research.ranking import TARGET, Needs, needs_of
 
 Verdict = Literal["supported", "contradicted", "undecided", "too few seeds"]

@@ -17,8 +17,7 @@ from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
-from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.folder import read_bounded
+from proposer_rl.runs.folder import is_rate, read_bounded
 
 LARGEST_FILE = 2**24
 LONGEST_NAME = 1024  # characters; a file of levels is named by its path

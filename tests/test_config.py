@@ -32,7 +32,7 @@ from proposer_rl.cli.errors import (
     lacks_memory,
     one_line,
 )
-from proposer_rl.cli.same_run import check_same_run
+from proposer_rl.cli.run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
 from proposer_rl.recipes import CONFIG_FOLDER, available

@@ -12,7 +12,7 @@ import pytest
 from hydra.errors import MissingConfigException
 
 from proposer_rl import extras
-from proposer_rl.cli.hydra_errors import LAUNCHERS, explained
+from proposer_rl.cli.groups import LAUNCHERS, explained
 from proposer_rl.extras import install_command
 from tests.test_packaging import PROJECT, ROOT
 

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.loggers import log_of, logger, require_logger
-from proposer_rl.cli.settings import LoggerSettings
 from tests.report.folders import LEVEL, PIXELS, cycle, write_run
 
 SMOKE = ["+method=target", "+scale=smoke", "compute.progress=false", "hydra.run.dir=run"]

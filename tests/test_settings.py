@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.settings import ComputeSettings
+from proposer_rl.cli.config import ComputeSettings
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning.settings import SolverSettings

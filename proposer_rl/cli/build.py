@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -115,15 +114,12 @@ def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, 
 def _curriculum(
     config: RunConfig, task: Task, signals: StopSignals, status: Status | None
 ) -> Curriculum:
-    def tell(done: int) -> None:
+    def on_update(done: int) -> None:
         if status is not None:
             status.tell("training the replicas", done)
-
-    def on_update(done: int) -> None:
-        tell(done)
         signals.check()
 
-    workers = _workers(config, task, tell)
+    workers = _workers(config, task)
     components = Components(task, config.proposer, config.seeds, on_update, workers)
     with (
         key("curriculum", "curriculum: ", (TypeError, ValueError)),
@@ -166,7 +162,7 @@ def _check_cycle(config: RunConfig) -> None:
         )
 
 
-def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Workers | None:
+def _workers(config: RunConfig, task: Task) -> Workers | None:
     """Where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
@@ -200,7 +196,7 @@ def _workers(config: RunConfig, task: Task, tell: Callable[[int], None]) -> Work
     settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
     context = ComputeContext(precision=task.precision, cores=cores, graphs=compute.graphs)
     make = partial(_made, task_maker(config.task), config.solver, context)
-    return Workers(settings, make, tell)
+    return Workers(settings, make)
 
 
 def _device(name: str, key: str = "device") -> torch.device:

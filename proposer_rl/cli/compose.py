@@ -19,8 +19,7 @@ from yaml import YAMLError
 
 from proposer_rl.cli.config import read_config
 from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.groups import check_groups
-from proposer_rl.cli.hydra_errors import explained
+from proposer_rl.cli.groups import check_groups, explained
 from proposer_rl.cli.run import carry_out
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError, one_line
-from proposer_rl.cli.settings import LoggerSettings
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.report.records import numbers, picture

@@ -26,8 +26,7 @@ from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.report.progress import read_progress
 from proposer_rl.report.records import level_text
 from proposer_rl.report.terminal import screen
-from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.folder import RunFolder, is_rate
 from proposer_rl.runs.machine import processor
 
 

@@ -14,11 +14,10 @@ from PIL import Image
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import LARGEST_FILE, RunConfig
+from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
-from proposer_rl.cli.same_run import as_begun, check_same_run
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.report.pictures import draw_run
@@ -30,6 +29,9 @@ from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
 
 SUMMARY = "summary.json"
+# What may differ: where it is computed and shown, and a longer schedule.
+FREE = {"compute", "logger"}
+FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
 
 def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
@@ -150,3 +152,59 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     with storage(file):
         file.unlink()
     return None
+
+
+def check_same_run(folder: RunFolder, config: RunConfig) -> None:
+    """Refuse to go on with a run that was started with other settings.
+
+    The stored configuration is compared with the present one and used for nothing else. If there is
+    none, the present one is written.
+    """
+    now = {key: value for key, value in asdict(config).items() if key not in FREE}
+    now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
+    file, wrong = folder.path / "config.json", f"hydra.run.dir={folder.path}:"
+    if not file.exists():
+        # Tables here are no run's of ours, and a run begins by removing what is left of one.
+        foreign = sorted([*folder.lengths(), *(p.name for p in folder.path.glob("checkpoints"))])
+        if foreign:
+            raise ConfigError(
+                f"{wrong} holds {foreign[0]} but no config.json, so it is no run's folder; give "
+                "another"
+            )
+        folder.write_json(file.name, now)
+        return
+    before = stored_config(file)
+    if isinstance(before, dict) and (gone := before.keys() - now.keys()):
+        raise ConfigError(
+            f"{wrong} the run there was begun by another version, which had "
+            f"{', '.join(sorted(gone))}; it can be read, but not gone on with"
+        )
+    differing = _different(before, now)
+    if differing:
+        key, (old, new) = next(iter(differing.items()))
+        raise ConfigError(
+            f"{key}={new!r:.80}: the run in {folder.path} was started with {old!r:.80}; "
+            f"differing keys: {', '.join(differing)}"
+        )
+
+
+def as_begun(config: RunConfig, path: Path) -> RunConfig:
+    """The settings, with what ``precision=auto`` was on the machine where the run was begun."""
+    file = path / "config.json"
+    if config.precision != "auto" or not file.is_file():
+        return config
+    match stored_config(file):
+        case {"precision": ("fp32" | "bf16") as precision}:
+            return replace(config, precision=precision)
+    return config
+
+
+def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
+    """Both values of every key that differs, by its dotted name."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return {} if before == now else {prefix.rstrip("."): (before, now)}
+    return {
+        name: values
+        for key in sorted(before.keys() | now.keys())
+        for name, values in _different(before.get(key), now.get(key), f"{prefix}{key}.").items()
+    }

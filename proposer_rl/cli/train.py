@@ -18,12 +18,15 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli import traces
+from proposer_rl.cli.callbacks import (
+    LostJobError,
+    command_folder,
+    forget_failure,
+    record_failure,
+    remove_traces,
+)
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import check_chosen, check_groups, overrides
-from proposer_rl.cli.hydra_errors import explained
-from proposer_rl.cli.sweep import LostJobError, forget_failure, record_failure
-from proposer_rl.cli.traces import remove_traces
+from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 
@@ -56,7 +59,7 @@ def _compose_and_run() -> None:
         ) from error
     except OSError as error:  # of Hydra's own files
         remove_traces()
-        refuse(error, traces.folder())
+        refuse(error, command_folder())
     except ValueError as error:
         if BEGUN:
             raise

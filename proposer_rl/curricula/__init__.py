@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from proposer_rl.curricula.batches import SomeBins
+from proposer_rl.curricula.batches import SomeBins, level_keys
 from proposer_rl.curricula.bins import BinCurriculum
 from proposer_rl.curricula.buffer import (
     ReplayRule,
@@ -33,7 +33,6 @@ from proposer_rl.curricula.contract import (
 )
 from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
 from proposer_rl.curricula.gaussians import MixtureCurriculum
-from proposer_rl.curricula.keys import level_keys
 from proposer_rl.curricula.modelled import Modelled
 from proposer_rl.curricula.problem_proposer import ProblemProposer
 from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer

@@ -10,8 +10,7 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 
 - ``level``: the levels;
 - ``filled`` bool: whether there is one; nothing else of an empty slot counts;
-- ``score`` float64; ``best`` float32, the highest return that was ever seen on the level, and
-  ``solved`` bool, whether an episode there ever was a success;
+- ``score`` float64; ``best`` float32, the highest return that was ever seen on the level;
 - ``reached`` float32, the return when the level was trained on last; else minus infinity;
 - ``touched`` int64: the clock when it was drawn or scored last. A clock counts the levels that were
   drawn or scored; it is the entry ``clock``, the same in all slots;
@@ -30,13 +29,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula import slots as rows
-from proposer_rl.curricula.batches import CPU, moved
-from proposer_rl.curricula.keys import level_keys
+from proposer_rl.curricula.batches import CPU, level_keys, moved
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
-
-SEEN = ("best", "solved")  # entries that never fall
 
 
 @settings
@@ -75,7 +71,6 @@ def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
             "score": torch.zeros(shape, dtype=torch.float64),
             "best": torch.full(shape, -torch.inf),
             "reached": torch.full(shape, -torch.inf),
-            "solved": torch.zeros(shape, dtype=torch.bool),
             **{name: torch.zeros(shape, dtype=torch.int64) for name in numbers},
         },
         shape,
@@ -196,9 +191,9 @@ def insert(
 
     Args:
         buffer: [K, N].
-        new: [K, M] with ``level``, ``score``, ``best`` and ``solved``, and where it is not zero
-            ``parent`` and ``generation``; ``reached`` where they were trained on. Scores that are
-            not finite are those of levels not to be kept.
+        new: [K, M] with ``level``, ``score`` and ``best``, and where it is not zero ``parent`` and
+            ``generation``; ``reached`` where they were trained on. Scores that are not finite are
+            those of levels not to be kept.
         rule: of the draws.
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
@@ -211,20 +206,19 @@ def insert(
     keys = level_keys(fresh["level"])
     none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
     for copy in _copies(wanted, len(keys)):
-        score, *seen = _of_equals(keys[copy], *(fresh[name][copy] for name in ("score", *SEEN)))
+        score, best = _of_equals(keys[copy], fresh["score"][copy], fresh["best"][copy])
         given = _row(entries, copy), keys[copy].numpy(), score.numpy(), rule.staleness, weigh
         if len(score) > rows.ONE_BY_ONE:
             source, again = map(torch.from_numpy, rows.insert_at_once(*given))
         else:
             by_rank = rule.prioritization == "rank"
             source, again = map(torch.from_numpy, rows.insert(*given, by_rank=by_rank))
-        for name, entry in zip(SEEN, seen, strict=True):
-            there = entries[name][copy]
-            there.scatter_reduce_(0, again[0], entry[again[1]].to(there), "amax")
+        there = entries["best"][copy]
+        there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
         slots = (source >= 0).nonzero().flatten()
         which = source[slots]
         told = {
-            **dict(zip(SEEN, seen, strict=True)),
+            "best": best,
             "parent": fresh.get("parent", none)[copy],
             "generation": fresh.get("generation", none)[copy],
             "draws": none[copy],
@@ -241,7 +235,6 @@ def rescore(
     slots: Tensor,
     score: Tensor,
     best: Tensor,
-    solved: Tensor,
     reached: Tensor | None = None,
 ) -> None:
     """Take new scores of levels that were drawn.
@@ -251,16 +244,14 @@ def rescore(
         slots: int64 [K, P]; of a slot that occurs several times the mean score counts.
         score: float [K, P]; one that is not finite leaves the level's old score.
         best: float [K, P], the highest returns, of which the highest ever is kept.
-        solved: bool [K, P], whether there was a success, of which one is enough for ever.
         reached: float [K, P], the returns, taken as scores are; None where nobody was trained.
     """
     new = {"score": score, **({} if reached is None else {"reached": reached})}
     for name, entry in new.items():
         there = buffer[name]
         there.copy_(_mean_of_slots(there, slots, entry))
-    for name, entry in zip(SEEN, (best, solved), strict=True):
-        there = buffer[name]
-        there.scatter_reduce_(1, slots, entry.to(there), "amax")
+    there = buffer["best"]
+    there.scatter_reduce_(1, slots, best.to(there), "amax")
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
@@ -281,17 +272,14 @@ def _row(entries: Mapping[str, Any], copy: int) -> dict[str, Any]:
     return {name: entries[name][copy].numpy() for name in names}
 
 
-def _of_equals(key: Tensor, score: Tensor, best: Tensor, solved: Tensor) -> list[Tensor]:
-    """Numbers [M] as those of all equal levels: finite scores' mean, the highest, whether any."""
+def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
+    """Numbers [M] as those of all equal levels: the mean of finite scores, the highest return."""
     groups, group = key.unique(return_inverse=True)
     finite, none = score.isfinite(), torch.zeros(len(groups), dtype=torch.float64)
     total = none.scatter_add(0, group, score.double().where(finite, 0.0))
     mean = total / none.scatter_add(0, group, finite.double())
-    highest = [
-        torch.full((len(groups),), low, dtype=entry.dtype).scatter_reduce(0, group, entry, "amax")
-        for low, entry in ((-torch.inf, best), (0, solved.int()))
-    ]
-    return [entry[group] for entry in (mean, *highest)]
+    lowest = torch.full((len(groups),), -torch.inf, dtype=best.dtype)
+    return mean[group], lowest.scatter_reduce(0, group, best, "amax")[group]
 
 
 def _shares(weight: Tensor) -> Tensor:

@@ -9,8 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import levels_at
-from proposer_rl.curricula.keys import level_keys
+from proposer_rl.curricula.batches import level_keys, levels_at
 from proposer_rl.curricula.scores import Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError
@@ -89,7 +88,7 @@ def _easiness(student: Student, outcome: TensorDictBase) -> Tensor:
     rollout = outcome["rollout"]
     ended = episodes(rollout)
     loss = Scorer("l1_value_loss", "episodes")
-    lost = loss.of_rollouts(student, [rollout], *unseen(ended.ended.shape)).score
+    lost = loss.of_rollouts(student, [rollout], unseen(ended.ended.shape)).score
     return lost - (ended.total / ended.ended.clamp(1)).cpu()
 
 

@@ -14,8 +14,6 @@ score                    from episodes                  from evaluation
 =======================  =============================  ====================================
 positive_value_loss      mean of max(A_t, 0)
 l1_value_loss            mean of abs(A_t)
-mean_negative_advantage  mean of A_t's losses alone;
-                         0 if never solved
 one_step_td_error        mean of abs(delta_t)           its expectation
 max_mc                   mean of R - V(s_t)             its expectation
 learnability             p (1 - p) of the share p       p (1 - p)
@@ -33,7 +31,7 @@ that the loop gives itself takes the place of all this.
 
 Sources: learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4), variance of a return
 that is 0 or 1; regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm: PACE (arXiv
-2605.01358); the first five: :mod:`~proposer_rl.curricula.stepwise`. The critic is discounted and R
+2605.01358); the first four: :mod:`~proposer_rl.curricula.stepwise`. The critic is discounted and R
 is not, so that ``max_mc`` is biased even at the optimum.
 """
 
@@ -58,7 +56,6 @@ Source = Literal["episodes", "exact"]
 
 READS = {
     "learnability": ("success",),
-    "mean_negative_advantage": ("success",),
     "return_variance": ("rollout",),
     "gradient_norm": ("rollout",),
 }
@@ -108,22 +105,20 @@ def episodes(rollout: TensorDictBase) -> Episodes:
 
 
 class Scored(NamedTuple):
-    """Levels' scores, and what was ever seen there.
+    """Levels' scores, and the highest returns ever seen there.
 
     Attributes:
         score: float64 [K, P].
         best: the highest return, float32 [K, P]; minus infinity where no episode was seen.
-        solved: whether there was a success, bool [K, P].
     """
 
     score: Tensor
     best: Tensor
-    solved: Tensor
 
 
-def unseen(shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The highest return on levels that nobody has played yet, and whether one was solved."""
-    return torch.full(shape, -torch.inf), torch.zeros(shape, dtype=torch.bool)
+def unseen(shape: Sequence[int]) -> Tensor:
+    """The highest return on levels that nobody has played yet."""
+    return torch.full(shape, -torch.inf)
 
 
 class Scorer:
@@ -166,7 +161,6 @@ class Scorer:
         student: Student,
         outcome: TensorDictBase,
         best: Tensor,
-        solved: Tensor,
         before: Tensor,
     ) -> Scored:
         """Score levels [K, n] by what came of training on them.
@@ -175,7 +169,6 @@ class Scorer:
             student: whose critic and discount count.
             outcome: with a ``score``, a ``rollout``, or neither.
             best: see :meth:`of_rollouts`.
-            solved: the same.
             before: the return of each level when it was trained on before, float [K, n]; minus
                 infinity where nothing is known.
 
@@ -186,16 +179,16 @@ class Scorer:
             if not {entry, "rollout"} & {*outcome.keys()}:
                 raise ValueError(f"score={self._name}: the outcome has no {entry}")
         if "rollout" in outcome.keys():
-            scored = self.of_rollouts(student, [outcome["rollout"]], best, solved)
+            scored = self.of_rollouts(student, [outcome["rollout"]], best)
         else:
             told = {name: entry.cpu() for name, entry in outcome.items()}
-            scored = _of_returns(self._name, told, best, solved, before)
+            scored = _of_returns(self._name, told, best, before)
         if "score" in outcome.keys():
             scored = scored._replace(score=outcome["score"].double().cpu())
         return scored
 
     def of_rollouts(
-        self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor, solved: Tensor
+        self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor
     ) -> Scored:
         """Score levels [K, n] by rollouts on them, [K, n, T] each.
 
@@ -204,14 +197,12 @@ class Scorer:
             rollouts: with values, as ``Student.play`` returns them.
             best: the highest returns seen on these levels before, float [K, n]; minus infinity
                 where there was none.
-            solved: whether an episode was a success before, bool [K, n].
         """
         split = [episodes(rollout) for rollout in rollouts]
         _, *numbers = zip(*split, strict=True)  # weights may be of several lengths
         ended, successes, total, squares, highest = map(torch.stack, numbers)
         count, some = ended.sum(0), ended.sum(0).clamp(1)
         best = torch.maximum(best.to(count.device).double(), highest.amax(0))
-        solved = solved.to(count.device) | (successes.sum(0) > 0)
         mean = total.sum(0) / some
         if self._name == "gradient_norm":
             lengths = [student.policy_gradient_norms(rollout) for rollout in rollouts]
@@ -223,8 +214,6 @@ class Scorer:
                 for rollout, own in zip(rollouts, split, strict=True)
             ]
             score = torch.stack(each).sum(0) / some
-            if self._name == "mean_negative_advantage":
-                score = score.where(solved, 0.0)
         elif self._name == "regret":
             score = best - mean
         elif self._name == "return_variance":
@@ -233,7 +222,7 @@ class Scorer:
             share = successes.sum(0) / some
             score = share * (1 - share)
         score = score.double().where(count > 0, -torch.inf)
-        return Scored(score.cpu(), best.float().cpu(), solved.cpu())
+        return Scored(score.cpu(), best.float().cpu())
 
     def __call__(
         self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
@@ -258,33 +247,30 @@ class Scorer:
                 ]
                 new = unseen(some.shape[:2])
                 if "next" in played[0].keys():
-                    scored.append(self.of_rollouts(student, played, *new))
+                    scored.append(self.of_rollouts(student, played, new))
                 else:
                     mean = torch.stack(played).mean(0)
-                    scored.append(self.of_outcome(student, mean, *new, new[0]))
+                    scored.append(self.of_outcome(student, mean, new, new))
             else:
                 with torch.no_grad():
                     score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
-                scored.append(Scored(score, *unseen(score.shape)))
+                scored.append(Scored(score, unseen(score.shape)))
         return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
 
 
-def _of_returns(
-    name: str, outcome: Mapping[str, Tensor], best: Tensor, solved: Tensor, before: Tensor
-) -> Scored:
+def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
     """A score of levels [K, n] from returns and success alone; see the module's text."""
     reached = outcome["return"].double()
     success = outcome.get("success", torch.zeros_like(reached)).double()
     value = before.double().where(before.isfinite(), reached)
-    best, solved = torch.maximum(best.double(), reached), solved | (success > 0)
+    best = torch.maximum(best.double(), reached)
     gained = reached - value
     score = {
         "positive_value_loss": gained.clamp_min(0),
         "l1_value_loss": gained.abs(),
         "one_step_td_error": gained.abs(),
         "max_mc": best - value,
-        "mean_negative_advantage": (-gained).clamp_min(0).where(solved, 0.0),
         "regret": best - reached,
         "learnability": success * (1 - success),
     }[name]
-    return Scored(score, best.float(), solved)
+    return Scored(score, best.float())

@@ -9,12 +9,11 @@ number for each step, float64 [K, P, T]; a level's score is the mean over an epi
 over its episodes.
 
 Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
-MaxMC: the latter, appendix; negative advantage: DEGen (arXiv 2601.14957).
+MaxMC: the latter, appendix.
 """
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -41,31 +40,6 @@ def max_mc(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
     return best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double()
 
 
-def mean_negative_advantage(student: Student, rollout: TensorDictBase, best: Tensor) -> Tensor:
-    """How far the student falls behind what its critic expects, whatever it gains otherwise.
-
-    In the sum of lambda-weighted i-step errors that A_t is, each error is cut off at zero at every
-    step that is added to it:
-
-        x_(t,0) = min(delta_t, 0),    x_(t,i) = min(x_(t,i-1) + gamma^i delta_(t+i), 0),
-        -(sum over i of (1 - lambda) lambda^i x_(t,i)),
-
-    where the last step of the episode has the weight lambda^i.
-    """
-    gamma, lmbda = student.gamma, student.lmbda
-    delta = advantages(student, rollout, lmbda=0.0)
-    goes_on = 1 - rollout["next", "done"].squeeze(-1).double()
-    lost, behind, playing = torch.zeros_like(delta), torch.zeros_like(delta), torch.ones_like(delta)
-    steps = delta.shape[-1]
-    for i in range(steps):  # of all steps at once the i-th after them, as far as there is one
-        early, late = (..., slice(steps - i)), (..., slice(i, None))
-        behind[early] = (behind[early] + gamma**i * delta[late]).clamp_max(0)
-        share = lmbda**i * (1 - lmbda * goes_on[late])
-        lost[early] -= share * behind[early] * playing[early]
-        playing[early] *= goes_on[late]
-    return lost
-
-
 STEPWISE = {
     score.__name__: score
     for score in (
@@ -73,6 +47,5 @@ STEPWISE = {
         l1_value_loss,
         one_step_td_error,
         max_mc,
-        mean_negative_advantage,
     )
 }

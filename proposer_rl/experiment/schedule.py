@@ -6,7 +6,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt
 
-from proposer_rl.runs.columns import can_reach
+from proposer_rl.runs.folder import can_reach
 from proposer_rl.settings import ArgumentError, settings
 from proposer_rl.task import Task
 

@@ -24,8 +24,7 @@ from proposer_rl.report.records import encoded, words
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
-from proposer_rl.runs.columns import can_reach, is_rate
-from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
 
 PAGE = "report.html"
 FIGURES, TABLES = "figures", "tables"

@@ -19,7 +19,7 @@ from proposer_rl.report.records import LevelRecord, number, picture
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 
 Json = Any
 DIGITS = 5

@@ -22,7 +22,7 @@ from proposer_rl.report.records import (
 )
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 
 UPDATES = "Solver updates"
 # What training cost beside updates: in words, and of a run at each of its evaluations.

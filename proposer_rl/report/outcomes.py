@@ -29,7 +29,7 @@ from proposer_rl.report.statistics import (
 )
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 
 MILLION = 1e6
 

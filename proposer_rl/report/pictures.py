@@ -27,7 +27,7 @@ from proposer_rl.report.style import (
     axes_of,
     finish,
 )
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 
 STAGES = 5
 BATCH = 2  # levels of a batch

@@ -32,8 +32,7 @@ from proposer_rl.report.records import (
 )
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.tidy import LARGEST_FILE, NAMES, STUDY, read_table
-from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.folder import read_csv, read_jsonl
+from proposer_rl.runs.folder import is_rate, read_csv, read_jsonl
 
 MOST_FOLDERS = 20_000
 FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed

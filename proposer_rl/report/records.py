@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from proposer_rl.runs.columns import is_rate
-from proposer_rl.runs.folder import read_bounded
+from proposer_rl.runs.folder import is_rate, read_bounded
 
 PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn

@@ -25,7 +25,7 @@ from proposer_rl.report.records import (
     words,
 )
 from proposer_rl.report.runs import Run, share_map
-from proposer_rl.runs.columns import is_rate
+from proposer_rl.runs.folder import is_rate
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"

@@ -110,6 +110,16 @@ class RunFolder:
         return sorted([*self.path.glob("*.csv"), *self.path.glob("*.jsonl")])
 
 
+def is_rate(name: str) -> bool:
+    """Whether a column holds shares from 0 to 1, as success is."""
+    return "success" in name.split("_")
+
+
+def can_reach(name: str, threshold: float) -> bool:
+    """Whether a threshold makes sense for a column: a rate is above 0 and at most 1."""
+    return not is_rate(name) or 0 < threshold <= 1
+
+
 def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
     """The complete rows of a ``.csv`` table, as they were given to :meth:`RunFolder.append`."""
     rows: list[dict[str, Number]] = []

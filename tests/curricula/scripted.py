@@ -64,4 +64,4 @@ class GivenScores(Scorer):
         self._numbers = numbers.double()
 
     def __call__(self, *given: Any) -> Scored:
-        return Scored(self._numbers, *unseen(given[1].shape[:2]))
+        return Scored(self._numbers, unseen(given[1].shape[:2]))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
+from proposer_rl.curricula.batches import level_keys
 from proposer_rl.curricula.buffer import (
     ReplayRule,
     draw_slots,
@@ -22,7 +23,6 @@ from proposer_rl.curricula.buffer import (
     score_weights,
     staleness_weights,
 )
-from proposer_rl.curricula.keys import level_keys
 
 # Five levels of a buffer; the same in every test that says "the table".
 SCORE = torch.tensor([0.9, 0.1, 0.5, 0.5, -0.2], dtype=torch.float64)
@@ -141,7 +141,7 @@ def levels(*numbers: int) -> TensorDict:
 
 
 def new(numbers: list[int], score: list[float], **more: Any) -> TensorDict:
-    known = {"best": score, "solved": [number > 0.5 for number in score], **more}
+    known = {"best": score, **more}
     known = {name: torch.tensor([entry]) for name, entry in known.items()}
     return TensorDict(
         {"level": levels(*numbers), "score": torch.tensor([score]), **known}, (1, len(numbers))
@@ -236,7 +236,7 @@ def test_what_is_evicted_leaves_nothing_behind() -> None:
     assert buffer["level", "a"].tolist() == [[1, 3]]
     row = buffer[0, 1]
     assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
-    assert float(row["best"]) == pytest.approx(0.3) and not bool(row["solved"])
+    assert float(row["best"]) == pytest.approx(0.3)
     assert int(row["touched"]) == int(buffer["clock"][0, 1]) == 2 + 5 + 1  # age 0
 
 
@@ -245,7 +245,6 @@ def test_what_was_reached_on_a_level_does_not_fall_when_it_comes_again() -> None
     insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
     assert buffer["score"][0, :2].tolist() == pytest.approx([0.2, 0.8])
     assert buffer["best"][0, :2].tolist() == pytest.approx([0.9, 0.8])
-    assert buffer["solved"][0, :2].tolist() == [True, True]
 
 
 def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
@@ -261,7 +260,7 @@ def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
         buffer = filled(numbers, score, 5, RANK)
         assert int(buffer["filled"].sum()) == 2
         seven = buffer[buffer["level", "a"] == 7]
-        assert float(seven["score"]) == pytest.approx(0.4) and bool(seven["solved"])
+        assert float(seven["score"]) == pytest.approx(0.4)
     unfinished = filled([7, 8, 7], [-torch.inf, 0.9, 0.6], 5, RANK)  # as of no complete episode
     assert float(unfinished["score"][unfinished["level", "a"] == 7]) == pytest.approx(0.6)
 
@@ -269,13 +268,10 @@ def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:
     buffer = filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)
     score = torch.tensor([[1.0, 2.0, -torch.inf]])
-    best, solved = torch.tensor([[-9.0, 0.7, 0.0]]), torch.tensor([[False, True, False]])
-    rescore(buffer, torch.tensor([[0, 0, 2]]), score, best, solved)
+    best = torch.tensor([[-9.0, 0.7, 0.0]])
+    rescore(buffer, torch.tensor([[0, 0, 2]]), score, best)
     assert buffer["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
     assert buffer["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
-    assert buffer["solved"].tolist() == [[True, False, False, False]]
-    rescore(buffer, torch.tensor([[0]]), score[:, :1], best[:, :1], solved[:, :1])
-    assert bool(buffer["solved"][0, 0])  # for ever
 
 
 def test_with_staleness_alone_every_level_comes_up() -> None:

@@ -71,7 +71,7 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
     rollouts = [first_episodes(learner.collect([draw])) for draw in draws]
     for name in ("max_mc", "one_step_td_error", "return_variance"):
         sampled: Scored = Scorer(name, "episodes").of_rollouts(
-            TaskStudent(task, learner), rollouts, *unseen((1, 2 * COPIES))
+            TaskStudent(task, learner), rollouts, unseen((1, 2 * COPIES))
         )
         taught = TaskStudent(task, learner)
         exact = Scorer(name, "exact", EPISODES)(taught, two.unsqueeze(0), [Streams(0)])

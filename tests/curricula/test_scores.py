@@ -22,7 +22,7 @@ FIRST = ([-0.01, -0.01, 0.99], [0.7, 0.4, 0.9])
 SECOND = ([-0.01, -0.01, 0.99], [0.8, 0.9, 0.6])
 SHORT = ([0.99], [0.5])
 FAILED = ([-0.01] * 3, [0.2] * 3)
-NONE, UNSOLVED = unseen((1, 1))
+NONE = unseen((1, 1))
 
 Episode = tuple[list[float], list[float]]
 
@@ -54,11 +54,9 @@ def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int =
     return TensorDict({"state_value": column(value), "next": step}, (1, 1, length))
 
 
-def score(
-    name: str, *rollouts: TensorDict, best: Tensor = NONE, solved: Tensor = UNSOLVED
-) -> float:
+def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
     scorer = Scorer(name, "episodes")
-    return float(scorer.of_rollouts(LEARNER, rollouts, best, solved).score)
+    return float(scorer.of_rollouts(LEARNER, rollouts, best).score)
 
 
 @pytest.mark.parametrize(
@@ -73,9 +71,6 @@ def score(
         ("positive_value_loss", played(FAILED, success=False, after=0.3), 0.02),
         ("max_mc", played(FAILED, success=False), -0.23),  # -0.20 if the maximum began at 0
         ("one_step_td_error", played(FIRST), 0.28),  # 0.375 without the last step
-        ("mean_negative_advantage", played(FIRST), 0.058333),  # 0.175 as a sum
-        ("mean_negative_advantage", played(SECOND), 0.094008),
-        ("mean_negative_advantage", played(FAILED, success=False), 0.0),  # never solved
         ("learnability", played(FIRST, SHORT), 0.0),
         ("return_variance", played(FIRST, SHORT), 0.0001),  # of 0.97 and 0.99
         ("regret", played(FIRST, SHORT), 0.01),  # 0.99 - (0.97 + 0.99) / 2
@@ -91,16 +86,8 @@ def test_the_best_return_of_a_level_is_remembered() -> None:
     assert score("regret", played(FIRST), best=best) == pytest.approx(0.01, abs=1e-6)
     scorer = Scorer("max_mc", "episodes")
     failed = played(FAILED, success=False)
-    found = scorer.of_rollouts(LEARNER, [failed], best, UNSOLVED)
-    assert float(found.best) == pytest.approx(0.98) and not bool(found.solved)
-
-
-def test_a_level_once_solved_is_worth_failing_on() -> None:
-    failed, name = played(FAILED, success=False), "mean_negative_advantage"
-    scorer = Scorer(name, "episodes")
-    solved = scorer.of_rollouts(LEARNER, [played(SHORT)], NONE, UNSOLVED).solved
-    assert bool(solved) and score(name, failed) == 0 < score(name, failed, solved=solved)
-    assert bool(scorer.of_rollouts(LEARNER, [failed], NONE, solved).solved)
+    found = scorer.of_rollouts(LEARNER, [failed], best)
+    assert float(found.best) == pytest.approx(0.98)
 
 
 def test_only_episodes_that_end_count() -> None:
@@ -121,35 +108,6 @@ def test_rollouts_are_pooled_by_episodes() -> None:
 def test_the_same_episodes_again_leave_a_score_as_it_was(name: str) -> None:
     parts = [FIRST, SHORT, SECOND]
     assert score(name, played(*parts, *parts)) == pytest.approx(score(name, played(*parts)))
-
-
-numbers = st.floats(-1, 1, width=32)
-
-
-@given(
-    st.lists(st.tuples(numbers, numbers), min_size=1, max_size=6),
-    numbers,
-    st.floats(0, 1),
-    st.floats(0, 1),
-)
-def test_negative_advantages_are_those_of_the_definition(
-    steps: list[tuple[float, float]], after: float, gamma: float, lmbda: float
-) -> None:
-    """The weighted sum of errors, one start at a time; truncated, as in an episode's last step."""
-    rewards, values = (list(column) for column in zip(*steps, strict=True))
-    following = [*values[1:], after]
-    delta = [r + gamma * n - v for r, v, n in zip(rewards, values, following, strict=True)]
-    lost = 0.0
-    for start in range(len(delta)):
-        behind, ahead = 0.0, delta[start:]
-        for i, error in enumerate(ahead):
-            behind = min(behind + gamma**i * error, 0)
-            lost -= (1 if i == len(ahead) - 1 else 1 - lmbda) * lmbda**i * behind
-    learner = Student(gamma=gamma, lmbda=lmbda)
-    rollout = played((rewards, values), success=False, after=after)
-    scorer = Scorer("mean_negative_advantage", "episodes")
-    found = scorer.of_rollouts(learner, [rollout], NONE, ~UNSOLVED).score
-    assert float(found) == pytest.approx(lost / len(delta), abs=1e-5)
 
 
 lists = st.lists(st.tuples(st.integers(1, 5), st.booleans()), min_size=1, max_size=4)
@@ -244,11 +202,10 @@ def test_without_a_rollout_an_episode_is_a_step_and_the_last_return_the_critic()
         [1, 3, 1],
         names=[None, None, "time"],
     )
-    unsolved = torch.zeros(1, 3, dtype=torch.bool)
     for name in (*STEPWISE, "regret"):
         scorer = Scorer(name, "episodes")
-        found = scorer.of_outcome(LEARNER, outcome, best, unsolved, value)
-        expected = scorer.of_rollouts(LEARNER, [rollout], best, unsolved)
+        found = scorer.of_outcome(LEARNER, outcome, best, value)
+        expected = scorer.of_rollouts(LEARNER, [rollout], best)
         torch.testing.assert_close(found, expected, msg=name)
 
 
@@ -256,10 +213,10 @@ def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own()
     outcome = TensorDict(
         {"return": torch.tensor([[0.2]]), "success": torch.tensor([[0.25]])}, [1, 1]
     )
-    known = torch.tensor([[0.5]]), UNSOLVED, torch.tensor([[0.5]])
+    known = torch.tensor([[0.5]]), torch.tensor([[0.5]])
     found = Scorer("learnability", "episodes").of_outcome(LEARNER, outcome, *known)
     assert float(found.score) == pytest.approx(0.1875)
-    assert float(found.best) == 0.5 and bool(found.solved)
+    assert float(found.best) == 0.5
     outcome["score"] = torch.tensor([[7.0]])
     assert float(Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, *known).score) == 7
     for name, lacking in (("return_variance", "rollout"), ("learnability", "success")):

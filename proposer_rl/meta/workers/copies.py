@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from copy import deepcopy
 from functools import partial
 from itertools import cycle
-from threading import Event, Thread
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.meta.copies import Trained
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
-    EVERY,
     WorkersError,
     WorkerSettings,
     lost,
@@ -45,8 +41,6 @@ class CopiesInWorkers:
             replicas; it is used for all but the replicas' training.
         make_env: makes a worker's environment.
         settings: how many workers there are, and where.
-        tell: called now and then, in another thread, with the number of updates that all replicas
-            have had of the present episode; not of Ray's workers, which share no memory.
 
     Raises:
         ValueError: for more workers than replicas.
@@ -57,13 +51,11 @@ class CopiesInWorkers:
         proposer: PPO,
         make_env: MakeEnv,
         settings: WorkerSettings,
-        tell: Callable[[int], None] = lambda done: None,
     ) -> None:
         self._proposer = proposer
         self._env: SolverTrainingEnv = proposer.env
         self._make_env = make_env
         self._settings = settings
-        self._tell = tell
         self._shares = shares(self._env.batch_size[0], settings.workers)
         # Of each replica its place, [K], among those of all workers: in the first that has it.
         every = [copy for share in self._shares for copy in share]
@@ -133,10 +125,9 @@ class CopiesInWorkers:
         origin = solver.cpu().consolidate()
         named = self._proposer.agent.named_parameters()
         weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
-        counts = torch.zeros(len(self._shares), dtype=torch.int64).share_memory_()
-        collector.map_fn("env.fork", [(origin, streams, count) for count in counts])
+        collector.map_fn("env.fork", [(origin, streams)] * len(self._shares))
         collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
-        with quiet(), _reported(counts, self._tell):
+        with quiet():
             rollouts = collector.next()
         return rollouts, collector.get_distant_attr("env.diverged")
 
@@ -173,26 +164,3 @@ def shares(copies: int, workers: int) -> list[range]:
     each = -(-copies // workers)
     starts = [min(worker * each, copies - each) for worker in range(workers)]
     return [range(start, start + each) for start in starts]
-
-
-@contextmanager
-def _reported(counts: Tensor, tell: Callable[[int], None]) -> Iterator[None]:
-    """While workers count their updates, [W], report what the slowest has counted."""
-    over = Event()
-
-    def watch() -> None:
-        told = 0
-        while True:
-            last = over.wait(EVERY)
-            if (done := int(counts.min())) > told:
-                tell(told := done)
-            if last:
-                return
-
-    watcher = Thread(target=watch)
-    watcher.start()
-    try:
-        yield
-    finally:
-        over.set()
-        watcher.join()

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
 from proposer_rl.meta.copies import Trained, taken_out
@@ -27,18 +26,9 @@ class WorkerEnv(SolverTrainingEnv):
 
     diverged: str | None = None
 
-    def fork(self, solver: TensorDictBase, streams: Streams, count: Tensor | None = None) -> None:
-        """See :meth:`SolverTrainingEnv.fork`.
-
-        ``count``, int64 [], is filled with the number of updates that the episode has had.
-        """
+    def fork(self, solver: TensorDictBase, streams: Streams) -> None:
+        """See :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
-        if count is not None:
-
-            def on_update(done: int) -> None:
-                count.fill_(done)
-
-            self.on_update = on_update
         super().fork(solver, streams)
 
     def trained(self, copy: int) -> Trained | None:

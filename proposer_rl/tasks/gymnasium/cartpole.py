@@ -14,15 +14,3 @@ def set_length(environment: Any, length: float) -> None:
     """
     environment.length = length
     environment.polemass_length = environment.masspole * length
-
-
-def set_pole_mass(environment: Any, mass: float) -> None:
-    """Set the pole's mass, in kilograms, and what CartPole computes from it once.
-
-    Args:
-        environment: ``CartPole-v1`` without wrappers.
-        mass: of the pole.
-    """
-    environment.masspole = mass
-    environment.total_mass = mass + environment.masscart
-    environment.polemass_length = mass * environment.length

@@ -11,7 +11,7 @@ from torch import Tensor
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.generation import generate_levels
 from proposer_rl.tasks.mazes.levels import Level, LevelSpec
-from proposer_rl.tasks.mazes.randomness import Generators
+from proposer_rl.tasks.mazes.mechanisms import Generators
 
 
 class LevelDistribution:

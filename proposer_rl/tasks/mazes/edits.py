@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_position
-from proposer_rl.tasks.mazes.randomness import Draws
+from proposer_rl.tasks.mazes.mechanisms import Draws
 
 L = TypeVar("L", bound=Level)
 

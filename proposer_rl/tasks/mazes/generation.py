@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.tasks.mazes.levels import Level
-from proposer_rl.tasks.mazes.path_first import draw_path_first
-from proposer_rl.tasks.mazes.randomness import Draws, Generators
-from proposer_rl.tasks.mazes.uniform import draw_uniform
+from proposer_rl.tasks.mazes.mechanisms import Draws, Generators, draw_path_first, draw_uniform
 
 
 class _Mechanism(NamedTuple):

@@ -35,7 +35,6 @@ def make(
     elsewhere: WorkerSettings | None,
     reward: Reward = performance_gain,
     *overrides: str,
-    tell: Callable[[int], None] = lambda done: None,
 ) -> tuple[Task, ProposerCurriculum]:
     settings = config(*overrides)
     maker, solver = task_maker(settings.task), settings.solver
@@ -44,7 +43,7 @@ def make(
         return maker(solver=solver, context=ComputeContext(torch.device(device)))
 
     task = make_task(settings)
-    found = None if elsewhere is None else Workers(elsewhere, make_in_worker, tell)
+    found = None if elsewhere is None else Workers(elsewhere, make_in_worker)
     parts = Components(task, settings.proposer, seeds=[0], workers=found)
     return task, proposer(parts, reward)
 

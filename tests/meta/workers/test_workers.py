@@ -21,9 +21,6 @@ from proposer_rl.meta.workers import copies as copies_module
 from proposer_rl.streams import Streams
 from tests.meta.workers.curricula import COPIES, cycles, make, workers
 
-LENGTH = 3  # updates of an episode at smoke scale
-
-
 Came = tuple[list[Any], list[float]]
 
 
@@ -68,8 +65,7 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
     monkeypatch.setenv("RAY_worker_niceness", "0")  # else 15: where others compute, none starts
     fuse = tmp_path / "fuse"
     fuse.touch()
-    told: list[int] = []
-    task, curriculum = make(workers(engine), lethal(fuse), tell=told.append)
+    task, curriculum = make(workers(engine), lethal(fuse))
     copies: Any = curriculum.trainer.copies
     losses = iter([True, False])
 
@@ -91,9 +87,6 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
         assert getsignal(SIGTERM) is ours and torch.get_num_threads() == threads
         assert not fuse.exists()
         assert_near(came, here)
-        # Ray's workers may be on other machines, and share no memory with this process.
-        ends = {"multiprocess": 2, "ray": 0}[engine]
-        assert told.count(LENGTH) == ends, told
         if engine == "multiprocess":
             diverges(task, curriculum)
     finally:

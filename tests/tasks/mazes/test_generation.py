@@ -18,7 +18,7 @@ from proposer_rl.tasks.mazes import (
     shortest_path_length,
     validate_levels,
 )
-from proposer_rl.tasks.mazes.path_first import _open_cells
+from proposer_rl.tasks.mazes.mechanisms import _open_cells
 from tests.tasks.mazes.oracles import distances, path_length
 
 BINS = [(fraction / 10, length) for fraction in range(6) for length in range(2, 17, 2)]

@@ -1,16 +1,123 @@
-"""The ``path_first`` mechanism: carve a path without shortcuts, then open cells around it."""
+"""The two mechanisms that draw candidates of levels, and the random numbers that they draw from.
+
+``uniform``: obstacles, start and goal are uniform, given the path length. ``path_first``: a path
+without shortcuts is carved, then cells around it are opened.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.distance import padded_index, schedule
+from proposer_rl.tasks.mazes.distance import cells_at_depth, padded_index, schedule
 from proposer_rl.tasks.mazes.levels import Level, cell_position
-from proposer_rl.tasks.mazes.randomness import Draws
+
+Generators = torch.Generator | None | Sequence[torch.Generator]
 
 _NEVER = 2**31 - 1  # rank of a cell that is not to be opened
 _CLOSED = 100  # added to a cell's count of carved neighbours: it can no longer be carved
+
+
+class Draws:
+    """Random matrices with one column for each candidate.
+
+    Each column comes from the generator of the candidate's group, in the order of the group's
+    candidates. So a group draws the same numbers whatever the other groups are.
+
+    Args:
+        generators: One generator (None for torch's default one), or one for each group.
+        group: int64 ``[C]`` on the CPU, the candidates' groups; without effect with one generator.
+        device: Where to draw, that of the generators.
+    """
+
+    def __init__(self, generators: Generators, group: Tensor, device: torch.device) -> None:
+        self.device = device
+        self._generators = generators
+        self._group = group
+
+    def rand(self, rows: int) -> Tensor:
+        """Uniform numbers in [0, 1), float32 ``[rows, C]``."""
+        return self._columns(lambda n, g: torch.rand(rows, n, generator=g, device=self.device))
+
+    def randint(self, high: int) -> Tensor:
+        """Uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
+        return self._columns(
+            lambda n, g: torch.randint(high, (1, n), generator=g, device=self.device)
+        )
+
+    def of(self, kept: Tensor) -> Draws:
+        """The same for some of the candidates, whose ascending indices are given, int64 ``[A]``."""
+        return Draws(self._generators, self._group[kept.cpu()], self.device)
+
+    def _columns(self, draw: Callable[[int, torch.Generator | None], Tensor]) -> Tensor:
+        if not isinstance(self._generators, Sequence):
+            return draw(len(self._group), self._generators)
+        counts = self._group.bincount(minlength=len(self._generators)).tolist()
+        drawn = [draw(n, g) for n, g in zip(counts, self._generators, strict=True)]
+        place = self._group.argsort(stable=True).argsort()  # of each candidate among the drawn
+        return torch.cat(drawn, 1).index_select(1, place.to(self.device))
+
+
+def draw_uniform(
+    obstacles: Tensor, path_length: Tensor, height: int, width: int, draws: Draws
+) -> tuple[Tensor, Level]:
+    """Draws one candidate per entry and keeps those in which the path length occurs.
+
+    A candidate is a uniform pair of obstacles and start. It is kept if some cell lies at exactly
+    the distance that is asked for, and the goal is then uniform over such cells.
+
+    Args:
+        obstacles: int64 ``[C]`` on the CPU, number of obstacles of each candidate.
+        path_length: int64 ``[C]`` on the CPU, ascending.
+        height: H.
+        width: W.
+        draws: Random numbers of the candidates.
+
+    Returns:
+        Indices of the A candidates that were kept, int64 ``[A]`` ascending, and their levels.
+    """
+    walls, start = _draw_walls_and_start(obstacles, height * width, draws)
+    free = ~walls.unflatten(0, (height, width))  # [H, W, C]
+    goals = cells_at_depth(free, start, path_length).flatten(0, 1)  # [H*W, C]
+    kept = goals.any(0).nonzero().squeeze(1)  # [A]
+    marked = goals.index_select(1, kept).cumsum(0, dtype=torch.int32)  # up to and with each cell
+    # Equal parts of [0, 1) lead to each goal; rounding may make the product their whole number.
+    rank = (draws.of(kept).rand(1).squeeze(0) * marked[-1]).int().minimum(marked[-1] - 1)
+    goal = (marked <= rank).sum(0)
+    return kept, Level(
+        walls=walls.index_select(1, kept).t().unflatten(1, (height, width)),
+        start=cell_position(start[kept], width),
+        goal=cell_position(goal, width),
+        batch_size=kept.shape,
+    )
+
+
+def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
+    """Uniform obstacles and a uniform free start.
+
+    The obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
+    3.4.2, algorithm S): a cell becomes one with probability (obstacles still needed) / (cells still
+    left), which gives exactly the number asked for. They are drawn among all cells but the last;
+    swapping that free cell with a uniform start cell makes the pair uniform.
+
+    Returns:
+        walls, bool ``[H*W, C]``, and start, int64 ``[C]``.
+    """
+    device, count = draws.device, obstacles.shape[0]
+    needed = obstacles.to(device, torch.float32)
+    draw = draws.rand(cells - 1)
+    # Strictly below the number of cells left, also after rounding: the last ones needed are taken.
+    draw *= torch.arange(cells - 1, 0, -1, device=device).unsqueeze(1)
+    walls = torch.zeros(cells, count, dtype=torch.bool, device=device)
+    for wall, threshold in zip(walls, draw, strict=False):
+        torch.lt(threshold, needed, out=wall)
+        needed -= wall.float()
+    start = draws.randint(cells)
+    walls[-1:] = walls.gather(0, start)
+    walls.scatter_(0, start, False)
+    return walls, start.squeeze(0)
 
 
 def draw_path_first(
@@ -18,9 +125,8 @@ def draw_path_first(
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those that meet their specification.
 
-    Args and returns are those of :func:`proposer_rl.tasks.mazes.uniform.draw_uniform`. A candidate
-    is
-    lost if its path runs into a dead end, or if too few cells can be opened without a shortcut.
+    Args and returns are those of :func:`draw_uniform`. A candidate is lost if its path runs into
+    a dead end, or if too few cells can be opened without a shortcut.
     """
     path, carved = _carve(path_length.to(draws.device), height, width, draws)  # [D+1, C], [C]
     kept = carved.nonzero().squeeze(1)  # [A]
