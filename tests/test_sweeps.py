@@ -149,15 +149,19 @@ def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> No
 @pytest.mark.parametrize(
     "launcher",
     [
-        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"],
+        # The second is refused before it imports PyTorch, which takes a process most of its time.
+        ["task=maze,cartpole", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        [
+            "solver.ppo.epochs=0,1",
+            "hydra/launcher=submitit_local",
+            "hydra.launcher.timeout_min=5",
+        ],
     ],
     ids=["joblib", "submitit"],
 )
 def test_other_launchers_run_a_sweep(launcher: list[str], train, capfd) -> None:
-    # The second is refused before it imports PyTorch, which takes a process most of its time.
-    arguments = ["-m", "+method=target", "task=maze,cartpole", *SMOKE, "hydra.sweep.dir=all"]
-    assert train(*arguments, *launcher) == 2
+    arguments = ["-m", "+method=target", *launcher, *SMOKE, "hydra.sweep.dir=all"]
+    assert train(*arguments) == 2
     assert len(states(Path("all"))) == 1
     assert "2 runs: 1 finished, 1 failed" in capfd.readouterr().out
 
