@@ -11,13 +11,15 @@ from __future__ import annotations
 import json
 import os
 import sys
+import sysconfig
 import traceback
 import venv
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib import metadata
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,16 @@ def make_environment(folder: Path, wheel: Path, extras: list[str]) -> dict[str, 
         names = closure(project, extra) - always if extra else always
         _link({name: metadata.distribution(name) for name in names}, sites[extra])
     return sites
+
+
+def share_bytecode(prefix: str, sites: Iterable[Path]) -> None:
+    """Let environments find the linked files compiled that this one keeps below a folder."""
+    ours = Path(prefix + sysconfig.get_path("purelib"))
+    ours.mkdir(parents=True, exist_ok=True)
+    for site in sites:
+        place = Path(prefix + str(site))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to(ours)
 
 
 def closure(project: metadata.Distribution, extra: str) -> set[str]:
@@ -146,7 +158,8 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
-        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, "task.levels=2")
+        few = ["task.levels=2", "solver.ppo.epochs=1", "pool.candidates=4"]
+        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, *few)
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
         yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
@@ -198,6 +211,10 @@ def _run(extra: str) -> None:
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
     for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
+        if name == "report":
+            from proposer_rl.report import build
+
+            build.DRAWINGS = build.DRAWINGS[::3]  # curves, maps, and what was recorded
         if name == "play":
             _play(command, arguments)
         else:
@@ -224,8 +241,12 @@ def _end_with(function: Callable[..., None], *given: Any) -> None:
 
 
 def _main() -> None:
-    import proposer_rl.cli.run  # noqa: F401
 
+    # Of the tests' folder nothing else can be imported.
+    spec = spec_from_file_location("composing", Path(__file__).with_name("composing.py"))
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(composing := module_from_spec(spec))
+    composing.remember()
     assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
     for line in sys.stdin:
         extra, site, folder = json.loads(line)

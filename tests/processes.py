@@ -122,17 +122,21 @@ def python(
 
 
 def serve() -> None:
-    from proposer_rl.cli import train
+    from proposer_rl.cli import run, train
+    from tests import composing
 
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
-    for module in ("proposer_rl.cli.run", "proposer_rl.tasks.mazes.task", "pandas"):
+    for module in ("proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
+    composing.remember()
+    run.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
     gc.freeze()  # a child that looks for garbage would copy all that memory
 
     for line in sys.stdin:
         values = json.loads(line)
         values["signal_at"] = {int(k): v for k, v in values["signal_at"].items()}
         request = Request(**values)
+        composing.prepare(tuple(given for given in request.arguments if given[0] == "+"))
         print(json.dumps(vars(_fork(request, train.main))), flush=True)
 
 

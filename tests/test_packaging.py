@@ -71,8 +71,12 @@ def call_there(
     environment = tmp_path_factory.mktemp("environment")
     sites = minimal.make_environment(environment, built.wheel, NAMED)
     kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
+    compiled = []
+    if sys.pycache_prefix:
+        minimal.share_bytecode(sys.pycache_prefix, sites.values())
+        compiled = ["-X", f"pycache_prefix={sys.pycache_prefix}"]
     with subprocess.Popen(
-        [environment / "bin" / "python", "-I", minimal.__file__],
+        [environment / "bin" / "python", "-I", *compiled, minimal.__file__],
         cwd=environment,
         env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
         stdin=subprocess.PIPE,

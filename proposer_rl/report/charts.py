@@ -6,6 +6,7 @@ import base64
 import io
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -202,14 +203,19 @@ def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict
 
 
 def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
-    image = picture(level.picture)
-    if image is None:
-        return level.text
-    return pictures.setdefault(_small(image), len(pictures))
+    small = _small(level.picture)
+    return level.text if small is None else pictures.setdefault(small, len(pictures))
 
 
-def _small(pixels: Any) -> str:
-    """A picture as PNG in base64, no larger than what is shown of it."""
+@lru_cache(4 * LEVELS * STAGES[0])
+def _small(stored: str | None) -> str | None:
+    """A picture as PNG in base64, no larger than what is shown of it; None if it is none.
+
+    Where all do not fit, the same are asked for again.
+    """
+    pixels = picture(stored)
+    if pixels is None:
+        return None
     image, file = Image.fromarray(pixels), io.BytesIO()
     image.thumbnail((SIDE, SIDE))
     image.save(file, format="PNG", optimize=True)

@@ -153,8 +153,14 @@ def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
     """A table of a study in those of its runs; columns that a run has nothing in are left out."""
     if not (folder / f"{name}.csv.gz").exists():
         return {}
-    groups = read_table(folder / f"{name}.csv.gz").groupby("run")
-    return {str(run): own.drop(columns="run").dropna(axis=1, how="all") for run, own in groups}
+    table = read_table(folder / f"{name}.csv.gz")
+    values = table.drop(columns="run")
+    known = values.notna().groupby(table["run"]).any()
+    places = values.groupby(table["run"]).indices
+    return {
+        str(run): values.loc[:, known.loc[run].to_numpy()].iloc[rows]
+        for run, rows in places.items()
+    }
 
 
 def _level_results(levels: pd.DataFrame) -> list[LevelResults]:

@@ -149,23 +149,15 @@ class Drawn(NamedTuple):
 
 def render(drawing: Drawing) -> Drawn:
     """Draw a figure, once: to lay it out takes longer than all else."""
-    columns = min(drawing.columns, len(drawing.panels))
-    rows = -(-len(drawing.panels) // columns)
-    width, height = drawing.size
-    legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
     with rc_context(SETTINGS):
-        figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
-        grid = figure.subfigures(rows, columns, squeeze=False)
-        for draw, part in zip(drawing.panels, grid.flat, strict=False):
-            draw(part)
-        if drawing.legend:
-            handles = [Line2D([], [], label=n, **style(one)) for n, one in drawing.legend.items()]
-            figure.legend(
-                handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
-            )
-        png = _render(figure, "png")
-        figure.set_layout_engine("none")  # it stands
-        return Drawn(_render(figure, "svg"), png)
+        figure = _laid_out(drawing)
+        return Drawn(_render(figure, "svg"), _render(figure, "png"))
+
+
+def render_png(drawing: Drawing) -> bytes:
+    """Draw a figure of which nobody wants vectors."""
+    with rc_context(SETTINGS):
+        return _render(_laid_out(drawing), "png")
 
 
 def in_few_colours(png: bytes) -> bytes:
@@ -177,6 +169,28 @@ def in_few_colours(png: bytes) -> bytes:
         few = image.convert("RGB").quantize(COLOURS, far, dither=plain)
     few.save(file, format="PNG", optimize=True)
     return file.getvalue()
+
+
+def _laid_out(drawing: Drawing) -> Figure:
+    columns = min(drawing.columns, len(drawing.panels))
+    rows = -(-len(drawing.panels) // columns)
+    width, height = drawing.size
+    legend = 0.3 * -(-len(drawing.legend) // max(2 * columns, 1))
+    size = (width * columns, height * rows + legend)
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    grid = figure.subfigures(rows, columns, squeeze=False)
+    for draw, part in zip(drawing.panels, grid.flat, strict=False):
+        draw(part)
+    if drawing.legend:
+        handles = [Line2D([], [], label=n, **style(one)) for n, one in drawing.legend.items()]
+        figure.legend(
+            handles=handles, loc="outside lower center", ncols=2 * columns, handlelength=3
+        )
+    layout = figure.get_layout_engine()
+    assert layout is not None
+    layout.execute(figure)
+    figure.set_layout_engine(None)  # with one, every file would be drawn twice
+    return figure
 
 
 def _render(figure: Figure, suffix: str) -> bytes:

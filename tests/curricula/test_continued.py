@@ -215,7 +215,7 @@ def experiment(folder: Path, updates: int, task: Any) -> Experiment:
         schedule=ScheduleSettings(
             updates=updates,
             cycle_length=5,
-            evaluate_every=1,
+            evaluate_every=5,
             checkpoint_every=3,
             checkpoint_seconds=None,
             headline=task.metrics[0],

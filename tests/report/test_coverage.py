@@ -125,7 +125,7 @@ def test_intervals_over_levels_and_seeds_cover(seeds: int) -> None:
     assert held >= ENOUGH
     drawn = []
     for rows in scores(50):
-        places = rng.integers(0, seeds, (200, seeds, 64))
+        places = rng.integers(0, seeds, (80, seeds, 64))
         means = [interquartile_mean(np.take_along_axis(rows, place, 0)) for place in places]
         drawn.append(np.quantile(means, [0.025, 0.975]))
     assert np.mean([low <= truth <= high for low, high in drawn]) < 0.5

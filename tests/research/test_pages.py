@@ -92,6 +92,16 @@ def pages(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages name their pictures, which takes most of the time to draw."""
+
+    def named(drawing: Drawing, files: object) -> str:
+        return f"![{escape_markdown(drawing.title)}](figures/{drawing.name}.png)"
+
+    monkeypatch.setattr("research.pages._picture", named)
+
+
 def test_the_best_depends_on_what_there_is_and_on_what_is_scarce(runs: Path) -> None:
     """A schedule nobody has here: that method is not chosen."""
     best = {
@@ -147,6 +157,7 @@ def test_thin_evidence_chooses_nothing(curves, seeds: int, doubt: str, tmp_path:
     assert ("[" in choice.value) == (seeds >= 5)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_method_with_few_seeds_is_not_chosen_and_hinders_none(tmp_path: Path) -> None:
     write_methods(tmp_path / "runs", {"plr": FASTEST}, seeds=2)
     write_methods(tmp_path / "runs", {"accel": SLOW, "robust_plr": FAST})
@@ -279,6 +290,7 @@ def test_what_holds_no_scores_is_told_in_one_line(content: str, tmp_path: Path) 
     assert len(str(refused.value).splitlines()) == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     """Whatever the runs took: half as good at a fifth of the time is better by seconds.
 
@@ -352,6 +364,7 @@ def test_by_seconds_better_is_who_is_so_in_every_round(
     assert [name for name, always in beaten.items() if not always] == level
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_further_methods_are_timed_beside_some_of_the_others(tmp_path: Path) -> None:
     """On a machine that is twice as fast for one of them, and four times for another."""
     first = write_seconds(tmp_path / "first.json", {"plr": [4.0], "accel": [2.0], "sfl": [3.0]})
@@ -438,16 +451,12 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
         assert line.startswith("error: ") and message in line
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", ["curricula", "medium"])
 def test_the_committed_pages_come_out_of_the_committed_results(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Word for word, in a clean clone; pictures are not drawn again."""
-
-    def named(drawing: Drawing, files: object) -> str:
-        return f"![{escape_markdown(drawing.title)}](figures/{drawing.name}.png)"
-
-    monkeypatch.setattr("research.pages._picture", named)
+    """Word for word, in a clean clone."""
     monkeypatch.chdir(ROOT)
     study = Path("results", name)
     given = [str(study)]
