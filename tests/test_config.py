@@ -192,6 +192,7 @@ WRONG = [
     ("+curriculum.x=1", "curriculum.x: unknown; there are none"),
 ]
 WRONG_COMMANDS = [
+    (["+method=target", "task.network=[8]"], "task.network=[8]: a list where there must be a map"),
     (["+method=target", "logger=paper"], "logger/paper: unknown; choose one of: csv,"),
     (["+method=target", "sede=1"], "sede: unknown; there are: ablation, checkpoint, compute,"),
     (["+method=target", "curriculum.tempo=3"], "curriculum.tempo: unknown; there are: _target_"),

@@ -5,14 +5,19 @@ from __future__ import annotations
 import codecs
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    OmegaConfBaseException,
+)
 
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.help import GROUPS, own_folders
@@ -94,6 +99,8 @@ def explained(error: Exception) -> str:
     cause = error.__cause__
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _no_such_key(cause)
+    if "DictConfig with ListConfig" in f"{error} {cause}":
+        return _no_mapping(error)
     not_chosen = _NOT_CHOSEN.match(str(error))
     if not_chosen and not_chosen[1] in ADDED:
         group, known = not_chosen[1], ", ".join(available(not_chosen[1]))
@@ -105,6 +112,27 @@ def explained(error: Exception) -> str:
             "than letters, digits and /:-+.$%*@?|_ has quotes of its own: \"KEY='VALUE'\""
         )
     return one_line(error)
+
+
+def _no_mapping(error: Exception) -> str:
+    """Of an override the error names all; of a file its name, so that its lists are named here."""
+    where = (
+        str(error).split("\n")[0].removeprefix("Error merging override ").partition(": Config")[0]
+    )
+    name = where.removeprefix("In '").removesuffix("'")
+    files = (folder / f"{name}.yaml" for folder in own_folders(sys.argv))
+    read = (yaml.safe_load(file.read_bytes()) for file in files if file.is_file())
+    lists = [key for content in read for key in _lists(content)]
+    named = f" (it has lists in {', '.join(lists)})" if lists else ""
+    return f"{name}: a list where there must be a mapping, {{NAME: VALUE}}{named}"
+
+
+def _lists(node: Any, place: str = "") -> Iterator[str]:
+    for key, value in node.items() if isinstance(node, dict) else ():
+        here = f"{place}.{key}" if place else str(key)
+        if isinstance(value, list) and here != "defaults":
+            yield here
+        yield from _lists(value, here)
 
 
 def _not_utf8(error: UnicodeDecodeError) -> str:

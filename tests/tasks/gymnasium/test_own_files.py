@@ -11,13 +11,13 @@ from proposer_rl.cli.loggers import wandb_id
 from tests.tasks.gymnasium.toys import TINY
 
 FIRST = "# @package _global_\n"
-FILE = """\
+WIDTH = "    width: {set: argument, values: [1.0, 2.0], target: 2.0}\n"
+FILE = f"""\
 defaults: [gymnasium, _self_]
 task:
   env_id: tests.tasks.gymnasium.toys:Walk-v0
   parameters:
-    width: {set: argument, values: [1.0, 2.0], target: 2.0}
-  success: {kind: terminated}
+{WIDTH}  success: {{kind: terminated}}
 """
 AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(9))
 PARAMETERS = "  parameters:\n"
@@ -49,6 +49,11 @@ PARAMETERS = "  parameters:\n"
         (
             (FIRST + FILE + "  transforms: [{_target_: torchrl.envs.NoSuch}]\n").encode(),
             "task.transforms: Error locating target 'torchrl.envs.NoSuch'",
+        ),
+        (
+            (FIRST + FILE.replace(f"{PARAMETERS}{WIDTH}", "  parameters: [width]\n")).encode(),
+            "task/line: a list where there must be a mapping, {NAME: VALUE} (it has lists in "
+            "task.parameters)",
         ),
         (
             (FIRST + FILE.replace(PARAMETERS, PARAMETERS + AXES)).encode(),
