@@ -72,6 +72,8 @@ class ReplayCurriculum(Curriculum):
         parents: of a batch of children; see :class:`~proposer_rl.curricula.children.Children`.
         renew: whether all scores are renewed before each draw, instead of those of what was trained
             on.
+        co_learnability: what is added to the scores of the levels trained on before, for each unit
+            by which the scores of those trained on now have fallen (TRACED, arXiv 2506.19997).
 
     Raises:
         DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
@@ -97,12 +99,18 @@ class ReplayCurriculum(Curriculum):
         edit: Edit | None = None,
         parents: Parents = "batch",
         renew: bool = False,
+        co_learnability: float = 0.0,
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
         if train_on_new and synchronous:
             raise ArgumentError(
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
                 "scored, beside every update"
+            )
+        if renew and co_learnability:
+            raise ArgumentError(
+                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
+                "before each draw, what is added to them is lost"
             )
         self._children = Children(edit, edits, parents)
         # Levels are scored aside where they are new and not trained on, edited, or renewed.
@@ -116,7 +124,7 @@ class ReplayCurriculum(Curriculum):
             replay_probability,
         )
         self._synchronous, self._train_on_new = synchronous, train_on_new
-        self._renew = renew
+        self._renew, self._co_learnability = renew, co_learnability
         self._template = new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, 0, self._capacity)
@@ -124,6 +132,7 @@ class ReplayCurriculum(Curriculum):
         # Evidence [K, m] whose children, or exact scores, are due at the next proposal.
         self._due: list[TensorDict] = []
         self._last: TensorDict | None = None  # "level" [K, m] of the evidence before
+        self._before: TensorDict | None = None  # [K, m]: "slot" and "key", the time before
         self._scored = 0  # new levels of each student
         self._came_back = {"levels": 0, "replayed": 0}
 
@@ -216,9 +225,10 @@ class ReplayCurriculum(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """The buffers, too, and what is known of the levels that were trained on."""
+        optional = {"last": self._last, "before": self._before}
         return super().state_dict() | {
             "buffer": packed(self.buffer),
-            "last": None if self._last is None else packed(self._last),
+            **{name: None if td is None else packed(td) for name, td in optional.items()},
             "due": [packed(evidence) for evidence in self._due],
         }
 
@@ -226,8 +236,10 @@ class ReplayCurriculum(Curriculum):
         """Go on with them."""
         super().load_state_dict(state)
         self.buffer = unpacked(state["buffer"], self._template)
-        last = state["last"]
-        self._last = None if last is None else unpacked(last, self._template)
+        self._last, self._before = (
+            None if state[name] is None else unpacked(state[name], self._template)
+            for name in ("last", "before")
+        )
         self._due = [unpacked(evidence, self._template) for evidence in state["due"]]
 
     def _take_in(self) -> None:
@@ -316,6 +328,7 @@ class ReplayCurriculum(Curriculum):
             # Another level may have taken the place of one that was long on its way.
             there = self.buffer["key"].gather(1, slots) == evidence["key"]
             there &= evidence["replayed"]
+            before = self.buffer["score"].gather(1, slots)
             rescore(
                 self.buffer,
                 slots,
@@ -323,8 +336,29 @@ class ReplayCurriculum(Curriculum):
                 scored.best.where(there, -torch.inf),
                 None if reached is None else reached.where(there, -torch.inf),
             )
+            if self._co_learnability:
+                self._credit(before, slots, replayed)
         if not bool(replayed.all()):
             self._add(evidence["level"], scored, {"reached": reached}, ~replayed)
+
+    def _credit(self, score: Tensor, slots: Tensor, replayed: Tensor) -> None:
+        """Credit the levels that were trained on before with how far the present scores fell.
+
+        Args:
+            score: of the present ones until now, [K, m].
+            slots: where they are.
+            replayed: bool [K], of the students whose levels they are.
+        """
+        fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
+        now = TensorDict({"slot": slots, "key": self.buffer["key"].gather(1, slots)}, slots.shape)
+        before = self._before
+        if before is None or before.shape != now.shape:
+            before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
+        each = replayed.unsqueeze(-1)
+        there = self.buffer["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
+        credited = torch.zeros_like(self.buffer["filled"]).scatter(1, before["slot"], there & each)
+        self.buffer["score"] += self._co_learnability * fell * credited
+        self._before = now.where(each, before)
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
         """New levels [K, count] on the CPU."""

@@ -90,6 +90,7 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (replay, {"renew": "no"}, "renew='no': input should be a valid boolean"),
     (replay, {"parents": "hard"}, "parents='hard': input should be 'batch' or 'easy'"),
     (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true"),
+    (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true"),
     (no_edits, {"edits": 1}, "edits=1: the task has no edit"),
     (ReplayRule, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
     (ReplayRule, {"staleness": 1.5}, "staleness=1.5: input should be less than or equal to 1"),

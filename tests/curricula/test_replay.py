@@ -198,6 +198,25 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
+def test_credit_goes_to_the_levels_trained_on_before() -> None:
+    curriculum = MADE["traced"]()
+    live(curriculum, solvers([0]), [0], range(4))
+    buffer = curriculum.buffer
+    slots, before = torch.tensor([[0, 1, 2, 2]]), torch.tensor([[4, 5, 6, 7]])
+    keys = buffer["key"].gather(1, before).clone()
+    keys[0, 3] += 1  # this one has been evicted since
+    curriculum._before = type(buffer)({"slot": before, "key": keys}, (1, P))
+    score = buffer["score"].gather(1, slots)
+    buffer["score"][0, :3] -= torch.tensor([0.4, 0.8, 0.2])
+    expected = buffer["score"][0].clone()
+    curriculum._credit(score, slots, torch.tensor([False]))  # trained on new ones
+    assert buffer["score"][0].equal(expected)
+    curriculum._credit(score, slots, torch.tensor([True]))
+    assert curriculum._before["slot"].equal(slots)
+    expected[4:7] += 0.5 * (0.4 + 0.8 + 0.2 + 0.2) / 4
+    torch.testing.assert_close(buffer["score"][0], expected)
+
+
 def test_what_is_logged_shows_levels() -> None:
     told = live(accel(), solvers([0, 1]), [0, 1], range(7)).told
     assert told[0] == {} and set(told[-1]["levels"]) > {"highest scores", "most replayed"}

@@ -461,6 +461,7 @@ def test_the_parts_of_a_curriculum_are_one_import_and_their_defaults_agree() -> 
         {"synchronous": False},
         {"edits": 2, "edit": SPACE.edit},
         {"renew": True},
+        {"co_learnability": 0.5},
     ]
     for some in options:
         own = ReplayCurriculum(SPACE, Scorer("regret", "episodes"), capacity=16, **some)
