@@ -114,7 +114,7 @@ PROSE = {
     "README.md": 14,
     "docs/explanation/filtering.md": 5,
     "docs/explanation/first_order.md#Results": 4,
-    "docs/explanation/outcome_model.md#Results": 5,
+    "docs/explanation/outcome_model.md#Results": 6,
     "docs/explanation/proposer.md#Results": 3,
     "docs/explanation/replay.md": 10,
     "docs/explanation/results.md": 2,
