@@ -15,7 +15,7 @@ from proposer_rl.cli.evaluate import SHOWN
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.tasks.mazes.level_files import shipped_levels
-from tests.commands import trained_run
+from tests.commands import trained_pair
 
 KEYS = ["success", "return", "greedy_success", "greedy_return"]
 
@@ -38,10 +38,7 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of two Solvers that were trained side by side."""
-    settings = ["compute.progress=false", "seeds=[3,5]", "task.evaluation.levels=40"]
-    folder = tmp_path_factory.mktemp("runs") / "trained"
-    return trained_run(folder, "+method=target", "+scale=smoke", *settings)
+    return trained_pair(tmp_path_factory.mktemp("runs") / "trained")
 
 
 @pytest.mark.parametrize("name", ["ID", "ood"])

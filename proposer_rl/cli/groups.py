@@ -13,11 +13,7 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    OmegaConfBaseException,
-)
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.help import GROUPS, own_folders
@@ -116,10 +112,9 @@ def explained(error: Exception) -> str:
 
 def _no_mapping(error: Exception) -> str:
     """Of an override the error names all; of a file its name, so that its lists are named here."""
-    where = (
-        str(error).split("\n")[0].removeprefix("Error merging override ").partition(": Config")[0]
-    )
-    name = where.removeprefix("In '").removesuffix("'")
+    said, *_ = str(error).splitlines()
+    name, *_ = said.removeprefix("Error merging override ").split(": Config")
+    name = name.removeprefix("In '").removesuffix("'")
     files = (folder / f"{name}.yaml" for folder in own_folders(sys.argv))
     read = (yaml.safe_load(file.read_bytes()) for file in files if file.is_file())
     lists = [key for content in read for key in _lists(content)]

@@ -16,7 +16,7 @@ from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.evaluate import load
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from research.scores import main
-from tests.commands import call, trained_run
+from tests.commands import call, trained_pair
 
 
 @pytest.fixture
@@ -33,10 +33,7 @@ def scores_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, st
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of two Solvers that were trained side by side."""
-    settings = ["compute.progress=false", "seeds=[3,5]", "task.evaluation.levels=40"]
-    folder = tmp_path_factory.mktemp("runs") / "trained"
-    return trained_run(folder, "+method=target", "+scale=smoke", *settings)
+    return trained_pair(tmp_path_factory.mktemp("runs") / "trained")
 
 
 def test_several_runs_are_compared_by_their_means(
