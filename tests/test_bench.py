@@ -45,6 +45,7 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     return partial(call, main)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_measures_something(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # Real workers are started in tests/meta/workers; here the replicas stay in this process.
@@ -118,6 +119,7 @@ def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> Non
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_methods_of_runs_are_timed_in_turns(
     bench, train, capsys, monkeypatch, tmp_path: Path
 ) -> None:

@@ -63,7 +63,13 @@ def run_there() -> Iterator[Run]:
         process.stdin.close()
 
 
-@pytest.mark.parametrize("name", CALLED)
+QUICKLY = ("perf_gain", "gymnasium")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICKLY)) for name in CALLED],
+)
 def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> None:
     said = run_there(tmp_path, *CALLED[name])
     assert said == "", said
@@ -71,6 +77,7 @@ def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> No
     assert updates == (2 if CYCLE[0] in CALLED[name] else 3)
 
 
+@pytest.mark.slow
 def test_a_frozen_proposer_comes_from_another_device(
     run_there: Run, train: Callable[..., int], tmp_path: Path
 ) -> None:
@@ -79,6 +86,7 @@ def test_a_frozen_proposer_comes_from_another_device(
     assert run_there(there, "+method=frozen_proposer", *QUIET, f"checkpoint={here}") == ""
 
 
+@pytest.mark.slow
 def test_what_is_computed_there_is_what_is_computed_here(
     run_there: Run, train: Callable[..., int], tmp_path: Path
 ) -> None:

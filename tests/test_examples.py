@@ -153,6 +153,7 @@ def test_learners_of_ones_own_train_in_the_meta_environment(example: Load) -> No
     torch.testing.assert_close(learner.agent[0], expected)
 
 
+@pytest.mark.slow
 def test_the_network_learns_and_acts_in_larger_mazes(
     example: Load, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,6 +172,7 @@ def test_other_losses_train_the_proposer(
     assert re.findall(r"^(\w+), cycle 0", printed, re.MULTILINE) == ["a2c", "reinforce"]
 
 
+@pytest.mark.slow
 def test_a_stock_script_learns_mazes(
     example: Load, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,8 @@ import os
 import resource
 from pathlib import Path
 
+import pytest
+
 from proposer_rl.cli.build import build, parts
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
@@ -25,6 +27,7 @@ def resident() -> float:
     return pages * resource.getpagesize() / MIB
 
 
+@pytest.mark.slow
 def test_memory_and_open_files_stay_flat(tmp_path: Path) -> None:
     options = [
         *("+method=perf_gain", "+scale=smoke", "proposer.meta_episode_length=2"),

@@ -146,6 +146,7 @@ def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> No
     assert "2 runs: 2 finished" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "launcher",
     [
@@ -166,6 +167,7 @@ def test_other_launchers_run_a_sweep(launcher: list[str], train, capfd) -> None:
     assert "2 runs: 1 finished, 1 failed" in capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_job_that_is_stopped_is_interrupted_and_its_sweep_says_so(
     train, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:

@@ -96,11 +96,13 @@ def test_it_finds_the_best_curriculum(make: Callable[..., PPO]) -> None:
     assert learnt_gain(make) > 0.9 * best_sequence(SKILLS, UPDATES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [A2CLoss, ReinforceLoss])
 def test_it_finds_the_best_curriculum_by_another_loss(kind: type[LossModule]) -> None:
     assert learnt_gain(other_loss(kind), cycles=80) > 0.9 * best_sequence(SKILLS, UPDATES)
 
 
+@pytest.mark.slow
 def test_it_finds_the_best_mixture_where_one_action_holds_for_an_episode() -> None:
     best = best_constant(SKILLS, UPDATES, PROBLEMS)
     held = {"idle": SKILLS, "action_repeat": UPDATES, "epochs": 8}

@@ -34,6 +34,8 @@ from tests.report.folders import TASK, config
 REPLICATIONS, ENOUGH = 2000, 0.93
 Law = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
+pytestmark = pytest.mark.slow
+
 LAWS: dict[str, Law] = {
     "normal": lambda rng, shape: rng.normal(0.5, 0.1, shape),
     "skewed": lambda rng, shape: rng.beta(2, 5, shape),

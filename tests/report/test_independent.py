@@ -157,7 +157,16 @@ def test_of_runs_with_every_kind_of_seed(tmp_path: Path) -> None:
     check(metrics, *tables, rel=1e-5)
 
 
-@pytest.mark.parametrize("folder", COMMITTED, ids=lambda folder: folder.name)
+LARGE = ("curricula", "medium")
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        pytest.param(folder, id=folder.name, marks=[pytest.mark.slow] * (folder.name in LARGE))
+        for folder in COMMITTED
+    ],
+)
 def test_of_the_committed_results(folder: Path) -> None:
     runs = pd.read_csv(folder / "runs.csv.gz", keep_default_na=False)
     variant = runs["ablation"].where(runs["ablation"] != "none", "").radd(", ").replace(", ", "")

@@ -21,6 +21,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trained_run(tmp_path_factory.mktemp("runs") / "learnt", "+method=perf_gain", *SMOKE)
 
 
+@pytest.mark.slow
 def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys) -> None:
     output = tmp_path / "snr.json"
     sizes = ["--proposals", "2", "--copies", "2", "--levels", "2", "4", "--output", str(output)]

@@ -232,6 +232,7 @@ def test_our_claims_hold_where_they_are_true(tmp_path: Path) -> None:
     assert "supported" not in verdicts(study)
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_pages(
     runs: Path, pages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
