@@ -11,6 +11,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,13 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # What tests write need not outlive the machine, and waiting for disks takes long.
 os.fsync = lambda file: None
+
+
+def pytest_configure() -> None:
+    """In a new environment nothing is compiled: of two processes one starts with other imports."""
+    if os.environ.get("PYTEST_XDIST_WORKER") == "gw1":
+        for name in ("pandas", "scipy.stats", "sklearn", "matplotlib.pyplot", "sympy"):
+            import_module(name)
 
 
 def pytest_collection_finish() -> None:

@@ -63,13 +63,10 @@ def run_there() -> Iterator[Run]:
         process.stdin.close()
 
 
-QUICKLY = ("perf_gain", "gymnasium")
+OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in CALLED if name != "perf_gain"]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICKLY)) for name in CALLED],
-)
+@pytest.mark.parametrize("name", ["perf_gain", *OTHERS])
 def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> None:
     said = run_there(tmp_path, *CALLED[name])
     assert said == "", said

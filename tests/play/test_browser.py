@@ -287,6 +287,7 @@ def test_levels_are_taken_from_the_run_a_set_and_a_file(
     expect(first).not_to_have_attribute("src", str(before))
 
 
+@pytest.mark.slow
 def test_cars_are_shown_in_pictures(car_tab: Tab) -> None:
     caption, updates = car_tab.locator("#caption"), car_tab.locator("#updates")
     expect(car_tab.locator("#editor")).to_be_hidden()
@@ -341,6 +342,7 @@ def test_another_page_gets_nothing_even_with_the_token(context: BrowserContext, 
     assert all("gallery" not in frame.content() for frame in tab.frames[1:])
 
 
+@pytest.mark.slow
 def test_a_maze_seen_through_a_window_is_drawn_watched_and_played(view_tab: Tab) -> None:
     tab, status = view_tab, view_tab.locator("#status")
     table = tab.locator("#results tbody")
