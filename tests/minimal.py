@@ -247,6 +247,8 @@ def _main() -> None:
     assert spec is not None and spec.loader is not None
     spec.loader.exec_module(composing := module_from_spec(spec))
     composing.remember()
+    from proposer_rl.cli import run  # noqa: F401  what takes seconds, before the forks
+
     assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
     for line in sys.stdin:
         extra, site, folder = json.loads(line)
