@@ -215,7 +215,7 @@ WRONG_COMMANDS = [
     (["+method=target", "+ablation=none"], "ablation/none: unknown; choose one of: paper_literal"),
     (["+method=plr", "+as=none"], "as/none: unknown; choose one of: dcd, dcd_accel, jaxued"),
     (["+method=plr", "+score=none"], "score/none: unknown; choose one of: model, sampled"),
-    (["+sweep=none"], "sweep/none: unknown; choose one of: curricula, gymnasium"),
+    (["+sweep=none"], "sweep/none: unknown; choose one of: curricula, medium"),
     (["curriculum.tempo=3"], "curriculum.tempo: unknown; there are: none"),
     (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
     (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),

@@ -59,6 +59,7 @@ def test_a_distribution_gives_the_runs_own_measurements(
     assert "Means over the seeds" in " ".join(said.split())
 
 
+@pytest.mark.slow
 def test_the_set_that_comes_along(run: Path, tmp_path: Path, evaluate) -> None:
     files = {name: tmp_path / name for name in ("rows.csv", "rows.json", "sheet.png")}
     first = evaluate(run, "-o", files["rows.csv"], "--pictures", files["sheet.png"])

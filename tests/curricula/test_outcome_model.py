@@ -159,6 +159,7 @@ def phi_of(x: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, x.square()], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.02, 0.08])
 def test_it_follows_a_learner_whose_success_moves(speed: float) -> None:
     """A skill that grows, and levels of difficulties x in [-1, 1] that take it.

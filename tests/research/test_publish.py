@@ -79,6 +79,7 @@ def test_tables_of_the_study_are_those_of_the_runs(
     assert tables["after"] == tables["before"]
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_a_study_has_a_page_with_its_figures(runs: Path, tmp_path: Path) -> None:
     """What its authors wrote above the mark stays."""

@@ -36,6 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trained_pair(tmp_path_factory.mktemp("runs") / "trained")
 
 
+@pytest.mark.slow
 def test_several_runs_are_compared_by_their_means(
     scores_of, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

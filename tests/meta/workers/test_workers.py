@@ -57,7 +57,8 @@ def lethal(fuse: Path) -> Reward:
     return reward
 
 
-@pytest.mark.parametrize("engine", ["multiprocess", pytest.param("ray", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["multiprocess", "ray"])
 def test_workers_give_the_numbers_of_one_process_also_where_they_die(
     engine: str, here: Came, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

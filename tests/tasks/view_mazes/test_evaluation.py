@@ -74,6 +74,7 @@ def always(action: int) -> ActorCritic:
     return scripted(lambda state: torch.full(state.batch_size, action))
 
 
+@pytest.mark.slow
 def test_playing_all_at_once_is_playing_one_by_one() -> None:
     """Though finished levels are left out; 30 steps are more than one check of who still plays."""
     agent, levels, limit, episodes = solvers(), random_levels(E, side=5), 30, 3
