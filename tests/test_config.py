@@ -126,6 +126,7 @@ WRONG = [
     # one of a few
     ("compute.threads=5000", "compute.threads=5000: input should be less than or equal to 1024"),
     ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),
+    ("compute.compile=true", "compute.compile=True: compiles for a GPU, and this run is computed"),
     ("compute.device=abacus", "compute.device='abacus': must be auto, cpu or a usable one"),
     ("compute.device=''", "compute.device='': must be auto, cpu or a usable one"),
     ("compute.device=meta", "compute.device='meta': must be auto, cpu or a usable one"),

@@ -33,6 +33,7 @@ from tests.tiny import EXAMPLES, composed
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 QUIET = ["compute.progress=false", "compute.device=cuda"]
+COMPILED = "compute.compile=true"
 SMOKE = ["+scale=smoke", *QUIET]
 METHODS = sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
 TASKS = {
@@ -44,6 +45,9 @@ TASKS = {
     "lunar_lander": ["task=lunar_lander", *TINY, *QUIET],
     "minigrid": ["task=minigrid", *TINY, *QUIET],
     "point_mass": ["task=point_mass", *GATE, *QUIET],
+    "compiled": [*SMOKE, COMPILED],
+    "compiled_bf16": [*SMOKE, COMPILED, "precision=bf16"],
+    "compiled_view_maze": ["task=view_maze_smoke", *QUIET, "schedule.updates=4", COMPILED],
 }
 SEVERAL = ["perf_gain", "domain_randomization", "first_order_gain", "model_transport"]
 
@@ -145,7 +149,9 @@ def test_the_same_command_gives_the_same_bytes_also_after_a_stop(
     assert_same_run(tmp_path / "one", tmp_path / "other")
 
 
-@pytest.mark.parametrize("task", ["maze", "bf16", "view_maze", "point_mass", "cartpole"])
+@pytest.mark.parametrize(
+    "task", ["maze", "bf16", "view_maze", "point_mass", "cartpole", "compiled"]
+)
 def test_graphs_change_no_byte(task: str, tmp_path: Path) -> None:
     given = ["+method=perf_gain", *TASKS[task]]
     experiment(tmp_path / "one", *given).run()

@@ -78,7 +78,9 @@ def make_task(config: RunConfig) -> Task:
     device = _device(compute.device)
     if compute.threads is not None:
         torch.set_num_threads(compute.threads)
-    context = ComputeContext(device, config.precision, compute.cores, compute.graphs)
+    context = ComputeContext(
+        device, config.precision, compute.cores, compute.graphs, compute.compile
+    )
     with key("task", "task."):
         task: Task = _made(task_maker(config.task), config.solver, context, str(device))
     if task.device.type != device.type:
@@ -86,6 +88,11 @@ def make_task(config: RunConfig) -> Task:
             f"this run is computed on {task.device.type} instead of {device.type}, since that is "
             "where the task makes its levels",
             stacklevel=2,
+        )
+    if compute.compile and task.device.type != "cuda":
+        raise ConfigError(
+            f"compute.compile=True: compiles for a GPU, and this run is computed on "
+            f"{task.device.type}; leave False"
         )
     return task
 
@@ -194,7 +201,9 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
         devices = [str(_device(name, "worker_devices")) for name in devices]
     cores = compute.cores or max(1, available_cores() // count)
     settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
-    context = ComputeContext(precision=task.precision, cores=cores, graphs=compute.graphs)
+    context = ComputeContext(
+        precision=task.precision, cores=cores, graphs=compute.graphs, compile=compute.compile
+    )
     make = partial(_made, task_maker(config.task), config.solver, context)
     return Workers(settings, make)
 

@@ -104,6 +104,7 @@ class ComputeSettings:
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
         graphs: replay on a GPU what can be recorded as CUDA graphs.
+        compile: have torch.compile fuse gradient steps, on a GPU.
         threads: CPU threads of one operation; None leaves torch's choice.
         cores: replicas of the Solver computed at once on a CPU; None for all cores.
         collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
@@ -115,6 +116,7 @@ class ComputeSettings:
 
     device: str = "auto"
     graphs: bool = True
+    compile: bool = False
     threads: Annotated[int, Ge(1), Le(1024)] | None = None
     cores: Annotated[int, Ge(1), Le(1024)] | None = None
     collector: Literal["single", "multiprocess", "ray"] = "single"

@@ -9,9 +9,11 @@ plays) stays where it is.
 
 from __future__ import annotations
 
+import gc
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -58,7 +60,8 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
             # It keeps the inputs that it records, which later replays write over, and so would what
             # came of them.
             try:
-                return module(inputs.clone(), *others).clone()
+                with _no_garbage():
+                    return module(inputs.clone(), *others).clone()
             except RuntimeError as error:
                 name, why = getattr(function, "__qualname__", function), str(error).split("\n")[0]
                 raise GraphError(
@@ -68,6 +71,19 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
         return module(inputs, *others)
 
     return call
+
+
+@contextmanager
+def _no_garbage() -> Iterator[None]:
+    """While a graph is recorded, another that is collected would free memory, and end it."""
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class ReplayedOfAgents:

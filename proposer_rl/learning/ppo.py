@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
@@ -44,7 +45,7 @@ from proposer_rl.learning.snapshot import (
     take_snapshot,
 )
 from proposer_rl.learning.statistics import Statistics
-from proposer_rl.models import ActorCritic
+from proposer_rl.models import ActorCritic, Population
 from proposer_rl.settings import ArgumentError
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
@@ -226,9 +227,20 @@ class PPO:
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
-        agent, copies = self.agent, self.agent.copies
         with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
-            steps = agent.decode(steps.copy(), agent.encode(level))
+            loss, metrics = self._forward(steps, level)
+        self._adam.zero_grad()
+        loss.backward()  # each replica's gradient is its own
+        norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, self.copies)
+        self._adam.step()
+        return TensorDict({**metrics, "grad_norm": norm}, norm.shape)
+
+    def _forward(
+        self, steps: TensorDictBase, level: TensorDictBase
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The sum of all losses, and what is told of them."""
+        agent, copies = self.agent, self.copies
+        steps = agent.decode(steps.copy(), agent.encode(level))
         trained_on = agent.value_key, ACTED_VALUE, "value_target", "advantage"
         steps = self.statistics.in_units(steps, *trained_on)
         losses = self._loss(steps)
@@ -238,18 +250,8 @@ class PPO:
             if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
-        self._adam.zero_grad()
-        torch.stack(terms).sum().backward()  # each replica's gradient is its own
-        norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, copies)
-        self._adam.step()
-        return TensorDict(
-            {
-                **{key: metric.detach() for key, metric in metrics.items()},
-                "explained_variance": explained_variance(steps, agent.value_key, copies),
-                "grad_norm": norm,
-            },
-            norm.shape,
-        )
+        metrics["explained_variance"] = explained_variance(steps, agent.value_key, copies)
+        return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:
         """Add what :meth:`optimise` needs to a rollout [*B, T] that another process has made."""
@@ -257,6 +259,22 @@ class PPO:
             context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
         set_next_values(self.agent, rollout, context)
         return rollout
+
+    def compile(self) -> PPO:
+        """From here on have torch.compile fuse what a gradient step computes, for a GPU.
+
+        The first step takes half a minute and more, and numbers are rounded otherwise.
+
+        Returns:
+            Itself.
+        """
+        for module in self.agent.modules():
+            if isinstance(module, Population):
+                module.prefer_products()
+        # Every learner of a process is a case of its own, and after eight it would be given up.
+        torch._dynamo.config.recompile_limit = 256
+        self._forward = torch.compile(self._forward, dynamic=False)  # type: ignore[method-assign]
+        return self
 
     def replay(self, *, rollouts: bool) -> PPO:
         """From here on replay training on a GPU as a CUDA graph, which changes no number.

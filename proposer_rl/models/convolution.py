@@ -1,4 +1,4 @@
-"""3x3 convolutions whose weight gradient is fast on small maps, where a CPU's library is slow."""
+"""3x3 convolutions, as matrix products where the library's kernels are slow."""
 
 from __future__ import annotations
 
@@ -20,18 +20,30 @@ class Conv3x3(nn.Conv2d):
     In bf16 on a CPU the library's weight gradient takes several times as long as its forward pass
     on maps of a few pixels with many channels. There it is computed as one matrix product instead;
     everything else, and every other case, is PyTorch's.
+
+    Attributes:
+        as_product: whether all of it is one product with every pixel's neighbourhood. The
+            convolutions of stacked networks, which have a kernel for each of them otherwise, are
+            products of stacks then.
     """
+
+    as_product = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__(in_channels, out_channels, 3, padding=1)
 
     def forward(self, maps: Tensor) -> Tensor:
         """Convolve maps [B, in_channels, H, W] to [B, out_channels, H, W]."""
+        assert self.bias is not None
+        if self.as_product:
+            weight = self.weight.permute(2, 3, 1, 0).flatten(0, 2)  # [9 * in, out]
+            pixels = torch.addmm(self.bias, _neighbourhoods(maps), weight)
+            pixels = pixels.view(len(maps), *maps.shape[-2:], self.out_channels)
+            return pixels.permute(0, 3, 1, 2).clone(memory_format=torch.contiguous_format)
         small = maps.shape[-2] * maps.shape[-1] <= SMALL_MAP
         small &= min(self.in_channels, self.out_channels) >= MANY_CHANNELS
         if small and maps.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
             low = torch.get_autocast_dtype("cpu")
-            assert self.bias is not None
             return _ProductGradient.apply(maps.to(low), self.weight.to(low), self.bias.to(low))
         return super().forward(maps)
 

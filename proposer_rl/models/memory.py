@@ -125,6 +125,7 @@ class _MemoryHead(TensorDictModuleBase):
         self.in_keys = ["is_init", *MEMORY, *observed]
         self.out_keys = ["logits", "state_value", *(("next", key) for key in MEMORY)]
 
+    @torch.compiler.disable  # through time is one node that writes in place
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
         steps = batch[-1] if recurrent_mode() else 1

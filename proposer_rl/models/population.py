@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from proposer_rl.models.convolution import Conv3x3
 from proposer_rl.models.stacked import Call, apply_alone, apply_batched, apply_on_cores
 
 
@@ -69,6 +70,12 @@ class Population(nn.Module):
         )
         # In a tuple, so that nn.Module does not register it: it lends its structure, no numbers.
         self._template = (members[0].to("meta"),)
+
+    def prefer_products(self) -> None:
+        """Let 3x3 convolutions of several replicas be products, which a compiler fuses."""
+        for layer in self._template[0].modules():
+            if isinstance(layer, Conv3x3):
+                layer.as_product = self.copies > 1
 
     def forward(self, *inputs: Tensor) -> Any:
         """Apply replica ``k`` to slice ``k`` of each input [K, ...]; outputs are [K, ...], too."""

@@ -133,6 +133,7 @@ class Task(ABC):
         self._measured = dict(measured or {"levels": [levels, seed], "target": target})
         self.evaluated_on = {name: self.evaluation_levels(name) for name in names}
         self.device = _place(self.evaluated_on[names[0]])
+        self._compile = context.compile
         self._graphs = context.graphs and graphs.has_graphs(self.device)
         if self._graphs:
             for name in set(self.replayed) - {"rollouts"}:
@@ -172,6 +173,8 @@ class Task(ABC):
         level = next(iter(self.evaluated_on.values()))[:1]
         env = self.environment(level.expand(copies, self.batch_size))
         ppo = PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
+        if self._compile:
+            ppo.compile()
         return ppo.replay(rollouts="rollouts" in self.replayed) if self._graphs else ppo
 
     def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:

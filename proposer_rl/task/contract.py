@@ -38,12 +38,14 @@ class ComputeContext(NamedTuple):
             choice.
         cores: Solvers of a population computed at once on a CPU; None for all cores.
         graphs: whether a GPU replays what can be recorded as CUDA graphs.
+        compile: whether gradient steps are compiled.
     """
 
     device: torch.device = torch.device("cpu")
     precision: str = "fp32"
     cores: int | None = None
     graphs: bool = True
+    compile: bool = False
 
 
 class Distribution(Protocol):

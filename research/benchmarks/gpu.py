@@ -21,17 +21,25 @@ def gpu_targets(options: Options) -> Result:
     if options.precision == "auto":
         options = replace(options, precision=precisions(options)[-1])
     scale = paper(options)
-    step = _meta_step(scale, options)
-    return Result([*_update(scale, options), *step.rows, *_runs(scale, options)], step.tables)
+    steps = [_meta_step(scale.but(*way), options) for way in _ways(options)]
+    rows = [row for step in steps for row in step.rows]
+    tables = [table for step in steps for table in step.tables]
+    return Result([*_update(scale, options), *rows, *_runs(scale, options)], tables)
+
+
+def _ways(options: Options) -> list[list[str]]:
+    """Without and, on a GPU, with a compiler."""
+    return [[], ["compute.compile=true"]] if options.device.startswith("cuda") else [[]]
 
 
 def _update(scale: Scale, options: Options) -> list[Row]:
-    """One Solver in both precisions, and without graphs; and how long the host is busy."""
+    """One Solver in both precisions, without graphs, compiled; and how long the host is busy."""
     ways = {
         options.precision: [],
         "fp32 (TF32)": ["precision=fp32"],
         f"{options.precision}, without graphs": ["compute.graphs=false"],
     }
+    ways |= {f"{options.precision}, compiled": way for way in _ways(options)[1:]}
     updates = {name: Solvers(scale.task(options, *way)).update for name, way in ways.items()}
     seconds = interleave(updates, options.repeats, options.device)
     rows = [
@@ -48,6 +56,7 @@ def _meta_step(scale: Scale, options: Options) -> Result:
     env = trainer_of(scale.made(options, EVERY_UPDATE)).env
     seconds = step_and_parts(env, options.repeats, options.device)
     size = f"K = {scale.config.proposer.rollouts}, {options.precision}"
+    size += ", compiled" * scale.config.compute.compile
     row = _row("a meta-environment step", size, seconds["step"], 50e-3)
     return Result([row], [parts_table(f"Parts of a meta-environment step, {size}", seconds)])
 

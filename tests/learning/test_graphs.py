@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,6 +26,17 @@ def test_neither_inputs_nor_outputs_are_shared() -> None:
     assert first["twice"].tolist() == second["twice"].tolist() == [2, 2]
     first["twice"].zero_()
     assert second["twice"].tolist() == [2, 2]
+
+
+def test_nothing_is_collected_while_it_is_recorded() -> None:
+    seen = []
+
+    def sees(inputs: TensorDictBase) -> TensorDictBase:
+        seen.append(gc.isenabled())
+        return inputs
+
+    graphs.replayed(sees)(TensorDict())
+    assert seen == [False] and gc.isenabled()
 
 
 def test_what_cannot_be_recorded_is_named() -> None:
