@@ -107,6 +107,7 @@ def careless(parts: Components, **_: Any) -> Curriculum:
     return Careless(parts.task.target)
 
 
+@pytest.mark.slow
 def test_what_mixes_devices_is_refused(run_there: Run, tmp_path: Path) -> None:
     said = run_there(tmp_path, *SEEDS, "curriculum._target_=tests.test_devices.careless")
     assert "on the CPU, others on the device" in said and "in observe" in said

@@ -53,6 +53,7 @@ def test_every_method_says_what_it_needs() -> None:
     assert "a Proposer that has learnt" in NEEDS[REUSED]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", sorted(NEEDS.keys() - {REUSED}))
 def test_every_method_runs_and_asks_for_what_it_says(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

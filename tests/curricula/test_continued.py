@@ -226,7 +226,7 @@ def experiment(folder: Path, updates: int, task: Any) -> Experiment:
     )
 
 
-@pytest.mark.parametrize("task", [walking, remembering])
+@pytest.mark.parametrize("task", [walking, pytest.param(remembering, marks=pytest.mark.slow)])
 def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(task: Any, tmp_path: Path) -> None:
     for updates in (5, 9):
         experiment(tmp_path / "resumed", updates, task()).run()

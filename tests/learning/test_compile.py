@@ -22,6 +22,7 @@ TASKS = {
     "minigrid": ["task=minigrid", *TINY],  # minibatches, a clipped value loss, convolutions
     "point_mass": ["task=point_mass", *GATE],
 }
+QUICK = ("minigrid", "point_mass")
 
 
 def learner(task: str, copies: int) -> PPO:
@@ -33,8 +34,10 @@ def learner(task: str, copies: int) -> PPO:
     return ppo
 
 
-@pytest.mark.parametrize("copies", [1, 2])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("copies", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "task", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in TASKS]
+)
 def test_numbers_are_the_same_but_for_rounding(
     task: str, copies: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import pytest
 from research.intervals import LAWS, SEEDS, main, simulate
 
 
+@pytest.mark.slow
 def test_shares_are_those_of_theory() -> None:
     """Of order statistics exactly, of Student's for normal laws, and where a run in five fails."""
     found = simulate(4000).set_index(["law", "seeds", "method"])["coverage"]

@@ -453,7 +453,7 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", ["curricula", "medium"])
+@pytest.mark.parametrize("name", ["curricula", pytest.param("medium", marks=pytest.mark.slow)])
 def test_the_committed_pages_come_out_of_the_committed_results(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,7 @@ def gains(signal: float, noise: float, generator: torch.Generator) -> torch.Tens
     return 0.3 + groups + noise * torch.randn(GROUPS, COPIES, generator=generator)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("signal", "noise"), [(0.0, 1.0), (1.0, 1.0), (2.0, 0.5)])
 def test_the_interval_covers_the_true_ratio_and_the_estimate_is_unbiased(
     signal: float, noise: float

@@ -116,6 +116,7 @@ def test_the_three_operators_are_equally_likely() -> None:
     assert chisquare(counts).pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_each_operator_chooses_evenly_among_its_cells() -> None:
     before = copies_of("S.#\n..#\n#.G", 18_000)
     after = edit_levels(before, 1, seeded(0))[0]

@@ -239,6 +239,7 @@ def opened(path: list[Cell], order: tuple[Cell, ...], obstacles: int) -> set[Cel
     return walls if len(walls) == obstacles else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("obstacles", "length"), [(2, 4), (3, 3)])
 def test_path_first_levels_follow_their_distribution(obstacles: int, length: int) -> None:
     expected: dict[str, float] = defaultdict(float)
