@@ -32,13 +32,15 @@ class Modelled(Combinator):
     filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
     to what came of the levels that the student was trained on. That costs no frames, no
     evaluations and no oracle. Beside the features of a level it knows what the student's critic
-    says of its first state, where there is a critic, which costs a reset.
+    says of its first state, where there is a critic.
 
     Args:
         curriculum: any.
         features: of levels, such as ``task.features`` or a space's alone, see
             :func:`~proposer_rl.task.space_features`.
         labels, ridge, half_life: see the model.
+        critic: whether the critic is asked, which costs a reset for each level that the model is
+            asked about.
     """
 
     remembers = ("_model", "_inbox", "_told")
@@ -52,12 +54,13 @@ class Modelled(Combinator):
         labels: Labels = "above_worst",
         ridge: Positive = 0.3,
         half_life: Annotated[float, Ge(1)] = 12.0,
+        critic: bool = True,
     ) -> None:
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)
         if labels == "success" and "success" not in self.reads:
             self.reads = (*self.reads, "success")
-        self._features, self._labels = features, labels
+        self._features, self._labels, self._critic = features, labels, critic
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life, scaled=1)
         self._inbox = Inbox()
         self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
@@ -135,7 +138,7 @@ class Modelled(Combinator):
         """Features of levels [K, n], and what the critic says of their first states, last."""
         phi = self._features(levels).double().cpu()
         value = torch.zeros(phi.shape[:2], dtype=phi.dtype)
-        if student.lacks("values") is None:
+        if self._critic and student.lacks("values") is None:
             size = student.batch_size or levels.shape[1]
             value = torch.cat([student.values(some) for some in levels.split(size, 1)], 1)
         phi = torch.cat([phi, value.to(phi).unsqueeze(-1)], -1)
