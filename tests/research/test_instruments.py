@@ -13,6 +13,8 @@ from research.snr import EXPLORATIONS
 from research.snr import main as snr
 from tests.commands import call, trained_run
 
+pytestmark = pytest.mark.slow  # whole runs, for what is no part of the package
+
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"]
 
 

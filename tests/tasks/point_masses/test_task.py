@@ -55,8 +55,9 @@ def test_pictures_show_the_wall_and_the_way() -> None:
 @pytest.mark.usefixtures("own_folder")
 @pytest.mark.parametrize(
     "method",
-    [["+method=accel"], ["+method=alp_gmm", "curriculum.rounded=false", "curriculum.warmup=4",
-     "curriculum.refit=4", "curriculum.components=2"], ["+method=model_transport"]],
+    [pytest.param(["+method=accel"], marks=pytest.mark.slow), ["+method=model_transport"],
+     ["+method=alp_gmm", "curriculum.rounded=false", "curriculum.warmup=4",
+     "curriculum.refit=4", "curriculum.components=2"]],
 )  # fmt: skip
 def test_runs_resume_with_the_same_bytes(method: list[str], train: Any) -> None:
     whole, parts = Path("whole"), Path("parts")
