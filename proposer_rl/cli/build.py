@@ -91,7 +91,7 @@ def make_task(config: RunConfig) -> Task:
         )
     if compute.compile and task.device.type != "cuda":
         raise ConfigError(
-            f"compute.compile=True: compiles for a GPU, and this run is computed on "
+            "compute.compile=True: compiles for a GPU, and this run is computed on "
             f"{task.device.type}; leave False"
         )
     return task
