@@ -177,7 +177,27 @@ domain_randomization = _of_task(SamplingCurriculum, "space")
 alp_gmm = _of_task(MixtureCurriculum, "space")
 learning_progress = _of_task(LearningProgressCurriculum, "space")
 first_order_gain = _of_task(FirstOrderCurriculum, "space", "target")
-first_order_sampled = _of_task(SampledFirstOrderCurriculum, "space", "target")
+
+
+def _of_located_task(make: Callable[..., Curriculum]) -> Callable[..., Curriculum]:
+    """The same of a curriculum that goes by where the target lies in the space."""
+    made = _of_task(make, "space", "target_shares")
+
+    @_takes_numbers_of(make)
+    def factory(run: Components, /, **numbers: Any) -> Curriculum:
+        if not isinstance(run.task, LocatedTarget):
+            raise TypeError(
+                f"this curriculum goes by where the target lies: {type(run.task).__name__} must "
+                "define target_shares, the target as shares of the space's bins"
+            )
+        return made(run, **numbers)
+
+    factory.__doc__ = made.__doc__
+    return factory
+
+
+currot = _of_located_task(TransportCurriculum)
+first_order_sampled = _of_located_task(SampledFirstOrderCurriculum)
 
 
 @checked
@@ -287,17 +307,6 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
         action_repeat=config.action_repeat,
         own_action=config.own_action,
     )
-
-
-@_takes_numbers_of(TransportCurriculum)
-def currot(components: Components, **numbers: Any) -> TransportCurriculum:
-    """Train on the way to the target, of a task that says where that lies."""
-    if not isinstance(components.task, LocatedTarget):
-        raise TypeError(
-            f"currot moves towards the target: {type(components.task).__name__} must define "
-            "target_shares, the target as shares of the space's bins"
-        )
-    return TransportCurriculum(components.task.space, components.task.target_shares, **numbers)
 
 
 @_takes_numbers_of(Scorer, ReplayRule, ReplayCurriculum, given="edit")

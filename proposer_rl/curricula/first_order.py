@@ -12,9 +12,16 @@ from torch import Tensor
 from proposer_rl.curricula.batches import device_of, fresh_levels
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.contract import Batch
-from proposer_rl.curricula.probes import tell_cost
+from proposer_rl.curricula.probes import Measure as Outcome
+from proposer_rl.curricula.probes import Probes, tell_cost
 from proposer_rl.curricula.student import Student
-from proposer_rl.meta.first_order import Measure, bin_scores
+from proposer_rl.curricula.transport import (
+    interim_target,
+    mastered,
+    shares_of_bins,
+    squared_distances,
+)
+from proposer_rl.meta.first_order import Measure, bin_scores, scaled
 from proposer_rl.settings import Count, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
@@ -28,11 +35,9 @@ class _AlignedBins(BinCurriculum):
         q_n  proportional to  exp( s_n / (temperature * max over n of |s_n|) ).
     """
 
-    def __init__(
-        self, space: Space, target: Distribution, every: int, temperature: float, smoothing: float
-    ) -> None:
+    def __init__(self, space: Space, every: int, temperature: float, smoothing: float) -> None:
         super().__init__(space, every=every)
-        self._target, self._temperature, self.smoothing = target, temperature, smoothing
+        self._temperature, self.smoothing = temperature, smoothing
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
@@ -76,10 +81,10 @@ class FirstOrderCurriculum(_AlignedBins):
         smoothing: Decay = 0.9,
         measure: Measure = "log_success",
     ) -> None:
-        super().__init__(space, target, every, temperature, smoothing)
+        super().__init__(space, every, temperature, smoothing)
         tell_cost(space, candidates, "candidates")
-        self._target_levels, self._candidates = target_levels, candidates
-        self._step, self._measure = step, measure
+        self._target, self._target_levels = target, target_levels
+        self._candidates, self._step, self._measure = candidates, step, measure
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Score every bin."""
@@ -110,56 +115,75 @@ class FirstOrderCurriculum(_AlignedBins):
 
 
 class SampledFirstOrderCurriculum(_AlignedBins):
-    """The same from episodes, with any environment.
+    """The same from the student's own training episodes, with any environment.
 
-    The direction is the policy gradient of episodes that are played on the target, whose frames
-    count; it is averaged as the scores are. The score of a bin is the mean alignment of the
-    student's own training episodes on it, which cost nothing, so that a part of each batch goes to
-    all bins alike. Where training standardises the advantages of a batch, so do the scores, over
-    what comes in of it between two proposals.
-
-    Where there is no success on the target there is no direction, but noise.
+    Where the target is never solved, episodes on it tell no direction. An interim target takes its
+    place: the nearest distribution on bins that are mastered, in which the student's performance is
+    at least delta (:func:`~proposer_rl.curricula.transport.interim_target`). The direction is the
+    policy gradient of the episodes that the student was trained on, each weighted by the interim
+    target's share of its bin, averaged as the scores are. The score of a bin is the mean alignment
+    of the training episodes on it with the direction before them. No episode is played for either,
+    so that a part of each batch goes to all bins alike. Where training standardises the advantages
+    of a batch, so do the scores, over what comes in of it between two proposals.
 
     Args:
         space: that has the bins.
-        target: the distribution that is to be mastered.
+        target_shares: the target as shares of the bins, float [N].
         every: batches between two scoring passes.
+        delta: least performance of a bin that the interim target lies on.
+        probes: levels of each bin by which performance is told.
+        measure: of performance, ``"success"`` or ``"return"``.
         temperature: the share of bin n is proportional to exp(s_n / (temperature * max |s|)), with
             s its averaged score.
-        smoothing: share of the old score in the average.
+        smoothing: share of the old in the averages.
         exploration: part of each batch that is drawn uniformly.
+
+    Raises:
+        ArgumentError: if there is not one share for each bin.
     """
 
-    needs = ("play", "sampled_direction", "sampled_alignment")
+    shown = ("score", "performance", "interim")
+    needs = ("performance", "sampled_direction", "sampled_alignment")
     reads = ("rollout",)
-    remembers = (*BinCurriculum.remembers, "_direction")
+    remembers = (*BinCurriculum.remembers, "_direction", "_gradient", "_probes")
 
     @checked
     def __init__(
         self,
         space: Space,
-        target: Distribution,
+        target_shares: Tensor,
         *,
         every: Count = 1,
+        delta: float = 0.2,
+        probes: Count = 4,
+        measure: Outcome = "success",
         temperature: Positive = 0.1,
         smoothing: Decay = 0.9,
         exploration: Share = 0.2,
     ) -> None:
-        super().__init__(space, target, every, temperature, smoothing)
-        self._exploration = exploration
+        super().__init__(space, every, temperature, smoothing)
+        self._target, self._costs = shares_of_bins(target_shares, space), squared_distances(space)
+        self._delta, self._exploration = delta, exploration
+        self._probes = Probes(space, probes, measure)
         self._direction: dict[str, Tensor] = {}
-        self._device = device_of(target.sample(1, torch.Generator()))
+        self._gradient: dict[str, Tensor] = {}  # of what came in since the last scoring pass
+        self._device = device_of(space.sample(1, torch.Generator()))
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Play as many levels of the target as the student plays at once, or as are proposed."""
-        levels = fresh_levels(self._target, student.batch_size or count, streams, "target")
-        rollout = student.play(levels, [s.generator("target_actions") for s in streams])
-        new = student.sampled_direction(rollout)
-        old = self.smoothing if self._direction else 0.0
-        before = self._direction or new
-        self._direction = {name: old * before[name] + (1 - old) * new[name] for name in new}
-        if not self.scores:
-            self.scores = {"score": torch.zeros(len(streams), self.space.size)}
+        """Move the direction by the gradient of what came in, and the interim target."""
+        performance = self._probes.performance(student, streams)
+        allowed = mastered(performance, self._delta)
+        nothing = torch.zeros_like(performance)
+        self.scores = {
+            "score": self.scores.get("score", nothing),
+            "performance": performance,
+            "interim": interim_target(self._target, self._costs, allowed).to(performance),
+        }
+        if self._gradient:
+            new, self._gradient = scaled(self._gradient), {}
+            kept = self.smoothing if self._direction else 0.0
+            before = self._direction or new
+            self._direction = {k: kept * before[k] + (1 - kept) * new[k] for k in new}
 
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
@@ -171,7 +195,13 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         """
         if "rollout" not in outcome.keys():
             raise ValueError("alignment: the outcome has no rollout")
-        parts = student.sampled_alignment(self._direction, outcome["rollout"])
+        rollout, weights = outcome["rollout"], self.scores["interim"].gather(1, batch.notes["bins"])
+        new = student.sampled_direction(rollout, weights)
+        before = self._gradient
+        self._gradient = {k: before[k] + v if before else v for k, v in new.items()}
+        if not self._direction:
+            return {}
+        parts = student.sampled_alignment(self._direction, rollout)
         return {**dict(parts.items()), "steps": outcome["steps"]}
 
     def learn(self, evidence: TensorDict) -> None:
@@ -185,7 +215,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
             aligned = (aligned - mean * evidence["drift"]) / spread
         means, counts = means_of_bins(evidence["bins"], aligned.to(score), score.shape[-1])
         averaged = self.smoothing * score + (1 - self.smoothing) * means
-        self.scores = {"score": torch.where(counts > 0, averaged, score)}
+        self.scores = {**self.scores, "score": torch.where(counts > 0, averaged, score)}
 
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
@@ -193,6 +223,8 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the direction, on the device: a checkpoint's tensors are on the CPU."""
+        """Go on with the gradients, on the device: a checkpoint's tensors are on the CPU."""
         super().load_state_dict(state)
-        self._direction = {k: v.to(self._device) for k, v in self._direction.items()}
+        for name in ("_direction", "_gradient"):
+            kept = getattr(self, name)
+            setattr(self, name, {k: v.to(self._device) for k, v in kept.items()})

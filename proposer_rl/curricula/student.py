@@ -24,10 +24,9 @@ from proposer_rl.meta.first_order import (
     alignment,
     exact_alignment,
     exact_direction,
+    in_adams_units,
     log_probabilities,
-    ppo_advantages,
     surrogate,
-    target_direction,
 )
 from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
 from proposer_rl.task import (
@@ -108,8 +107,13 @@ class Student:
 
     The last argument is the step of the differences, in learning rates.
     """
-    sampled_direction: Callable[[TensorDictBase], Direction]
-    """The direction by the policy gradient of a rollout [K, n, T] on the target."""
+    sampled_direction: Callable[[TensorDictBase, Tensor], Direction]
+    """The policy gradient of a rollout [K, n, T] whose levels have weights, float [K, n].
+
+    The sum over the levels of their weights times the gradients of the means over the steps of
+    A_t log pi, with advantages A_t that are not standardised, in units of the optimiser's steps:
+    what parts of a batch give adds up.
+    """
     sampled_alignment: Callable[[Direction, TensorDictBase], TensorDict]
     """What the alignment of levels is made of, by a rollout [K, n, T] on them.
 
@@ -271,11 +275,11 @@ class TaskStudent(Student):
             cast(DifferentiableTask, self._task), self._learner, direction, levels, step
         )
 
-    def _sampled_direction(self, rollout: TensorDictBase) -> Direction:
-        learner = self._learner
+    def _sampled_direction(self, rollout: TensorDictBase, weights: Tensor) -> Direction:
+        learner, advantage = self._learner, advantages(self, rollout).float()
         with torch.enable_grad():
-            gained = surrogate(learner.agent, rollout, ppo_advantages(learner, rollout)).mean(1)
-            return target_direction(learner, gained)
+            gained = surrogate(learner.agent, rollout, advantage) * weights.to(advantage)
+            return in_adams_units(learner, gained.sum(1))
 
     def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
         agent, advantage = self._learner.agent, advantages(self, rollout)

@@ -71,11 +71,6 @@ class TransportCurriculum(BinCurriculum):
     ) -> None:
         super().__init__(space, every=every)
         self._exploration = exploration
-        if target_shares.shape != (space.size,):
-            raise ArgumentError(
-                f"target_shares={list(target_shares.shape)}: must be one for each of {space.size} "
-                "bins"
-            )
         if space.size > MOST_BINS:
             raise ArgumentError(
                 f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares a linear "
@@ -83,17 +78,13 @@ class TransportCurriculum(BinCurriculum):
             )
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
-        target = target_shares.double()
-        self._target = (target / target.sum()).numpy()
-        places = space.coordinates.double()
-        self._costs = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
-        self._costs = self._costs.square()
+        self._target = shares_of_bins(target_shares, space).numpy()
+        self._costs = squared_distances(space)
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Move the distributions, each by its own student's performance on the probes."""
         performance = self._probes.performance(student, streams)
-        best = performance.amax(-1, keepdim=True)
-        allowed = performance >= best.clamp(max=self._delta)
+        allowed = mastered(performance, self._delta)
         even = torch.full(performance.shape, 1 / performance.shape[-1], dtype=torch.float64)
         steps = [
             step_towards(self._target, now, self._costs.numpy(), mask, self._epsilon)
@@ -123,6 +114,55 @@ class TransportCurriculum(BinCurriculum):
             told["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
             told["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
         return told
+
+
+def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
+    """A distribution over the bins of a space, float64 [N], of shares in any unit.
+
+    Raises:
+        ArgumentError: if there is not one share for each bin.
+    """
+    if shares.shape != (space.size,):
+        raise ArgumentError(
+            f"target_shares={list(shares.shape)}: must be one for each of {space.size} bins"
+        )
+    return shares.double() / shares.double().sum()
+
+
+def squared_distances(space: Space) -> Tensor:
+    """Between the bins of a space, by their coordinates: float64 [N, N]."""
+    places = space.coordinates.double()
+    return torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").square()
+
+
+def mastered(performance: Tensor, delta: float) -> Tensor:
+    """Bins of at least this performance, of float [K, N]; where there is none, the best ones."""
+    return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)
+
+
+def interim_target(target: Tensor, costs: Tensor, allowed: Tensor) -> Tensor:
+    """The distribution on allowed bins that is nearest to the target, in 2-Wasserstein distance.
+
+    Each bin of the target gives its share to the nearest allowed ones, to several in equal parts.
+
+    Args:
+        target: shares that add up to one, float64 [N].
+        costs: squared distances between bins, float64 [N, N].
+        allowed: bool [K, N], at least one of each student's.
+
+    Returns:
+        float64 [K, N].
+
+    Example:
+        >>> places = torch.arange(4.0, dtype=torch.float64).unsqueeze(1)
+        >>> target = torch.tensor([0.0, 0.0, 0.5, 0.5], dtype=torch.float64)
+        >>> allowed = torch.tensor([[True, True, False, True]])
+        >>> interim_target(target, torch.cdist(places, places).square(), allowed)
+        tensor([[0.0000, 0.2500, 0.0000, 0.7500]], dtype=torch.float64)
+    """
+    reached = costs.where(allowed.unsqueeze(1), torch.inf)  # [K, N of the target, N]
+    nearest = (reached == reached.amin(-1, keepdim=True)).to(target)
+    return target @ (nearest / nearest.sum(-1, keepdim=True))
 
 
 def step_towards(

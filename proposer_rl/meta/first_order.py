@@ -44,7 +44,6 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import PPO
-from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import DivergedError
 from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
@@ -78,28 +77,38 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
         known = " or ".join(get_args(Measure))
         raise ValueError(f"measure={measure!r}: must be {known}")
     mean, success = mean_log_success(performance), performance["success"]
-    hopeless = (success <= 0).all(1)
-    if bool(hopeless.any()):
-        which = ", ".join(map(str, torch.nonzero(hopeless).flatten().tolist()))
-        raise DivergedError(
-            f"copy {which}: the probability of success is exactly 0 on each of {success.shape[1]} "
-            "levels of the target, so that nothing points towards it; measure=return may"
-        )
+    _refuse(
+        (success <= 0).all(1),
+        f"the probability of success is exactly 0 on each of {success.shape[1]} levels of the "
+        "target, so that nothing points towards it; measure=return may",
+    )
     return mean
 
 
 def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
     """The target direction of K Solvers, each scaled to a root mean square of 1.
 
-    Before Adam's first step, when there is no second moment, it is that of the gradient itself.
-
     Args:
-        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
-        performance: R of each Solver, float [K], with gradients towards the agent's parameters: an
-            exact one (:func:`target_performance`) or :func:`surrogate`, averaged.
+        learner: whose agent the performance is of.
+        performance: exact R of each Solver, float [K], with gradients towards the agent's
+            parameters; see :func:`target_performance`.
 
     Raises:
         DivergedError: if the gradient of a Solver is zero, or not finite.
+    """
+    direction = in_adams_units(learner, performance)
+    _refuse(root_mean_square(direction) == 0, "the target direction is zero")
+    return scaled(direction)
+
+
+def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
+    """The gradient of a performance, each parameter's divided by what Adam divides its step by.
+
+    Before Adam's first step, when there is no second moment, it is the gradient itself.
+
+    Args:
+        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
+        performance: of each Solver, float [K], with gradients towards the agent's parameters.
     """
     parameters = dict(learner.agent.named_parameters())
     gradients = torch.autograd.grad(
@@ -112,14 +121,26 @@ def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
         bias = 1 - SECOND_MOMENT_DECAY**step
         moment = torch.where(step > 0, state[name, "exp_avg_sq"] / bias, torch.ones_like(gradient))
         direction[name] = gradient / (moment.sqrt() + learner.settings.adam_eps)
+    return direction
+
+
+def scaled(direction: Direction) -> dict[str, Tensor]:
+    """A direction of K Solvers, each brought to a root mean square of 1; what is zero stays.
+
+    Raises:
+        DivergedError: if that of a Solver is not finite.
+    """
     size = root_mean_square(direction)
-    if not bool((size.isfinite() & (size > 0)).all()):
-        which = torch.nonzero(~(size.isfinite() & (size > 0))).flatten().tolist()
-        raise DivergedError(
-            f"copy {', '.join(map(str, which))}: the target direction has length "
-            f"{float(size[which[0]])}; it must be finite and not zero"
-        )
+    _refuse(~size.isfinite(), "the target direction is not finite")
+    size = torch.where(size > 0, size, torch.ones_like(size))
     return {name: entry / _per_copy(size, entry) for name, entry in direction.items()}
+
+
+def _refuse(wrong: Tensor, why: str) -> None:
+    """Raise :class:`DivergedError` if anything is wrong with a Solver, bool [K]."""
+    if bool(wrong.any()):
+        which = ", ".join(map(str, torch.nonzero(wrong).flatten().tolist()))
+        raise DivergedError(f"copy {which}: {why}")
 
 
 def squared_length(direction: Direction) -> Tensor:
@@ -208,21 +229,6 @@ def exact_alignment(
         step * learner.settings.learning_rate,
         lambda: task.differentiable_performance(learner.agent, levels)["return"],
     )
-
-
-def ppo_advantages(learner: PPO, rollout: TensorDictBase) -> Tensor:
-    """GAE of a rollout [K, P, T] with the learner's numbers, float [K, P, T].
-
-    Standardised over each Solver's batch where PPO does so.
-    """
-    settings = learner.settings
-    estimate = gae(settings.gamma, settings.lmbda, learner.agent.value_key)
-    advantage = estimate(rollout.copy())["advantage"].squeeze(-1)
-    if not settings.normalize_advantage:
-        return advantage
-    batch = tuple(range(1, advantage.ndim))
-    deviation = advantage.std(batch, keepdim=True).clamp_min(1e-6)
-    return (advantage - advantage.mean(batch, keepdim=True)) / deviation
 
 
 def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from proposer_rl.curricula import Student
 from proposer_rl.curricula.student import VALUE, advantages
-from proposer_rl.learning import DivergedError
 from proposer_rl.meta.first_order import Direction, alignment
 from proposer_rl.settings import ArgumentError
 
@@ -48,7 +47,7 @@ def adapted(name: str, function: Any, given: Callable[[Any], Any]) -> Any:
 class ActorStudent(Student):
     """One student that is an actor, a critic and an optimiser of TorchRL's or of one's own.
 
-    It can do what first-order gain from episodes asks for, ``first_order_sampled``: ``play``,
+    It can do what first-order gain from episodes asks for, ``first_order_sampled``:
     ``sampled_direction`` and ``sampled_alignment``; see :mod:`proposer_rl.meta.first_order` for the
     formulas. With ``can`` it can do more.
 
@@ -58,10 +57,11 @@ class ActorStudent(Student):
         optimizer: of the actor's parameters. Where it is an Adam, its second moments say how far a
             step along each of them goes; else the direction is that of the gradient. Its learning
             rate is the step of the differences.
-        play: ``play(levels, generator)`` gives a rollout [n, T] of the actor on levels [n].
-        given: from levels inside to levels as ``play`` takes them; that of the space.
+        given: from levels inside to levels as the functions in ``can`` take them; that of the
+            space. Only for these.
         gamma, lmbda: discount, and decay of the traces of generalised advantages.
-        can: further functions, as of :class:`~proposer_rl.curricula.Student`.
+        can: further functions, as of :class:`~proposer_rl.curricula.Student`; such as ``play``,
+            where ``play(levels, generator)`` gives a rollout [n, T] of the actor on levels [n].
     """
 
     def __init__(
@@ -69,9 +69,8 @@ class ActorStudent(Student):
         actor: Any,
         critic: Any,
         optimizer: torch.optim.Optimizer,
-        play: Callable[[Any, torch.Generator], TensorDictBase],
         *,
-        given: Callable[[Any], Any],
+        given: Callable[[Any], Any] = lambda levels: levels,
         gamma: float = 0.99,
         lmbda: float = 0.95,
         **can: Any,
@@ -81,26 +80,20 @@ class ActorStudent(Student):
             lmbda=lmbda,
             sampled_direction=self._sampled_direction,
             sampled_alignment=self._sampled_alignment,
-            **{name: adapted(name, one, given) for name, one in {"play": play, **can}.items()},
+            **{name: adapted(name, one, given) for name, one in can.items()},
         )
         self._actor, self._critic, self._optimizer = actor, critic, optimizer
 
-    def _sampled_direction(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+    def _sampled_direction(self, rollout: TensorDictBase, weights: Tensor) -> dict[str, Tensor]:
         advantage = self._advantage(rollout)
-        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
         parameters = dict(self._actor.named_parameters())
         with torch.enable_grad():
-            gained = (advantage * self._log_prob(rollout)).mean()
-            gradients = torch.autograd.grad(gained, list(parameters.values()))
-        direction = {
-            name: gradient / self._scale(parameter)
+            gained = (advantage * self._log_prob(rollout)).mean(-1) * weights.to(advantage)
+            gradients = torch.autograd.grad(gained.sum(), list(parameters.values()))
+        return {  # of one student
+            name: (gradient / self._scale(parameter)).unsqueeze(0)
             for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True)
         }
-        numbers = sum(entry.numel() for entry in direction.values())
-        size = (sum(entry.square().sum() for entry in direction.values()) / numbers) ** 0.5
-        if not bool(torch.as_tensor(size).isfinite() & (torch.as_tensor(size) > 0)):
-            raise DivergedError(f"the target direction has length {float(size)}")
-        return {name: entry / size for name, entry in direction.items()}
 
     def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
         advantage = self._advantage(rollout)
@@ -109,7 +102,8 @@ class ActorStudent(Student):
             return (advantage * self._log_prob(rollout)).mean(-1)
 
         step = self._optimizer.param_groups[0]["lr"]
-        slope = alignment(self._actor, direction, step, gained)
+        own = {name: entry[0] for name, entry in direction.items()}
+        slope = alignment(self._actor, own, step, gained)
         return TensorDict({"slope": slope}, slope.shape)
 
     def _advantage(self, rollout: TensorDictBase) -> Tensor:

@@ -149,7 +149,7 @@ MADE: dict[str, Make] = {
     ),
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
-    "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TARGET),
+    "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
     "filtered bins": lambda: filtered(
         LearningProgressCurriculum(SPACE, source="episodes", every=2)
     ),

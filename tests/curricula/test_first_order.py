@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,9 +16,11 @@ from torch import Tensor, nn
 from proposer_rl.curricula import (
     FirstOrderCurriculum,
     SampledFirstOrderCurriculum,
+    Student,
     TaskStudent,
     outcome_of,
 )
+from proposer_rl.curricula.student import advantages
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -112,6 +115,9 @@ class Mazes(Skills):
     def differentiable_performance(self, agent: nn.Module, levels: Level) -> TensorDict:
         return exact.performance(agent, levels)
 
+    def performance(self, agent: nn.Module, levels: Level, generator: Any) -> TensorDict:
+        return exact.performance(agent, levels)
+
 
 def mazes(**options: Any) -> FirstOrderCurriculum:
     task = Mazes()
@@ -185,55 +191,89 @@ def test_the_log_has_standard_errors_and_how_even_the_shares_are() -> None:
 
 
 def sampled(**options: Any) -> SampledFirstOrderCurriculum:
-    task = Mazes()
-    return SampledFirstOrderCurriculum(task.space, task.target, **options)
+    shares = torch.eye(BINS)[-1]
+    return SampledFirstOrderCurriculum(Mazes().space, shares, **{"probes": 1, **options})
+
+
+def bins_of(levels: Any) -> Tensor:
+    """Of mazes of the space, found anew: [*B]."""
+    wanted = torch.tensor(Mazes().space.specifications)  # fraction, length
+    found = levels.walls.double().mean((-2, -1)), shortest_path_length(levels).double()
+    each = (
+        (f.unsqueeze(-1) - w).abs() < error
+        for f, w, error in zip(found, wanted.T, (0.05, 0.5), strict=True)
+    )
+    return torch.stack([*each]).all(0).int().argmax(-1)
+
+
+def weighted(solvers: PPO, rollout: Any, weights: Tensor) -> dict[str, Tensor]:
+    """Of each Solver, the weighted sum of its levels' policy gradients, in Adam's units."""
+    advantage = advantages(TaskStudent(Mazes(), solvers), rollout)
+    gradients = [
+        exact.gradient(
+            solvers.agent, exact.surrogate(solvers.agent, rollout, advantage)[:, p].sum()
+        )
+        for p in range(P)
+    ]
+    adam, found = solvers.snapshot(), {}
+    for name, entry in gradients[0].items():
+        each = [weights[:, p].view(-1, *[1] * (entry.ndim - 1)) for p in range(P)]
+        total = sum(w * gradient[name] for w, gradient in zip(each, gradients, strict=True))
+        moment = adam[name, "exp_avg_sq"] / (1 - 0.999**3)  # after three steps
+        found[name] = total / (moment.sqrt() + solvers.settings.adam_eps)
+    return found
 
 
 @pytest.mark.parametrize("standardised", [False, True])
-def test_sampled_scores_are_inner_products_with_the_sampled_direction(standardised: bool) -> None:
+def test_sampled_scores_are_inner_products_with_the_interim_targets_gradient(
+    standardised: bool,
+) -> None:
+    """Two updates: the first tells the direction, the second the scores."""
     solvers, curriculum = learner(), sampled(smoothing=0.0)
     solvers.settings = replace(solvers.settings, normalize_advantage=standardised)
-    own = streams(0, 0, 1)
-    student = taught(Mazes(), solvers)
-    batch = curriculum.propose(student, P, own)
-    levels = batch.levels
+    own, student = streams(0, 0, 1), taught(Mazes(), solvers)
+    rollouts = []
+    for _ in range(2):
+        batch = curriculum.propose(student, P, own)
+        solvers.env.set_levels(batch.levels)
+        rollouts.append(solvers.collect([s.generator("actions") for s in own]))
+        before = curriculum.state_dict()["scores"]["interim"]
+        curriculum.observe(student, batch, outcome_of(rollouts[-1]))
+        if len(rollouts) == 1:
+            found, where = curriculum.state_dict()["gradient"], bins_of(batch.levels)
+            expected = weighted(solvers, rollouts[0], before.gather(1, where))
+            for name, entry in expected.items():
+                torch.testing.assert_close(found[name], entry.to(found[name]), rtol=1e-3, atol=1e-7)
     direction = curriculum.state_dict()["direction"]
-    solvers.env.set_levels(levels)
-    rollout = solvers.collect([s.generator("actions") for s in own])
-    curriculum.observe(student, batch, outcome_of(rollout))
+    size = exact.inner(direction, direction) / sum(e[0].numel() for e in direction.values())
+    torch.testing.assert_close(size, torch.ones_like(size))
+    cosine = exact.inner(direction, expected) / exact.inner(expected, expected).sqrt()
+    torch.testing.assert_close(cosine, exact.inner(direction, direction).sqrt())
     curriculum.log()
     found = curriculum.state_dict()["scores"]["score"]
-    advantage = exact.ppo_advantages(solvers, rollout)
-    fraction = levels.walls.double().mean((-2, -1))
-    length = shortest_path_length(levels)
-    for n, (wanted, moves) in enumerate(Mazes().space.specifications):
-        own_bin = (fraction - wanted).abs() < 0.05
-        own_bin &= length == moves
-        for k in range(2):
-            if not own_bin[k].any():
-                assert found[k, n] == 0
-                continue
-            worth = exact.surrogate(solvers.agent, rollout, advantage)[k][own_bin[k]].mean()
-            expected = exact.inner(direction, exact.gradient(solvers.agent, worth))[k]
-            torch.testing.assert_close(
-                found[k, n].double(), expected.detach(), rtol=1e-3, atol=1e-6
-            )
+    where = bins_of(batch.levels)
+    advantage = advantages(student, rollouts[1])
+    if standardised:
+        advantage = advantage - advantage.mean((1, 2), keepdim=True)
+        advantage = advantage / advantage.std((1, 2), keepdim=True)
+    for k, n in product(range(2), range(BINS)):
+        worth, some = exact.surrogate(solvers.agent, rollouts[1], advantage), where[k] == n
+        mean = worth[k][some].mean() if some.any() else 0 * worth.sum()
+        aligned = exact.inner(direction, exact.gradient(solvers.agent, mean))[k]
+        torch.testing.assert_close(found[k, n].double(), aligned.double(), rtol=1e-3, atol=1e-6)
 
 
-def test_the_sampled_direction_is_the_policy_gradient_of_the_targets_episodes() -> None:
-    solvers, curriculum = learner(), sampled()
-    own = streams(0, 0, 1)
-    student = taught(Mazes(), solvers)
-    curriculum.propose(student, P, own)
-    target = torch.stack([Mazes().target.sample(P, s.generator("target")) for s in own])
-    solvers.env.set_levels(target)
-    rollout = solvers.collect([s.generator("target_actions") for s in own])
-    value = exact.surrogate(solvers.agent, rollout, exact.ppo_advantages(solvers, rollout)).mean(1)
-    expected = exact.target_direction(solvers, value)
-    found = curriculum.state_dict()["direction"]
-    for name, entry in expected.items():
-        torch.testing.assert_close(found[name], entry)
-    assert (student.frames, student.evaluations) == (P * solvers.settings.horizon, 0)
+def test_the_interim_target_moves_with_what_is_mastered_at_no_cost_of_its_own() -> None:
+    curriculum = sampled(delta=0.5)
+    told = torch.tensor([[0.9, 0.6, 0.1, 0.2, 0.1, 0.0]])
+    student = Student(performance=lambda levels, g: TensorDict({"success": told}, [1, BINS]))
+    curriculum.propose(student, P, streams(0, 0))
+    # Of (fraction, length) bins the target is the last, and (0, 4) the nearest that is mastered.
+    assert curriculum.state_dict()["scores"]["interim"].tolist() == [[0, 1, 0, 0, 0, 0]]
+    told += 0.5
+    curriculum.propose(student, P, streams(1, 0))
+    assert curriculum.state_dict()["scores"]["interim"].tolist() == [[0, 0, 0, 0, 0, 1]]
+    assert (student.frames, student.evaluations) == (0, 0)
 
 
 def test_exploration_is_spread_over_all_bins() -> None:

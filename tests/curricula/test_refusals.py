@@ -75,7 +75,7 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (first_order, {"candidates": 0}, "candidates=0: input should be greater"),
     (first_order, {"measure": "luck"}, "measure='luck': input should be 'log_success' or 'return'"),
     (
-        partial(SampledFirstOrderCurriculum, SPACE, TARGET),
+        partial(SampledFirstOrderCurriculum, SPACE, TASK.target_shares),
         {"exploration": 2},
         "exploration=2: input should be less than or equal to 1",
     ),

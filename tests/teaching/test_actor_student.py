@@ -49,18 +49,15 @@ def play(actor: Any, levels: Any, generator: torch.Generator) -> TensorDict:
 
 def student(adam: bool) -> tuple[prl.ActorStudent, Any, Any]:
     actor, critic, optimizer = bandits(adam)
-    given = SPACE.given
-    taught = prl.ActorStudent(
-        actor, critic, optimizer, lambda levels, g: play(actor, levels, g), given=given
-    )
-    return taught, actor, optimizer
+    return prl.ActorStudent(actor, critic, optimizer), actor, optimizer
 
 
 @pytest.mark.parametrize("adam", [True, False])
 def test_direction_and_alignment_are_those_of_gradients_by_hand(adam: bool) -> None:
     taught, actor, optimizer = student(adam)
-    levels = SPACE.sample(64, torch.Generator().manual_seed(0)).unsqueeze(0)
-    rollout = taught.play(levels, [torch.Generator().manual_seed(1)])
+    levels = SPACE.given(SPACE.sample(64, torch.Generator().manual_seed(0)))
+    rollout = play(actor, levels, torch.Generator().manual_seed(1)).unsqueeze(0)
+    weights = torch.rand(1, 64, generator=torch.Generator().manual_seed(2))
     weight = next(actor.parameters())
 
     def mean_log_prob(advantage: torch.Tensor) -> torch.Tensor:
@@ -71,15 +68,14 @@ def test_direction_and_alignment_are_those_of_gradients_by_hand(adam: bool) -> N
     with torch.no_grad():
         value = taught._critic(rollout.copy())["state_value"].squeeze(-1)
     advantage = rollout["next", "reward"].squeeze(-1) - value
-    standard = (advantage - advantage.mean()) / advantage.std()
-    (gradient,) = torch.autograd.grad(mean_log_prob(standard).mean(), weight)
+    weighted = (mean_log_prob(advantage).mean(-1) * weights).sum()
+    (gradient,) = torch.autograd.grad(weighted, weight)
     if adam:
         state = optimizer.state[weight]
         gradient = gradient / ((state["exp_avg_sq"] / (1 - 0.999**3)).sqrt() + 1e-8)
-    expected = gradient / gradient.square().mean().sqrt()
-    direction = taught.sampled_direction(rollout)
-    (found,) = direction.values()
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    direction = taught.sampled_direction(rollout, weights)
+    (found,) = (entry[0] for entry in direction.values())
+    torch.testing.assert_close(found, gradient, rtol=1e-4, atol=1e-5)
     before = weight.detach().clone()
     slope = taught.sampled_alignment(direction, rollout)["slope"]
     each = [

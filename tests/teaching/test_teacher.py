@@ -366,7 +366,7 @@ NEEDS = {
     "robust_plr": "robust_plr needs a student with play: it has no play(levels, generators)",
     "accel": "accel needs a student with play",
     "currot": "currot needs a student with performance",
-    "first_order_sampled": "first_order_sampled needs a student with play",
+    "first_order_sampled": "first_order_sampled needs a student with sampled_direction",
     "pace": "pace needs a student with gradient_norms",
 }
 
