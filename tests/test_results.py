@@ -30,10 +30,12 @@ TABLES = [
 @cache
 def tables(study: str) -> dict[str, list[dict[str, str]]]:
     """The tables of methods and of comparisons of a study, as ``bin/report`` writes them."""
-    (found,), notes = read_studies([ROOT / "results" / study], None)
+    found, notes = read_studies([ROOT / "results" / study], None)
     assert notes == []
-    made = {"methods": group_table(found), "comparisons": comparison_table(found)}
-    return {name: list(csv.DictReader(io.StringIO(t.to_csv()))) for name, t in made.items()}
+    return {
+        name: [row for one in found for row in csv.DictReader(io.StringIO(table(one).to_csv()))]
+        for name, table in {"methods": group_table, "comparisons": comparison_table}.items()
+    }
 
 
 def intervals(updates: int, headline: str) -> dict[str, tuple[str, int]]:
