@@ -27,8 +27,8 @@ SHOWN = [
 
 def main(results: Path = RESULTS) -> None:
     """Draw success on the target, as median and its interval over seeds, to learning_curves.png."""
-    runs = pd.read_csv(results / "runs.csv.gz")[["run", "method", "ablation"]]
-    metrics = pd.read_csv(results / "metrics.csv.gz").merge(runs, on="run")
+    runs = pd.read_csv(results / "runs.csv.xz")[["run", "method", "ablation"]]
+    metrics = pd.read_csv(results / "metrics.csv.xz").merge(runs, on="run")
     figure, axes = plt.subplots(figsize=(8, 3.6), layout="constrained")
     ends = []
     for method, ablation, text, colour in SHOWN:

@@ -7,8 +7,8 @@ are, by ``bin/report`` and ``bin/research pages``.
 from __future__ import annotations
 
 import argparse
-import gzip
 import json
+import lzma
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,10 +32,10 @@ from proposer_rl.runs.folder import write_atomically
 
 MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (
-    "`runs.csv.gz` has a row for each run, with its settings and facts as JSON; `metrics.csv.gz`, "
-    "`training.csv.gz`, `cycles.csv.gz` and `levels.csv.gz` what was recorded at each evaluation, "
+    "`runs.csv.xz` has a row for each run, with its settings and facts as JSON; `metrics.csv.xz`, "
+    "`training.csv.xz`, `cycles.csv.xz` and `levels.csv.xz` what was recorded at each evaluation, "
     "of the batches, by the curricula and on every single level at the end: "
-    '`pandas.read_csv("metrics.csv.gz")`.'
+    '`pandas.read_csv("metrics.csv.xz")`.'
 )
 
 
@@ -94,10 +94,10 @@ def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
     written = {"runs": pd.DataFrame(listed), **tables(runs)}
     for name in NAMES:
         if name not in written:
-            (folder / f"{name}.csv.gz").unlink(missing_ok=True)
+            (folder / f"{name}.csv.xz").unlink(missing_ok=True)
     for name, table in reversed(written.items()):  # what makes it a study comes last
-        packed = gzip.compress(to_csv(table), 9, mtime=0)
-        write_atomically(folder / f"{name}.csv.gz", packed)
+        packed = lzma.compress(to_csv(table), preset=9)
+        write_atomically(folder / f"{name}.csv.xz", packed)
 
 
 def write_page(folder: Path) -> None:

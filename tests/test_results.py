@@ -139,7 +139,7 @@ def written(mean: float, low: float, high: float) -> Iterator[str]:
 def told() -> dict[str, list[dict[str, str]]]:
     """By every interval that a table has, the rows that have it; none if it is a table of docs."""
     found: dict[str, list[dict[str, str]]] = {}
-    for study in (file.parent.name for file in (ROOT / "results").glob("*/runs.csv.gz")):
+    for study in (file.parent.name for file in (ROOT / "results").glob("*/runs.csv.xz")):
         for row in (row for table in tables(study).values() for row in table):
             for name in (name for name in row if row.get(f"{name}, low")):
                 bounds = (float(row[f"{name}{part}"]) for part in ("", ", low", ", high"))

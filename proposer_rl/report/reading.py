@@ -151,9 +151,9 @@ def _read_study(folder: Path) -> list[Run]:
 
 def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
     """A table of a study in those of its runs; columns that a run has nothing in are left out."""
-    if not (folder / f"{name}.csv.gz").exists():
+    if not (folder / f"{name}.csv.xz").exists():
         return {}
-    table = read_table(folder / f"{name}.csv.gz")
+    table = read_table(folder / f"{name}.csv.xz")
     values = table.drop(columns="run")
     known = values.notna().groupby(table["run"]).any()
     places = values.groupby(table["run"]).indices
@@ -169,7 +169,7 @@ def _level_results(levels: pd.DataFrame) -> list[LevelResults]:
     for (seed, updates, name), own in levels.groupby(place, sort=False) if len(levels) else ():
         values = own.drop(columns=[*place, "level"]).dropna(axis=1).astype(float).to_dict("list")
         about = {"seed": int(seed), "updates": int(updates), "distribution": name}
-        found.append(checked(LevelResults, {**about, **values}, "levels.csv.gz"))
+        found.append(checked(LevelResults, {**about, **values}, "levels.csv.xz"))
     return found
 
 

@@ -1,6 +1,6 @@
 """Runs in a few tidy tables: of a report, and of a study, which is read as runs are.
 
-A study's folder has ``runs.csv.gz``, a row for each run with its settings and facts as JSON, and
+A study's folder has ``runs.csv.xz``, a row for each run with its settings and facts as JSON, and
 the tables ``metrics``, ``training``, ``cycles`` and ``levels``, each a row for what a run recorded
 at one moment, of one cycle or of one level. Cells of ``cycles`` are JSON, so that lists stay lists.
 Every number is written so that it reads back bit for bit.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from proposer_rl.report.records import encoded
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import read_bounded
 
-STUDY = "runs.csv.gz"  # what makes a folder a study's
+STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
 LARGEST_FILE = 64 * 2**20  # bytes, unpacked
 
@@ -73,11 +72,13 @@ def read_table(file: Path) -> pd.DataFrame:
     if file.is_symlink():
         raise ValueError(f"{file.name} is not a plain file")
     content = read_bounded(file, LARGEST_FILE)
-    unpacker = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    import lzma  # which not every Python is built with
+
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=2 * LARGEST_FILE)
     try:
         text = unpacker.decompress(content, LARGEST_FILE + 1)
-    except zlib.error as error:
-        raise ValueError(f"{file.name} is not packed by gzip: {error}") from None
+    except (lzma.LZMAError, EOFError) as error:
+        raise ValueError(f"{file.name} is not packed by xz: {error}") from None
     if len(text) > LARGEST_FILE or not unpacker.eof:
         raise ValueError(f"{file.name} is cut off, or larger than {LARGEST_FILE // 2**20} MiB")
     return pd.read_csv(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import io
 import json
+import lzma
 import shutil
 from pathlib import Path
 
@@ -61,7 +61,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def rows(study: Path, table: str) -> list[dict[str, str]]:
-    text = gzip.decompress((study / f"{table}.csv.gz").read_bytes()).decode()
+    text = lzma.decompress((study / f"{table}.csv.xz").read_bytes()).decode()
     return list(csv.DictReader(io.StringIO(text)))
 
 
@@ -85,7 +85,7 @@ def test_a_study_has_a_page_with_its_figures(runs: Path, tmp_path: Path) -> None
     """What its authors wrote above the mark stays."""
     light = published(runs, tmp_path / "light")
     assert {path.name for path in light.iterdir()} == {
-        "README.md", "figures", *(f"{name}.csv.gz" for name in ("runs", "metrics", "training",
+        "README.md", "figures", *(f"{name}.csv.xz" for name in ("runs", "metrics", "training",
                                                                 "cycles", "levels")),
     }  # fmt: skip
     page = (light / "README.md").read_text(encoding="utf-8")
@@ -103,7 +103,7 @@ def test_a_study_has_no_pictures_and_names_no_folder_of_the_machine(
     runs: Path, tmp_path: Path
 ) -> None:
     light = published(runs, tmp_path / "light")
-    everything = b"".join(gzip.decompress(file.read_bytes()) for file in light.iterdir()).decode()
+    everything = b"".join(lzma.decompress(file.read_bytes()) for file in light.iterdir()).decode()
     assert SECRET not in everything and "somebody" not in everything
     assert str(LEVEL["picture"]) not in everything
     first = rows(light, "runs")[0]
@@ -198,15 +198,15 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
         ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
         ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
         ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),
-        ("levels", None, "levels.csv.gz is cut off"),
+        ("levels", None, "levels.csv.xz is cut off"),
     ],
 )
 def test_a_broken_study_is_named_in_one_line(
     table: str, text: str | None, message: str, tmp_path: Path
 ) -> None:
     light = published(write_run(tmp_path / "target_0", levels=[0.5]), tmp_path / "light")
-    packed = b"" if text is None else gzip.compress(text.encode())
-    (light / f"{table}.csv.gz").write_bytes(packed)
+    packed = b"" if text is None else lzma.compress(text.encode())
+    (light / f"{table}.csv.xz").write_bytes(packed)
     with pytest.raises(UnreadableRun, match=message) as refused:
         read_run(light)
     assert len(str(refused.value).splitlines()) == 1 and TASK["title"] not in str(refused.value)
