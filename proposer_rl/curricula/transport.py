@@ -71,11 +71,6 @@ class TransportCurriculum(BinCurriculum):
     ) -> None:
         super().__init__(space, every=every)
         self._exploration = exploration
-        if space.size > MOST_BINS:
-            raise ArgumentError(
-                f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares a linear "
-                "program is made; give its axes fewer"
-            )
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
         self._target = shares_of_bins(target_shares, space).numpy()
@@ -130,7 +125,16 @@ def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
 
 
 def squared_distances(space: Space) -> Tensor:
-    """Between the bins of a space, by their coordinates: float64 [N, N]."""
+    """Between the bins of a space, by their coordinates: float64 [N, N].
+
+    Raises:
+        ArgumentError: if there are too many bins.
+    """
+    if space.size > MOST_BINS:
+        raise ArgumentError(
+            f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares tables are made; "
+            "give its axes fewer"
+        )
     places = space.coordinates.double()
     return torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").square()
 
@@ -160,9 +164,12 @@ def interim_target(target: Tensor, costs: Tensor, allowed: Tensor) -> Tensor:
         >>> interim_target(target, torch.cdist(places, places).square(), allowed)
         tensor([[0.0000, 0.2500, 0.0000, 0.7500]], dtype=torch.float64)
     """
-    reached = costs.where(allowed.unsqueeze(1), torch.inf)  # [K, N of the target, N]
-    nearest = (reached == reached.amin(-1, keepdim=True)).to(target)
-    return target @ (nearest / nearest.sum(-1, keepdim=True))
+    moved = []
+    for own in allowed:
+        reached = costs.where(own, torch.inf)  # from the target's bins to those
+        nearest = (reached == reached.amin(-1, keepdim=True)).to(target)
+        moved.append(target @ (nearest / nearest.sum(-1, keepdim=True)))
+    return torch.stack(moved)
 
 
 def step_towards(

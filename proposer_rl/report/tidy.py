@@ -69,11 +69,11 @@ def to_csv(table: pd.DataFrame) -> bytes:
 
 def read_table(file: Path) -> pd.DataFrame:
     """A table of a study, its cells as text; NaN where one is empty."""
+    import lzma  # which not every Python is built with
+
     if file.is_symlink():
         raise ValueError(f"{file.name} is not a plain file")
     content = read_bounded(file, LARGEST_FILE)
-    import lzma  # which not every Python is built with
-
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=2 * LARGEST_FILE)
     try:
         text = unpacker.decompress(content, LARGEST_FILE + 1)
