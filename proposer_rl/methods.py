@@ -164,6 +164,11 @@ def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curr
 
     @_takes_numbers_of(make)
     def factory(run: Components, /, **numbers: Any) -> Curriculum:
+        if "target_shares" in parts and not isinstance(run.task, LocatedTarget):
+            raise TypeError(
+                f"this curriculum goes by where the target lies: {type(run.task).__name__} must "
+                "define target_shares, the target as shares of the space's bins"
+            )
         return make(*(getattr(run.task, part) for part in parts), **numbers)
 
     factory.__doc__ = f"Make a :class:`~{make.__module__}.{make.__qualname__}` for the run's task."
@@ -177,27 +182,8 @@ domain_randomization = _of_task(SamplingCurriculum, "space")
 alp_gmm = _of_task(MixtureCurriculum, "space")
 learning_progress = _of_task(LearningProgressCurriculum, "space")
 first_order_gain = _of_task(FirstOrderCurriculum, "space", "target")
-
-
-def _of_located_task(make: Callable[..., Curriculum]) -> Callable[..., Curriculum]:
-    """The same of a curriculum that goes by where the target lies in the space."""
-    made = _of_task(make, "space", "target_shares")
-
-    @_takes_numbers_of(make)
-    def factory(run: Components, /, **numbers: Any) -> Curriculum:
-        if not isinstance(run.task, LocatedTarget):
-            raise TypeError(
-                f"this curriculum goes by where the target lies: {type(run.task).__name__} must "
-                "define target_shares, the target as shares of the space's bins"
-            )
-        return made(run, **numbers)
-
-    factory.__doc__ = made.__doc__
-    return factory
-
-
-currot = _of_located_task(TransportCurriculum)
-first_order_sampled = _of_located_task(SampledFirstOrderCurriculum)
+currot = _of_task(TransportCurriculum, "space", "target_shares")
+first_order_sampled = _of_task(SampledFirstOrderCurriculum, "space", "target_shares")
 
 
 @checked
