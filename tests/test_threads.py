@@ -1,7 +1,8 @@
-"""Every command sets how PyTorch's threads wait before it loads it, unless the user has."""
+"""Every command sets how PyTorch waits and keeps memory before it loads it, unless the user has."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -34,3 +35,27 @@ def test_a_command_says_how_threads_wait_before_it_loads_pytorch(module: str) ->
 def test_what_the_user_says_counts() -> None:
     assert waits("proposer_rl.cli.start", GOMP_SPINCOUNT="7")[0] == "7"
     assert waits("proposer_rl.cli.start", OMP_WAIT_POLICY="active")[0] == "None"
+
+
+USE = """
+import importlib, resource, sys
+importlib.import_module(sys.argv[1])
+import torch
+for turn in range(30):  # what lies between small things is found after some
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(10 * 2**20)  # 40 MiB, 10,240 pages
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+print(faults)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc's malloc")
+def test_memory_that_was_used_is_kept_unless_the_user_says_otherwise() -> None:
+    def faults(**given: str) -> int:
+        kept = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")}
+        command = [sys.executable, "-c", USE, "proposer_rl.cli.start"]
+        said = subprocess.run(command, env=kept | given, capture_output=True, text=True, check=True)
+        return int(said.stdout)
+
+    assert faults() < 1000
+    assert faults(MALLOC_ARENA_MAX="2") > 5000

@@ -81,22 +81,25 @@ class _ThroughTime(torch.autograd.Function):
     def forward(
         inputs: Tensor, rows: Tensor, kept: Tensor, hidden: Tensor, cell: Tensor, weight: Tensor
     ) -> tuple[Tensor, ...]:
-        shape, width = (len(rows), *hidden.shape[:-1]), hidden.shape[-1]
-        gates = hidden.new_empty(*shape, 4 * width)
-        hiddens, cells, squashed = hidden.new_empty(3, *shape, width)
-        for t, row in enumerate(rows):
-            before = (hidden * kept[t]).to(weight.dtype)
-            gate = torch.add(
-                inputs.index_select(-2, row), torch.matmul(before, weight.mT), out=gates[t]
-            )
+        width, less = hidden.shape[-1], hidden.new_full((), -1.0)
+        # tanh(x) is 2 sigmoid(2 x) - 1, so that one call serves all gates: g is doubled beforehand.
+        twice = torch.ones(4 * width, dtype=weight.dtype, device=weight.device)
+        twice[2 * width : 3 * width] = 2
+        weight = (weight * twice.unsqueeze(-1)).mT.contiguous()
+        given = (inputs * twice).index_select(-2, rows.flatten()).to(hidden.dtype)
+        gates = given.unflatten(-2, rows.shape).movedim(-3, 0)
+        hiddens, cells, squashed = hidden.new_empty(3, len(rows), *hidden.shape)
+        # A view of each step, made for all at once.
+        steps = (x.unbind() for x in (gates, kept, cells, squashed, hiddens))
+        for gate, keep, now, small, after in zip(*steps, strict=True):
+            gate.add_(torch.matmul((hidden * keep).to(weight.dtype), weight)).sigmoid_()
             i, f, g, o = gate.chunk(4, -1)
-            g.mul_(2)
-            gate.sigmoid_()
-            g.mul_(2).sub_(1)
-            f.mul_(kept[t])
-            cell = torch.mul(f, cell, out=cells[t]).addcmul_(i, g)
-            torch.mul(cell, 2, out=squashed[t]).sigmoid_().mul_(2).sub_(1)
-            hidden = torch.mul(o, squashed[t], out=hiddens[t])
+            torch.add(less, g, alpha=2, out=g)
+            f.mul_(keep)
+            cell = torch.mul(f, cell, out=now).addcmul_(i, g)
+            torch.mul(cell, 2, out=small).sigmoid_()
+            torch.add(less, small, alpha=2, out=small)
+            hidden = torch.mul(o, small, out=after)
         return hiddens, cells, gates, squashed
 
     @staticmethod
@@ -110,30 +113,33 @@ class _ThroughTime(torch.autograd.Function):
     def backward(ctx: Any, of_hidden: Tensor | None, of_cell: Tensor | None, *_: Any) -> Any:
         rows, kept, hidden, cell, weight, hiddens, cells, gates, squashed = ctx.saved_tensors
         slopes, width = torch.empty_like(gates), hidden.shape[-1]
-        of_inputs = gates.new_zeros(ctx.distinct)
         to_hidden, to_cell = torch.zeros_like(hidden), torch.zeros_like(cell)
-        for t in reversed(range(len(rows))):
-            gate, slope = gates[t], slopes[t]
+        previous = (cell, *cells.unbind()[:-1])
+        none = (None,) * len(rows)
+        outer = (none if x is None else x.unbind() for x in (of_hidden, of_cell))
+        steps = (x.unbind() for x in (gates, slopes, squashed, kept))
+        backwards = reversed(list(zip(*outer, *steps, previous, strict=True)))
+        for own_hidden, own_cell, gate, slope, small, keep, before in backwards:
             (i, f, g, o), (si, sf, sg, so) = gate.chunk(4, -1), slope.chunk(4, -1)
-            if of_hidden is not None:
-                to_hidden.add_(of_hidden[t])
-            if of_cell is not None:
-                to_cell.add_(of_cell[t])
-            to_cell.add_(torch.ops.aten.tanh_backward(to_hidden * o, squashed[t]))
+            if own_hidden is not None:
+                to_hidden.add_(own_hidden)
+            if own_cell is not None:
+                to_cell.add_(own_cell)
+            to_cell.add_(torch.ops.aten.tanh_backward(to_hidden * o, small))
             torch.mul(to_cell, g, out=si)
-            torch.mul(to_cell, cells[t - 1] if t else cell, out=sf)
+            torch.mul(to_cell, before, out=sf)
             torch.mul(to_cell, i, out=sg)
-            torch.mul(to_hidden, squashed[t], out=so)
+            torch.mul(to_hidden, small, out=so)
             both = slope[..., : 2 * width]
             sigmoid_slope_(both, gate[..., : 2 * width], grad_input=both)
             tanh_slope_(sg, g, grad_input=sg)
             sigmoid_slope_(so, o, grad_input=so)
-            of_inputs.index_add_(-2, rows[t], slope)
-            to_hidden = torch.matmul(slope.to(weight.dtype), weight).to(hidden).mul_(kept[t])
+            to_hidden = torch.matmul(slope.to(weight.dtype), weight).to(hidden).mul_(keep)
             to_cell.mul_(f)
         before = torch.cat([hidden.unsqueeze(0), hiddens[:-1]]).mul_(kept)
-        flat = [x.movedim(0, -3).flatten(-3, -2).to(weight.dtype) for x in (slopes, before)]
-        of_weight = torch.matmul(flat[0].mT, flat[1])
+        slopes, before = (x.movedim(0, -3).flatten(-3, -2) for x in (slopes, before))
+        of_weight = torch.matmul(slopes.to(weight.dtype).mT, before.to(weight.dtype))
+        of_inputs = gates.new_zeros(ctx.distinct).index_add_(-2, rows.flatten(), slopes)
         return of_inputs.to(ctx.low), None, None, to_hidden, to_cell, of_weight
 
     @staticmethod
