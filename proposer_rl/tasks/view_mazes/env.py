@@ -126,9 +126,9 @@ class ViewMazeEnv(LevelEnv):
         return cell_index(agent, self._width) + self._origin
 
     def _view(self, place: Tensor, direction: Tensor) -> Tensor:
-        seen = self._seen.index_select(0, direction.flatten())  # [N, 25]
-        cells = (seen + place.reshape(-1, 1).int()).flatten()
-        view = self._objects.index_select(0, cells).view(*place.shape, VIEW, VIEW)
+        cells = self._seen.index_select(0, direction.flatten())  # [N, 25]
+        cells.add_(place.reshape(-1, 1).int())
+        view = self._objects.index_select(0, cells.flatten()).view(*place.shape, VIEW, VIEW)
         view[..., AGENT[0], AGENT[1]].fill_(EMPTY)
         return view
 
