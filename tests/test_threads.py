@@ -52,10 +52,11 @@ print(faults)
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc's malloc")
 def test_memory_that_was_used_is_kept_unless_the_user_says_otherwise() -> None:
     def faults(**given: str) -> int:
-        kept = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")}
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "GLIBC_"))}
         command = [sys.executable, "-c", USE, "proposer_rl.cli.start"]
         said = subprocess.run(command, env=kept | given, capture_output=True, text=True, check=True)
         return int(said.stdout)
 
     assert faults() < 1000
-    assert faults(MALLOC_ARENA_MAX="2") > 5000
+    assert faults(MALLOC_ARENA_MAX="2") < 1000
+    assert faults(MALLOC_TRIM_THRESHOLD_="131072") > 5000

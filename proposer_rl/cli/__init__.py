@@ -15,9 +15,10 @@ if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
     os.environ["GOMP_SPINCOUNT"] = "1000"
 
 # On a CPU PyTorch asks the C library for every tensor. That gives what is large back to the system,
-# which then clears each page again: an eighth of the time of training on the view maze.
-KEEP = {-3: 2**26, -1: 2**31 - 1}  # M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h, in bytes
-if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
-    set_allocator = getattr(ctypes.CDLL(None), "mallopt", None)  # only glibc has it
-    for number, value in KEEP.items() if set_allocator is not None else ():
-        set_allocator(number, value)
+# which then clears each page again: an eighth of the time of training on the view maze. These are
+# M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of glibc's malloc.h, in bytes.
+KEPT = {"MALLOC_MMAP_THRESHOLD_": (-3, 2**26), "MALLOC_TRIM_THRESHOLD_": (-1, 2**31 - 1)}
+if sys.platform == "linux" and not {*KEPT, "GLIBC_TUNABLES"} & os.environ.keys():
+    c_library = ctypes.CDLL(None)
+    for option, value in KEPT.values() if hasattr(c_library, "mallopt") else ():  # glibc's alone
+        c_library.mallopt(option, value)
