@@ -49,7 +49,10 @@ print(faults)
 """
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc's malloc")
+GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt")
+
+
+@pytest.mark.skipif(not GLIBC, reason="needs glibc's malloc")
 def test_memory_that_was_used_is_kept_unless_the_user_says_otherwise() -> None:
     def faults(**given: str) -> int:
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "GLIBC_"))}
