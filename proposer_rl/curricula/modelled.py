@@ -31,16 +31,13 @@ class Modelled(Combinator):
     Whatever the curriculum asks as ``performance`` or ``exact_performance``, by a scoring pass or a
     filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
     to what came of the levels that the student was trained on. That costs no frames, no
-    evaluations and no oracle. Beside the features of a level it knows what the student's critic
-    says of its first state, where there is a critic.
+    evaluations and no oracle.
 
     Args:
         curriculum: any.
         features: of levels, such as ``task.features`` or a space's alone, see
             :func:`~proposer_rl.task.space_features`.
         labels, ridge, half_life: see the model.
-        critic: whether the critic is asked, which costs a reset for each level that the model is
-            asked about.
     """
 
     remembers = ("_model", "_inbox", "_told")
@@ -54,14 +51,13 @@ class Modelled(Combinator):
         labels: Labels = "above_worst",
         ridge: Positive = 0.3,
         half_life: Annotated[float, Ge(1)] = 12.0,
-        critic: bool = True,
     ) -> None:
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)
         if labels == "success" and "success" not in self.reads:
             self.reads = (*self.reads, "success")
-        self._features, self._labels, self._critic = features, labels, critic
-        self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life, scaled=1)
+        self._features, self._labels = features, labels
+        self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._inbox = Inbox()
         self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
 
@@ -69,7 +65,7 @@ class Modelled(Combinator):
         """What the curriculum proposes to a student of whom the model speaks."""
         self._take_in()
         batch = self.parts[0].propose(_Answering(student, self._predict), count, streams)
-        phi = self._phi(student, batch.levels)
+        phi = self._phi(batch.levels)
         predicted = self._model.predict(phi)["success"]
         return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
 
@@ -131,17 +127,11 @@ class Modelled(Combinator):
             self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
             self._model.add(evidence["features"], outcome)
 
-    def _predict(self, student: Student, levels: Levels) -> TensorDict:
-        return self._model.predict(self._phi(student, levels))
+    def _predict(self, levels: Levels) -> TensorDict:
+        return self._model.predict(self._phi(levels))
 
-    def _phi(self, student: Student, levels: Levels) -> Tensor:
-        """Features of levels [K, n], and what the critic says of their first states, last."""
+    def _phi(self, levels: Levels) -> Tensor:
         phi = self._features(levels).double().cpu()
-        value = torch.zeros(phi.shape[:2], dtype=phi.dtype)
-        if self._critic and student.lacks("values") is None:
-            size = student.batch_size or levels.shape[1]
-            value = torch.cat([student.values(some) for some in levels.split(size, 1)], 1)
-        phi = torch.cat([phi, value.to(phi).unsqueeze(-1)], -1)
         wrong = (~phi.isfinite()).sum()
         if wrong:
             raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
@@ -151,14 +141,14 @@ class Modelled(Combinator):
 class _Answering(Student):
     """A student whose performance a model tells; all else it does itself."""
 
-    def __init__(self, student: Student, predict: Callable[[Student, Levels], TensorDict]) -> None:
+    def __init__(self, student: Student, predict: Callable[[Levels], TensorDict]) -> None:
         own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
         super().__init__(
             gamma=student.gamma,
             lmbda=student.lmbda,
             batch_size=student.batch_size,
             **{name: getattr(student, name) for name in own},
-            performance=lambda levels, generator: predict(student, levels),
-            exact_performance=lambda levels: predict(student, levels),
+            performance=lambda levels, generator: predict(levels),
+            exact_performance=predict,
         )
         self.spend = student.spend  # type: ignore[method-assign]

@@ -116,20 +116,12 @@ class OutcomeModel:
             episode is above the worst: no level is silent, and each teaches something.
         ridge: on the coefficients.
         half_life: batches after which a row counts half.
-        scaled: the last of the features, whose units nobody knows. They are brought to mean 0 and
-            deviation 1 over the rows; one that is constant there has no effect.
     """
 
     def __init__(
-        self,
-        *,
-        labels: Labels = "success",
-        ridge: float = 0.3,
-        half_life: float = 12.0,
-        scaled: int = 0,
+        self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
-        self._labels, self._ridge = labels, ridge
-        self._half_life, self._scaled = half_life, scaled
+        self._labels, self._ridge, self._half_life = labels, ridge, half_life
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
@@ -158,7 +150,7 @@ class OutcomeModel:
             same = {"success": 0.5, "return": 0.0, "spread": 0.0}
             return TensorDict({k: features.new_full(shape, v) for k, v in same.items()}, shape)
         self._fitted = fitted = self._fitted or self._fit()
-        phi = fitted.standard(features)
+        phi = torch.cat([torch.zeros_like(features[..., :1]), features], -1)  # of age 0
         z = _times(phi, fitted.success.beta)
         variance = ((phi @ fitted.success.covariance) * phi).sum(-1)
         return TensorDict(
@@ -199,19 +191,13 @@ class OutcomeModel:
             1,
         ).flip(1)
         weights = 0.5**ages
-        shift, scale = _moments(entries["features"], weights.unsqueeze(-1))
-        scale[scale == 0] = torch.inf
-        plain = slice(scale.shape[-1] - self._scaled)
-        shift[..., plain], scale[..., plain] = 0, 1
         middle, unit = _moments(entries["return"], weights)
         unit[unit == 0] = 1
-        phi = torch.cat([-ages.unsqueeze(-1), (entries["features"] - shift) / scale], -1)
+        phi = torch.cat([-ages.unsqueeze(-1), entries["features"]], -1)
         returns = (entries["return"] - middle) / unit
         mean = linear_ridge(phi, returns, weights, self._ridge)
         residuals = (returns - _times(phi, mean)).square()
         return _Fitted(
-            shift,
-            scale,
             logistic_ridge(phi, self.labels(entries), weights, self._ridge),
             middle,
             unit,
@@ -221,19 +207,13 @@ class OutcomeModel:
 
 
 class _Fitted(NamedTuple):
-    """Regressions on standardised features and returns: [K, 1, F], [K, 1] and [K, F]."""
+    """Regressions on features and age, and the mean and deviation of returns [K, 1]."""
 
-    shift: Tensor
-    scale: Tensor
     success: Logistic
     middle: Tensor
     unit: Tensor
     mean: Tensor
     spread: Tensor
-
-    def standard(self, features: Tensor) -> Tensor:
-        now = torch.zeros_like(features[..., :1])
-        return torch.cat([now, (features - self.shift) / self.scale], -1)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

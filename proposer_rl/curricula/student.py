@@ -71,8 +71,6 @@ class Student:
         (None, 'it has no probe(levels)')
     """
 
-    values: Callable[[Levels], Tensor]
-    """What the critic says of the first state of each level, float [K, n]."""
     play: Callable[[Levels, Sequence[torch.Generator]], TensorDictBase]
     """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
 
@@ -218,15 +216,6 @@ class TaskStudent(Student):
         if name in kinds and not isinstance(self._task, kinds[name][0]):
             return f"{task} must define {kinds[name][1]}"
         return None
-
-    @torch.no_grad()
-    def _values(self, levels: Levels) -> Tensor:
-        agent, count = self._learner.agent, levels.shape[1]
-        env, _ = self._spectators()
-        env.set_levels(self._filled_up(levels))
-        state = env.reset()
-        state.update(agent.no_memory(state))
-        return agent.decode(state, agent.encode(state))[VALUE].squeeze(-1)[:, :count]
 
     def _play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
         count = levels.shape[1]

@@ -14,7 +14,7 @@ from proposer_rl.curricula.student import VALUE, advantages
 from proposer_rl.meta.first_order import Direction, alignment
 from proposer_rl.settings import ArgumentError
 
-OF_LEVELS = ("values", "optimal_return", "exact_performance", "performance", "play")
+OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
 def adapted(name: str, function: Any, given: Callable[[Any], Any]) -> Any:

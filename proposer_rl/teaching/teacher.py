@@ -60,8 +60,8 @@ class Teacher:
             ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
         student: what the curriculum may ask of; None for one that can do what ``can`` says.
         can: functions by their names, as of :class:`~proposer_rl.curricula.Student`. Where there is
-            one student, ``values``, ``performance``, ``exact_performance``, ``optimal_return`` and
-            ``play`` are called with levels [n] as :meth:`propose` gives them.
+            one student, ``performance``, ``exact_performance``, ``optimal_return`` and ``play`` are
+            called with levels [n] as :meth:`propose` gives them.
 
     Raises:
         ArgumentError: naming the argument.

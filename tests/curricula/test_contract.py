@@ -30,7 +30,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
 from tests.curricula.living import Lived, live, solvers
-from tests.curricula.made import LEARNED, MADE, SPACE, Make, P, replay
+from tests.curricula.made import LEARNED, MADE, Make, P, replay
 from tests.tiny import TASK, mountain_cars, tiny_view_task
 
 EVERY = {**MADE, **LEARNED}
@@ -279,18 +279,11 @@ def test_a_student_that_lacks_something_is_named() -> None:
         (windows, "exact_performance", "ViewMazeTask tells performance by playing, which is not"),
     ):
         poor = TaskStudent(task, task.learner([Streams(0)]))
-        require(poor, ("play", "values", "probe", "performance"), "plr")
+        require(poor, ("play", "probe", "performance"), "plr")
         with pytest.raises(UnfitStudentError, match=f"it needs a student with {need}: {reason}"):
             require(poor, (need,), "it")
     for name in ABILITIES:
         with pytest.raises(UnfitStudentError, match=rf"{name}: it has no {name}\("):
             getattr(Student(), name)
-    with pytest.raises(ValueError, match="sing: a student can have values, play"):
+    with pytest.raises(ValueError, match="sing: a student can have play"):
         Student(sing=print)
-
-
-def test_values_are_those_of_the_first_step() -> None:
-    student = TaskStudent(TASK, solvers([0, 1]))
-    levels = torch.stack([SPACE.sample(3, Streams(k).generator()) for k in range(2)])
-    rollout = student.play(levels, [Streams(k).generator() for k in range(2)])
-    torch.testing.assert_close(student.values(levels), rollout["state_value"][:, :, 0, 0])
