@@ -130,7 +130,7 @@ class OutcomeModel:
         """Take in a batch.
 
         Args:
-            features: float64 [K, m, F].
+            features: float64 [K, m, F]; a constant one is a further intercept.
             outcome: ``return`` and, where that is what is labelled, ``success``: float64 [K, m].
         """
         kept = {name: outcome[name] for name in ("return", "success") if name in outcome}

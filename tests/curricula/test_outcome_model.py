@@ -116,6 +116,22 @@ def test_few_outcomes_say_little(count: int) -> None:
     assert (told["success"][0, :count] < 0.5).all()
 
 
+def test_a_constant_feature_is_a_further_intercept() -> None:
+    """Constants 1 and c are one, sqrt(1 + c^2): the penalty is the same all round."""
+    features, labels, _ = (entry[0] for entry in rows())
+    one = torch.ones(len(features), 1, dtype=features.dtype)
+    told = [
+        model_of(phi, labels).predict(phi[None])["success"]
+        for phi in (
+            torch.cat([features, one, 3 * one], -1),
+            torch.cat([features, math.sqrt(10) * one], -1),
+            torch.cat([features, math.sqrt(10) * one, 0 * one], -1),
+        )
+    ]
+    torch.testing.assert_close(told[0], told[1])
+    torch.testing.assert_close(told[2], told[1])
+
+
 def test_mean_and_spread_of_returns_are_found() -> None:
     """A return of 40 + 10 x, give or take 5 (1 + x): the more rows, the nearer."""
     g = torch.Generator().manual_seed(0)
