@@ -99,7 +99,7 @@ class MazeEnv(LevelEnv):
         self._goal = cell_index(levels.goal, self._grid[1]).unsqueeze(-1)  # [*B, 1]
 
     def _first(self) -> dict[str, Tensor]:
-        return self._observe(self._levels.start.clone())
+        return self._observe(self._levels.start)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         (height, width), action = self._grid, tensordict.get("action")

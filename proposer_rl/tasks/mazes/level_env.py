@@ -60,7 +60,7 @@ class LevelEnv(EnvBase):
 
     @abstractmethod
     def _first(self) -> dict[str, Tensor]:
-        """What is observed at the beginning of an episode, ``"agent"`` included."""
+        """What is observed when an episode begins, ``"agent"`` included; nobody writes into it."""
 
     @property
     def levels(self) -> Level:
@@ -108,24 +108,22 @@ class LevelEnv(EnvBase):
         ended = done.flatten().nonzero().squeeze(1) if population.at_hand(done) else None
         if ended is not None and not len(ended):
             return tensordict
-        after = tensordict.copy()
+        after = dict(tensordict.items())
         for key, first in self._first().items():
-            if key in tensordict.keys() and key not in self._constant:
-                after.set(key, self._begun(first, tensordict.get(key), done, ended))
-        after.set("step_count", tensordict.get("step_count") * ~done)
-        for key in ENDS:
-            after.set(key, torch.zeros_like(done))
-        self._agent = after.get("agent")
-        return after
+            if key in after and key not in self._constant:
+                after[key] = self._begun(first, after[key], done, ended)
+        after["step_count"] = after["step_count"] * ~done
+        after |= {key: torch.zeros_like(done) for key in ENDS}
+        self._agent = after["agent"]
+        return TensorDict(after, tensordict.batch_size, device=tensordict.device)
 
     def _begun(self, first: Tensor, standing: Tensor, done: Tensor, ended: Tensor | None) -> Tensor:
         """What stands in mazes, as at first where they are done."""
+        each = first.shape[self.batch_dims :]
         if ended is None:
-            more = [1] * (first.ndim - self.batch_dims)
-            return first.where(done.reshape(*self.batch_size, *more), standing)
-        flat = (x.reshape(-1, *x.shape[self.batch_dims :]) for x in (standing, first))
-        rows, begun = flat
-        return rows.index_copy(0, ended, begun[ended]).view(standing.shape)
+            return first.where(done.reshape(*self.batch_size, *[1] * len(each)), standing)
+        begun = first.reshape(-1, *each).index_select(0, ended)
+        return standing.reshape(-1, *each).index_copy(0, ended, begun).view(standing.shape)
 
     def to(self, device: torch.device | str | int) -> Self:
         """Moves the environment and its levels to a device."""
@@ -169,8 +167,9 @@ class LevelEnv(EnvBase):
         self._agent = start if mask is None else start.where(mask.unsqueeze(-1), self._agent)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         ends = {key: none.clone() for key in ENDS}
+        first = {k: x if k in self._constant else x.clone() for k, x in self._first().items()}
         # Of these TorchRL takes over only the entries of the mazes that are reset.
-        state = {**self._first(), "step_count": none.long(), **ends}
+        state = {**first, "step_count": none.long(), **ends}
         return TensorDict(state, self.batch_size, device=self.device)
 
     def _after(self, terminated: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:

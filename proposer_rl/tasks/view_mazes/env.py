@@ -85,28 +85,27 @@ class ViewMazeEnv(LevelEnv):
         rim = RIM * (width + 1)  # before the first cell of a grid
         each = torch.arange(count, device=device).view(self.batch_size)
         self._origin = each * (rows * width) + rim
-        self._meaning, self._seen = _directions(width, device)
+        self._meaning, self._ahead, self._seen = _directions(width, device)
         self._first_view = self._view(self._place(levels.start), levels.direction)
 
     def _first(self) -> dict[str, Tensor]:
         return {
-            "view": self._first_view.clone(),
-            "direction": self._levels.direction.clone(),
-            "agent": self._levels.start.clone(),
+            "view": self._first_view,
+            "direction": self._levels.direction,
+            "agent": self._levels.start,
             "is_init": torch.ones(*self.batch_size, 1, dtype=torch.bool, device=self.device),
         }
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         agent, turn = tensordict.get("agent"), len(AHEAD) - 1
         does = torch.add(tensordict.get("action"), tensordict.get("direction"), alpha=turn)
-        meant = self._meaning.index_select(0, does.flatten()).view(*does.shape, 4)
-        direction, place = meant[..., 0], self._place(agent)
-        ahead = place + meant[..., 1]
-        there = self._objects.take(ahead)
-        moved = there != WALL
-        place = torch.where(moved, ahead, place)
+        place = self._place(agent)
+        there = self._objects.take(place + self._ahead.take(does))
+        does = does.add_(there == WALL, alpha=len(self._ahead))
+        does = self._meaning.index_select(0, does.flatten()).view(*does.shape, 4)
+        direction, place = does[..., 0], place + does[..., 1]
         terminated = (there == GOAL).unsqueeze(-1)
-        self._agent = torch.addcmul(agent, meant[..., 2:], moved.unsqueeze(-1))
+        self._agent = agent + does[..., 2:]
         ends = self._after(terminated, tensordict)
         reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
         return TensorDict(
@@ -134,15 +133,16 @@ class ViewMazeEnv(LevelEnv):
 
 
 @cache
-def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """What actions and directions mean in a line of grids of some width.
 
     Made once: from numbers of the host, which a recorded reset must not ask for.
 
     Returns:
-        Of each action in each direction, int64 [4 * 3, 4]: the direction after it, the change of
-        place if nothing is in the way, and the move; and the changes of place from the agent to the
-        cells that it sees, of each direction, int32 [4, 25].
+        Of each action in each direction, first if nothing is in the way and then if there is, int64
+        [2 * 3 * 4, 4]: the direction after it, the change of place, and the move; of the former the
+        changes of place alone, [3 * 4]; and the changes of place from the agent to the cells that
+        it sees, of each direction, int32 [4, 25].
     """
     ahead, none = torch.tensor(AHEAD), torch.zeros(len(AHEAD), 2, dtype=torch.int64)
     each = torch.arange(len(AHEAD))
@@ -153,6 +153,9 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
         torch.arange(VIEW) - AGENT[0], AGENT[1] - torch.arange(VIEW), indexing="ij"
     )
     seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
-    meaning = torch.cat([turned.view(-1, 1), cell_index(moves, width).unsqueeze(1), moves], 1)
+    free = torch.cat([turned.view(-1, 1), cell_index(moves, width).unsqueeze(1), moves], 1)
+    blocked = free * torch.tensor([1, 0, 0, 0])
+    changes, meaning = free[:, 1].contiguous(), torch.cat([free, blocked])
     # int32: half the memory to go through.
-    return meaning.to(device), cell_index(seen, width).flatten(1).int().to(device)
+    seen = cell_index(seen, width).flatten(1).int()
+    return meaning.to(device), changes.to(device), seen.to(device)
