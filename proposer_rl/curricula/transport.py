@@ -46,7 +46,8 @@ class TransportCurriculum(BinCurriculum):
         every: batches between two scoring passes.
         probes: levels of each bin.
         measure: of performance, ``"success"`` or ``"return"``.
-        exploration: part of each batch that is drawn uniformly.
+        exploration: part of each batch that is drawn uniformly while performance is below delta
+            in all bins of the target; then of the share of the target where it still is.
 
     Raises:
         ArgumentError: if there is not one share for each bin.
@@ -100,7 +101,9 @@ class TransportCurriculum(BinCurriculum):
     def shares(self) -> Tensor:
         """Of the bins in the next batch, float [K, N]."""
         share = self.scores["share"]
-        return (1 - self._exploration) * share + self._exploration / share.shape[-1]
+        ahead = torch.from_numpy(self._target) * (self.scores["performance"] < self._delta)
+        part = self._exploration * ahead.sum(-1, keepdim=True)
+        return (1 - part) * share + part / share.shape[-1]
 
     def log(self) -> dict[str, Any]:
         """Besides, how many bins are allowed, and how far off the target is, in W2."""

@@ -187,6 +187,19 @@ def test_where_all_fails_all_is_searched() -> None:
     assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [2] * 5
 
 
+def test_uniform_draws_end_where_the_target_is_reached() -> None:
+    task = Scripted(torch.tensor([[0.9, 0.6, 0.2, 0.1, 0.0]]), batch_size=100)
+    task.target_shares = torch.tensor([0.0, 0.0, 0.0, 0.75, 0.25])
+    found = curriculum(task, delta=0.5, epsilon=5.0, exploration=0.5)
+    # None of the target, three quarters of it, and all.
+    for skills, uniform in ([0.1, 0.0], 50), ([0.5, 0.0], 12.5), ([0.7, 0.5], 0):
+        task.skills[0, 3:] = torch.tensor(skills)
+        counts = step(found, task, 0)[0].bincount(minlength=5)
+        below = counts[task.skills[0] < 0.5].tolist()
+        assert below == [pytest.approx(uniform / 5, abs=1)] * len(below)
+    assert counts.tolist() == [0, 0, 0, 75, 25]
+
+
 def test_scoring_passes_are_counted() -> None:
     task = Scripted(torch.ones(1, 5))
     found = curriculum(task, every=3, probes=4)
