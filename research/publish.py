@@ -1,7 +1,7 @@
 """Finished runs as a study: a folder of a few tables, small enough for a repository.
 
-Checkpoints, pictures of levels and this machine's folders are left out. A study is read as runs
-are, by ``bin/report`` and ``bin/research pages``.
+Checkpoints, pictures of levels and this machine's folders are left out, and fractions have six
+significant digits. A study is read as runs are, by ``bin/report`` and ``bin/research pages``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from proposer_rl.cli.errors import command
@@ -141,12 +142,31 @@ def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
 
 
 def _light(run: Run) -> Run:
-    """A run without pictures, and without this machine's folders in what it says of itself."""
+    """A run without pictures, without this machine's folders, and of six significant digits."""
     facts = {name: value for name, value in run.facts.items() if name != "final"}
     facts["task"] = {name: value for name, value in facts["task"].items() if name != "samples"}
     reused = str(run.config.get("checkpoint") or "")
     config, facts = (_anywhere(value, reused) for value in (run.config, facts))
-    return replace(run, config=config, facts=facts, samples=(), sheets={})
+    return replace(
+        run,
+        config=config,
+        facts=facts,
+        metrics=run.metrics.map(_six_digits),
+        training=run.training.map(_six_digits),
+        cycles=[_six_digits(cycle) for cycle in run.cycles],
+        samples=(),
+        levels={name: np.array(_six_digits([*column])) for name, column in run.levels.items()},
+        sheets={},
+    )
+
+
+def _six_digits(value: Any) -> Any:
+    """A value with all fractions in it at six significant digits; whole numbers stay."""
+    if isinstance(value, float):
+        return value if value.is_integer() else float(f"{value:.6g}")
+    if isinstance(value, Mapping):
+        return {name: _six_digits(each) for name, each in value.items()}
+    return [_six_digits(each) for each in value] if isinstance(value, list) else value
 
 
 def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:

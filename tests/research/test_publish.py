@@ -42,9 +42,9 @@ def runs(tmp_path: Path) -> Path:
                 tmp_path / "runs" / f"{method}_{seed}",
                 method,
                 [seed],
-                [value - 0.01 * seed for value in curve],
+                [round(value - 0.01 * seed, 2) for value in curve],
                 cycles=cycles if method == "perf_gain" else (),
-                levels=[0.1 * seed, *curve[1:]],
+                levels=[seed / 10, *curve[1:]],
                 facts={"arguments": arguments, "overrides": [f"checkpoint={reused}"]},
                 checkpoint=reused,
             )
@@ -134,6 +134,19 @@ def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: P
     light = published(tmp_path / "runs", tmp_path / "light")
     found = [(row["run"], row["success"], row["return"]) for row in rows(light, "levels")]
     assert found == [("a", "0.5", ""), ("b", "", "0.4")]
+
+
+def test_fractions_have_six_digits_and_counts_all_of_theirs(tmp_path: Path) -> None:
+    long = 1_234_567.1234567
+    reached, cell = [0.0, 1 / 3, 1e-5 / 3], {"performance": [[1 / 3, long]], "updates": 12_345_678}
+    write_run(tmp_path / "runs" / "a", "plr", [0], reached, cycles=[cell], levels=reached)
+    light = published(tmp_path / "runs", tmp_path / "light")
+    expected = ["0", "0.333333", "3.33333e-06"]
+    assert [row["id_success"] for row in rows(light, "metrics")] == expected
+    assert [row["success"] for row in rows(light, "levels")] == 2 * expected
+    (found,) = rows(light, "cycles")
+    assert json.loads(found["performance"]) == [[0.333333, 1_234_570.0]]
+    assert json.loads(found["updates"]) == 12_345_678
 
 
 def test_a_study_is_added_to_and_its_runs_are_replaced(runs: Path, tmp_path: Path) -> None:
