@@ -18,6 +18,7 @@ from proposer_rl.curricula import Batch, Curriculum, SamplingCurriculum, Student
 from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
+from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import TINY
 
 # Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
@@ -28,6 +29,7 @@ SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5", "task.evaluation.level
 QUIET = ["+scale=smoke", *FEW, *SHORT, "task.network.channels=[8,8]"]
 SEEDS = ["+method=target", "seeds=[0,1]", *QUIET]
 FITTED = ["curriculum.warmup=4", "curriculum.refit=4", "curriculum.components=2"]
+NORMALIZED = [f"solver.ppo.normalize_{name}=true" for name in ("observations", "rewards")]
 CALLED = {
     "plr": ["+method=plr", *QUIET],
     "perf_gain": ["+method=perf_gain", *QUIET, *CYCLE],
@@ -36,6 +38,7 @@ CALLED = {
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
+    "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
 }
 
@@ -72,6 +75,17 @@ def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> No
     assert said == "", said
     updates = read_csv(tmp_path / "metrics.csv")[-1]["updates"]
     assert updates == (2 if CYCLE[0] in CALLED[name] else 3)
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed_there(run_there: Run, tmp_path: Path) -> None:
+    """In the middle of episodes: levels, memories and gradients come from a checkpoint."""
+    given = ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED]
+    given += ["task.network.memory=4"]
+    assert run_there(tmp_path / "resumed", *given) == ""
+    for folder in ("resumed", "whole"):
+        assert run_there(tmp_path / folder, *given, "schedule.updates=6") == ""
+    assert_same_run(tmp_path / "resumed", tmp_path / "whole")
 
 
 @pytest.mark.slow

@@ -36,11 +36,13 @@ QUIET = ["compute.progress=false", "compute.device=cuda"]
 COMPILED = "compute.compile=true"
 SMOKE = ["+scale=smoke", *QUIET]
 METHODS = sorted(file.stem for file in (CONFIG_FOLDER / "method").glob("*.yaml"))
+NORMALIZED = [f"solver.ppo.normalize_{name}=true" for name in ("observations", "rewards")]
 TASKS = {
     "maze": SMOKE,
     "bf16": [*SMOKE, "precision=bf16"],
     "view_maze": ["task=view_maze_smoke", *QUIET, "schedule.updates=4"],
     "cartpole": ["task=cartpole", *TINY, *QUIET],
+    "cartpole_normalized": ["task=cartpole", *TINY, *QUIET, *NORMALIZED],
     "cartpole_memory": ["task=cartpole", *TINY, *QUIET, "task.network.memory=8"],
     "lunar_lander": ["task=lunar_lander", *TINY, *QUIET],
     "minigrid": ["task=minigrid", *TINY, *QUIET],

@@ -20,7 +20,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, pad
 from torch import Tensor
 
-from proposer_rl.curricula.batches import of_kind, packed
+from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
 from proposer_rl.curricula.contract import Batch, Curriculum, outcome_of
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, Update
@@ -174,14 +174,17 @@ class ContinuedLevels:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it: episodes that are not over are played again up to where they were."""
-        shape = self._steps.shape
+        """Go on with it: episodes that are not over are played again up to where they were.
+
+        Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
+        """
+        shape, device = self._steps.shape, self._learner.env.device
         self._proposed, self._most = state["proposed"], state["most"]
         self._waiting = [deque(map(tuple, waiting)) for waiting in state["waiting"]]
-        self._levels = of_kind(self._levels, state["levels"], shape)
+        self._levels = _of_kind(self._levels, state["levels"], shape)
         self._playing, self._steps = state["playing"].clone(), state["steps"].clone()
         self._batches = {
-            number: _Outstanding.of_state(each, self._levels)
+            number: _Outstanding.of_state(each, self._levels, device)
             for number, each in state["batches"].items()
         }
         self._history = self._shown = None
@@ -189,17 +192,19 @@ class ContinuedLevels:
             levels, episodes = state["shown"]
             size = episodes["action"].shape[:3]
             self._shown = (
-                of_kind(self._levels, levels, size[:2]),
-                TensorDict.from_dict(episodes, batch_size=size),
+                _of_kind(self._levels, levels, size[:2]),
+                TensorDict.from_dict(episodes, batch_size=size).to(device),
             )
         if state["history"] is not None:
             length = state["history"]["action"].shape[2]
-            self._history = TensorDict.from_dict(state["history"], batch_size=[*shape, length])
+            history = TensorDict.from_dict(state["history"], batch_size=[*shape, length])
+            self._history = history.to(device)
             self._episodes.stand(self._levels, self._history["action"], self._steps)
         if state["discounted"] is not None:
-            self._learner.statistics.discounted = state["discounted"].clone()
+            self._learner.statistics.discounted = state["discounted"].clone().to(device)
         if state["memory"] is not None:
-            self._learner.collector.memory = TensorDict.from_dict(state["memory"], batch_size=shape)
+            memory = TensorDict.from_dict(state["memory"], batch_size=shape)
+            self._learner.collector.memory = memory.to(device)
 
 
 class _Outstanding:
@@ -262,33 +267,41 @@ class _Outstanding:
         }
 
     @classmethod
-    def of_state(cls, state: Mapping[str, Any], like: Levels) -> _Outstanding:
-        """What :meth:`state_dict` returned, with levels of a kind."""
+    def of_state(
+        cls, state: Mapping[str, Any], like: Levels, device: torch.device | None
+    ) -> _Outstanding:
+        """What :meth:`state_dict` returned, with levels of a kind and episodes on a device."""
         shape = state["state"].shape
-        levels = of_kind(like, state["levels"], shape)
+        levels = _of_kind(like, state["levels"], shape)
         places = state["places"]
         kept = levels if places is None else levels[:, places]
         notes = TensorDict.from_dict(state["notes"], batch_size=kept.shape[:2])
         each = cls(levels, Batch(kept, notes))
         each.state, each._places = state["state"].clone(), places
         each._played = {
-            (copy, place): TensorDict.from_dict(episode, batch_size=[len(episode["action"])])
+            (copy, place): TensorDict.from_dict(
+                episode, batch_size=[len(episode["action"])]
+            ).to(device)
             for copy, place, episode in state["played"]
         }
         return each
 
 
+def _of_kind(like: Levels, state: Mapping[str, Any], shape: Sequence[int]) -> Levels:
+    """Levels as others are, and where they are."""
+    return moved(of_kind(like, state, shape), device_of(like))
+
+
 def outcome_of_episodes(episodes: Sequence[Sequence[TensorDictBase]]) -> TensorDict:
     """What came of levels [K, m] from the one episode [T] on each of them.
 
-    They are filled up with zeros to one rollout [K, m, T]: steps of an episode that does not end,
-    which no score counts.
+    They are filled up with zeros to one rollout [K, m, T], whose ``is_step`` says what is played.
     """
-    steps = torch.tensor([[len(episode) for episode in row] for row in episodes])
-    longest = int(steps.max())
-    rows: list[Any] = [
-        torch.stack([pad(episode, [0, longest - len(episode)]) for episode in row])
-        for row in episodes
-    ]
-    outcome = outcome_of(torch.stack(rows))
-    return outcome.set("steps", steps.to(outcome["steps"]))
+    longest = max(len(episode) for row in episodes for episode in row)
+
+    def filled_up(episode: TensorDictBase) -> Any:
+        played = torch.ones(len(episode), dtype=torch.bool, device=episode["action"].device)
+        return pad(episode.copy().set("is_step", played), [0, longest - len(episode)])
+
+    rows: list[Any] = [torch.stack([filled_up(each) for each in row]) for row in episodes]
+    return outcome_of(torch.stack(rows))

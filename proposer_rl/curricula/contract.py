@@ -83,7 +83,8 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
       loop has played there;
     - ``success`` float in [0, 1], where there is such a thing: likewise;
     - ``episodes`` and ``steps`` int64: how many episodes ended, and how long all of it was;
-    - ``rollout`` [K, n, T], where there is one, with ``state_value`` where there is a critic;
+    - ``rollout`` [K, n, T], where there is one, with ``state_value`` where there is a critic, and
+      ``is_step`` bool [K, n, T] where episodes are filled up to one length;
     - ``score`` float, where the loop itself says how much there is to learn on a level.
 
     Curricula without a use for an entry do not ask for it; ``return`` must be there.
@@ -95,7 +96,7 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
             "return": first_episode_return(rollout),
             "success": first_episode_success(rollout).float(),
             "episodes": episodes,
-            "steps": torch.full_like(episodes, done.shape[-1]),
+            "steps": rollout.get("is_step", torch.ones_like(done)).sum(-1),
             "rollout": rollout,
         },
         rollout.batch_size[:-1],

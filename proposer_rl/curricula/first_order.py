@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of, fresh_levels
+from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.probes import Measure as Outcome
@@ -167,7 +167,6 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         self._probes = Probes(space, probes, measure)
         self._direction: dict[str, Tensor] = {}
         self._gradient: dict[str, Tensor] = {}  # of what came in since the last scoring pass
-        self._device = device_of(space.sample(1, torch.Generator()))
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Move the direction by the gradient of what came in, and the interim target."""
@@ -183,7 +182,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
             new, self._gradient = scaled(self._gradient), {}
             kept = self.smoothing if self._direction else 0.0
             before = self._direction or new
-            self._direction = {k: kept * before[k] + (1 - kept) * new[k] for k in new}
+            self._direction = {k: kept * before[k].to(v) + (1 - kept) * v for k, v in new.items()}
 
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
@@ -197,7 +196,10 @@ class SampledFirstOrderCurriculum(_AlignedBins):
             raise ValueError("alignment: the outcome has no rollout")
         rollout, weights = outcome["rollout"], self.scores["interim"].gather(1, batch.notes["bins"])
         new = student.sampled_direction(rollout, weights)
-        before = self._gradient
+        # A checkpoint's tensors are on the CPU.
+        before, self._direction = (
+            {k: v.to(new[k]) for k, v in kept.items()} for kept in (self._gradient, self._direction)
+        )
         self._gradient = {k: before[k] + v if before else v for k, v in new.items()}
         if not self._direction:
             return {}
@@ -208,8 +210,12 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         """Score the bins that were trained on."""
         aligned, score = evidence["slope"], self.scores["score"]
         if "drift" in evidence.keys():
-            mean, square = (evidence[key].mean(-1, keepdim=True) for key in ("advantage", "square"))
-            count = evidence["steps"].sum(-1, keepdim=True)
+            steps = evidence["steps"]
+            count = steps.sum(-1, keepdim=True)
+            mean, square = (
+                (evidence[key] * steps).sum(-1, keepdim=True) / count
+                for key in ("advantage", "square")
+            )
             variance = (square - mean.square()).clamp_min(0) * count / (count - 1).clamp_min(1)
             spread = variance.sqrt().clamp_min(1e-6)
             aligned = (aligned - mean * evidence["drift"]) / spread
@@ -221,10 +227,3 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         """Of the bins in the next batch, float [K, N]."""
         shares = super().shares()
         return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the gradients, on the device: a checkpoint's tensors are on the CPU."""
-        super().load_state_dict(state)
-        for name in ("_direction", "_gradient"):
-            kept = getattr(self, name)
-            setattr(self, name, {k: v.to(self._device) for k, v in kept.items()})

@@ -26,6 +26,7 @@ from proposer_rl.meta.first_order import (
     exact_direction,
     in_adams_units,
     log_probabilities,
+    over_steps,
     surrogate,
 )
 from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
@@ -275,13 +276,15 @@ class TaskStudent(Student):
 
         def gained() -> Tensor:
             log_prob = log_probabilities(agent, rollout).double()
-            return torch.stack([(advantage * log_prob).mean(-1), log_prob.mean(-1)], -1)
+            each = advantage * log_prob, log_prob
+            return torch.stack([over_steps(values, rollout) for values in each], -1)
 
         slopes = alignment(agent, direction, self._learner.settings.learning_rate, gained)
         parts = {"slope": slopes[..., 0]}
         if self._learner.settings.normalize_advantage:
             parts["drift"] = slopes[..., 1]
-            parts |= {"advantage": advantage.mean(-1), "square": advantage.square().mean(-1)}
+            for name, values in {"advantage": advantage, "square": advantage.square()}.items():
+                parts[name] = over_steps(values, rollout)
         return TensorDict(parts, slopes.shape[:2])
 
     def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:

@@ -58,9 +58,8 @@ class Statistics:
                 )
         agent.normalization = None
         if shapes or settings.normalize_rewards:
-            agent.normalization = Normalization(
-                agent.copies, shapes, rewards=settings.normalize_rewards
-            )
+            numbers = Normalization(agent.copies, shapes, rewards=settings.normalize_rewards)
+            agent.normalization = numbers.to(next(agent.parameters()).device)
 
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
         """Take in the rewards of a rollout [*B, T], and put its values into their unit.

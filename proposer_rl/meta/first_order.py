@@ -241,7 +241,19 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
         rollout: what they played, [K, P, T].
         advantage: of every step, float [K, P, T].
     """
-    return (advantage * log_probabilities(agent, rollout)).mean(-1)
+    return over_steps(advantage * log_probabilities(agent, rollout), rollout)
+
+
+def over_steps(values: Tensor, rollout: TensorDictBase) -> Tensor:
+    """Mean over the steps of each problem, float [K, P], of values [K, P, T].
+
+    Episodes of several lengths are filled up to one rollout; its ``is_step``, bool [K, P, T], says
+    what is played. Without it all is.
+    """
+    if "is_step" not in rollout.keys():
+        return values.mean(-1)
+    played = rollout["is_step"]
+    return values.where(played, 0).sum(-1) / played.sum(-1)
 
 
 def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from proposer_rl.curricula import Student
 from proposer_rl.curricula.student import VALUE, advantages
-from proposer_rl.meta.first_order import Direction, alignment
+from proposer_rl.meta.first_order import Direction, alignment, over_steps
 from proposer_rl.settings import ArgumentError
 
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
@@ -88,7 +88,8 @@ class ActorStudent(Student):
         advantage = self._advantage(rollout)
         parameters = dict(self._actor.named_parameters())
         with torch.enable_grad():
-            gained = (advantage * self._log_prob(rollout)).mean(-1) * weights.to(advantage)
+            gained = over_steps(advantage * self._log_prob(rollout), rollout)
+            gained = gained * weights.to(advantage)
             gradients = torch.autograd.grad(gained.sum(), list(parameters.values()))
         return {  # of one student
             name: (gradient / self._scale(parameter)).unsqueeze(0)
@@ -99,7 +100,7 @@ class ActorStudent(Student):
         advantage = self._advantage(rollout)
 
         def gained() -> Tensor:
-            return (advantage * self._log_prob(rollout)).mean(-1)
+            return over_steps(advantage * self._log_prob(rollout), rollout)
 
         step = self._optimizer.param_groups[0]["lr"]
         own = {name: entry[0] for name, entry in direction.items()}

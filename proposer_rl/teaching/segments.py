@@ -35,7 +35,7 @@ class Segments:
 
         Returns:
             Their levels' numbers [m], and a rollout [1, m, L] of whole episodes; what is behind the
-            end of each is no step: it has no reward and no end.
+            end of each is no step, as ``is_step`` says: it has no reward and no end.
 
         Raises:
             ArgumentError: if it does not say which levels it is of, or other environments'.
@@ -52,7 +52,9 @@ class Segments:
             raise ArgumentError(
                 f"rollout: of {len(rows)} environments, but the last one was of {len(kept)}"
             )
-        joined: Any = rows if kept is None else torch.cat([kept, rows], 1)
+        joined: Any = rows  # a checkpoint's tensors are on the CPU
+        if kept is not None:
+            joined = torch.cat([kept.to(rows[LEVEL_ID].device), rows], 1)
         known = 0 if kept is None else kept.shape[1]
         ids = joined[LEVEL_ID].reshape(joined.shape)
         done = joined["next", "done"].reshape(joined.shape)
@@ -73,6 +75,7 @@ class Segments:
         for name in set(ENDS) & set(after.keys()):
             after[name] = after[name] & inside
         after["reward"] = after["reward"] * inside
+        episodes["is_step"] = inside.squeeze(-1).unsqueeze(0)
         episodes.names = [None, None, "time"]
         return ids[row, end].cpu().numpy(), episodes
 

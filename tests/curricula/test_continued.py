@@ -21,7 +21,7 @@ from proposer_rl.curricula import (
     TaskStudent,
 )
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.curricula.continued import ContinuedLevels, outcome_of_episodes
 from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning.rollout import RolloutCollector
 from proposer_rl.learning.settings import PPOSettings, SolverSettings
@@ -127,6 +127,36 @@ def test_each_episode_is_credited_to_its_level() -> None:
     # In the order of the proposals, whatever the order in which they have come in.
     numbers = [int(part["number"][0, 0]) for part in curriculum.inbox.take()]
     assert numbers == sorted(numbers)
+
+
+def test_what_an_episode_gives_does_not_depend_on_those_beside_it() -> None:
+    """Episodes of several lengths are filled up to one rollout; what fills them counts nowhere."""
+    learner = TASK.learner([Streams(0)])
+    student = TaskStudent(TASK, learner)
+    levels, draws = TASK.evaluated_on["target"][: 2 * P].unsqueeze(0), torch.Generator()
+    whole = torch.cat([student.play(some, [draws]) for some in levels.split(P, 1)], 1)
+    ends = whole["next", "done"][0].squeeze(-1).long().argmax(-1) + 1
+    episodes = [whole[0, place, :end].clone() for place, end in enumerate(ends.tolist())]
+    assert len({*ends.tolist()}) > 1
+    together = outcome_of_episodes([episodes])
+    alone = [outcome_of_episodes([[episode]]) for episode in episodes]
+    assert together["steps"].tolist() == [ends.tolist()]
+    weights = torch.rand(1, 2 * P, generator=torch.Generator().manual_seed(1))
+    direction = student.sampled_direction(together["rollout"], weights)
+    each = [
+        student.sampled_direction(outcome["rollout"], weights[:, [place]])
+        for place, outcome in enumerate(alone)
+    ]
+    for name, entry in direction.items():
+        torch.testing.assert_close(entry, torch.stack([d[name] for d in each]).sum(0))
+    found = student.sampled_alignment(direction, together["rollout"])
+    parts = [student.sampled_alignment(direction, outcome["rollout"]) for outcome in alone]
+    for key in ("slope", "drift", "advantage", "square"):
+        expected = torch.cat([part[key] for part in parts], 1)
+        torch.testing.assert_close(found[key], expected, rtol=1e-4, atol=1e-3)
+    norms = [student.policy_gradient_norms(outcome["rollout"]) for outcome in alone]
+    found_norms = student.policy_gradient_norms(together["rollout"])
+    torch.testing.assert_close(found_norms, torch.cat(norms, 1), rtol=1e-4, atol=1e-5)
 
 
 def test_rollouts_go_on_where_the_last_one_ended() -> None:

@@ -13,6 +13,7 @@ from torch.distributions import Categorical
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 import proposer_rl as prl
+from proposer_rl.teaching.segments import Segments
 
 SPACE = prl.Parameters({"arm": [0, 1]}, target={"arm": 1})
 
@@ -97,3 +98,28 @@ def test_first_order_gain_finds_the_levels_of_the_target() -> None:
         rollout = play(actor, levels, torch.Generator().manual_seed(update))
         teacher.observe(prl.outcome_of(rollout))
     assert sum(share[4:]) / 4 > 0.8
+
+
+def test_what_lies_behind_an_episode_counts_nowhere() -> None:
+    """Of episodes cut out of a rollout: those of other lengths beside it change nothing."""
+    taught, _, _ = student(adam=False)
+    draws = torch.Generator().manual_seed(3)
+    over = torch.tensor([[0, 1, 0, 0, 0, 1], [0, 0, 0, 1, 0, 1]]).bool().unsqueeze(-1)
+    numbers = torch.tensor([[1, 1, 2, 2, 2, 2], [3, 3, 3, 3, 4, 4]])
+    seen = torch.randn(2, 7, 2, generator=draws)
+    after = {"observation": seen[:, 1:], "reward": torch.randn(2, 6, 1, generator=draws)}
+    after |= {"done": over, "terminated": over}
+    entries = {"observation": seen[:, :-1], "next": after, "level_id": numbers}
+    entries["action"] = torch.randint(2, (2, 6), generator=draws)
+    rollout = TensorDict(entries, [2, 6], names=[None, "time"])
+    ids, together = Segments().ended(rollout)
+    cuts = {1: rollout[:1, :2], 2: rollout[:1, 2:], 3: rollout[1:, :4], 4: rollout[1:, 4:]}
+    alone = [cuts[number].unsqueeze(0) for number in ids.tolist()]
+    assert prl.outcome_of(together)["steps"].tolist() == [[e.batch_size[-1] for e in alone]]
+    direction = taught.sampled_direction(together, torch.ones(1, 4))
+    each = [taught.sampled_direction(episode, torch.ones(1, 1)) for episode in alone]
+    for name, entry in direction.items():
+        torch.testing.assert_close(entry, torch.stack([d[name] for d in each]).sum(0))
+    slopes = [taught.sampled_alignment(direction, episode)["slope"] for episode in alone]
+    found = taught.sampled_alignment(direction, together)["slope"]
+    torch.testing.assert_close(found, torch.cat(slopes, 1), rtol=1e-3, atol=1e-3)
