@@ -121,11 +121,14 @@ class Modelled(Combinator):
         }
 
     def _take_in(self) -> None:
-        for evidence in self._inbox.take():
-            outcome = {name: evidence[name] for name in evidence.keys()}
-            label = self._model.labels(outcome)
-            self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
-            self._model.add(evidence["features"], outcome)
+        """Take in what came back since the last proposal, of whichever batches: it has one age."""
+        if not (taken := self._inbox.take()):
+            return
+        evidence: Any = torch.cat(taken, 1)
+        outcome = {name: evidence[name] for name in evidence.keys()}
+        label = self._model.labels(outcome)
+        self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
+        self._model.add(evidence["features"], outcome)
 
     def _predict(self, levels: Levels) -> TensorDict:
         return self._model.predict(self._phi(levels))
