@@ -358,10 +358,19 @@ def paired(
     """Train on the draws of a policy that is rewarded for the regret against a second Solver.
 
     The arguments are those of :func:`first_order_proposer`.
+
+    Raises:
+        ArgumentError: where episodes go on from update to update.
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
     task, stream = components.task, Streams(components.seeds[0], "antagonist")
-    antagonist = TaskStudent(task, task.learner([stream]))
+    second = task.learner([stream])
+    if second.settings.continue_episodes:
+        raise ArgumentError(
+            "continue_episodes=True: the second Solver trains on whole levels, an update for each "
+            "of the first one's; give False"
+        )
+    antagonist = TaskStudent(task, second)
     probes = components.proposer.probe_levels
     return PairedProposer(*policy, probe_levels=probes, antagonist=antagonist)
 

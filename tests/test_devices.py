@@ -81,7 +81,7 @@ def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> No
 def test_a_run_is_resumed_there(run_there: Run, tmp_path: Path) -> None:
     """In the middle of episodes: levels, memories and gradients come from a checkpoint."""
     given = ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED]
-    given += ["task.network.memory=4"]
+    given += ["task.network.memory=4", "solver.ppo.anneal_updates=6"]
     assert run_there(tmp_path / "resumed", *given) == ""
     for folder in ("resumed", "whole"):
         assert run_there(tmp_path / folder, *given, "schedule.updates=6") == ""

@@ -12,6 +12,7 @@ from signal import SIG_DFL, SIGTERM, signal
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase
 
 from proposer_rl.curricula import (
     Advance,
@@ -19,39 +20,45 @@ from proposer_rl.curricula import (
     Curriculum,
     Improvement,
     LearnedCurriculum,
+    LearningProgressCurriculum,
     SamplingCurriculum,
+    Student,
     TaskStudent,
     UnfitStudentError,
     outcome_of,
 )
 from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.streams import Streams
+from proposer_rl.task import NoSuccessError, Task
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
 from tests.same_run import assert_same_run
 from tests.stops import StopAt
+from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import TASK, mountain_cars
 
 LENGTHS = {"updates": 5, "cycle_length": 2, "evaluate_every": 2, "checkpoint_every": 3}
 P, T = 4, 8
 
 
-def learner(*seeds: int) -> PPO:
-    return TASK.learner([Streams(seed, "solver") for seed in seeds])
+def learner(*seeds: int, task: Task = TASK) -> PPO:
+    return task.learner([Streams(seed, "solver") for seed in seeds])
 
 
 def experiment(
-    path: Path, *seeds: int, curriculum: Curriculum | None = None, **options
+    path: Path, *seeds: int, curriculum: Curriculum | None = None, task: Task = TASK, **options
 ) -> Experiment:
     lengths = {key: options.pop(key) for key in list(options) if hasattr(ScheduleSettings, key)}
+    lengths = {"headline": task.metrics[0], **lengths}
     return Experiment(
-        TASK,
-        learner(*seeds),
-        curriculum or SamplingCurriculum(TASK.target),
+        task,
+        learner(*seeds, task=task),
+        curriculum or SamplingCurriculum(task.target),
         schedule=ScheduleSettings(**{"threshold": 0.1, **LENGTHS, **lengths}),
         seeds=seeds,
         folder=RunFolder(path),
@@ -181,6 +188,36 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
             folder=RunFolder(tmp_path / "run"),
         )
     assert not list((tmp_path / "run").iterdir())
+
+
+class Told(SamplingCurriculum):
+    """Keeps the returns that it is told."""
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        self.returns = [*getattr(self, "returns", []), *outcome["return"].flatten().tolist()]
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_outcomes_are_told_without_the_scale_of_the_rewards(goes_on: bool, tmp_path: Path) -> None:
+    found = []
+    for scale in (1.0, 0.01):
+        ppo = PPOSettings(horizon=16, epochs=1, continue_episodes=goes_on)
+        task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo), reward_scale=scale)
+        curriculum = Told(task.target)
+        folder = tmp_path / str(scale)
+        experiment(folder, 0, curriculum=curriculum, task=task, updates=1).run()
+        found.append(curriculum.returns)
+    assert found[1] == pytest.approx(found[0], rel=1e-5) and max(map(abs, found[0])) > 0.1
+
+
+def test_success_of_a_task_that_has_none_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TASK, "results", ("return",))
+    reader = LearningProgressCurriculum(TASK.space, source="episodes")
+    with pytest.raises(NoSuccessError, match="LearningProgressCurriculum: reads success"):
+        experiment(tmp_path, 0, curriculum=reader, headline="id_return", threshold=-0.1)
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> None:

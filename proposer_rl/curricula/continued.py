@@ -279,9 +279,9 @@ class _Outstanding:
         each = cls(levels, Batch(kept, notes))
         each.state, each._places = state["state"].clone(), places
         each._played = {
-            (copy, place): TensorDict.from_dict(
-                episode, batch_size=[len(episode["action"])]
-            ).to(device)
+            (copy, place): TensorDict.from_dict(episode, batch_size=[len(episode["action"])]).to(
+                device
+            )
             for copy, place, episode in state["played"]
         }
         return each

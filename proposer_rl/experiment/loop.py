@@ -30,7 +30,7 @@ from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
 from proposer_rl.settings import NotNegative, settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import NoSuccessError, Task
 
 
 @settings
@@ -64,6 +64,7 @@ class Experiment:
 
     Raises:
         UnfitStudentError: if the task does not allow what the curriculum needs.
+        NoSuccessError: if the curriculum reads success and the task has none.
         ValueError: if the headline is none of the task's metrics.
     """
 
@@ -86,6 +87,11 @@ class Experiment:
         self.learner = learner
         self.student = TaskStudent(task, learner)
         require(self.student, curriculum.needs, type(curriculum).__name__)
+        if "success" in curriculum.reads and "success" not in task.results:
+            raise NoSuccessError(
+                f"{type(curriculum).__name__}: reads success of episodes, and this task tells "
+                "none, only the return"
+            )
         self.curriculum = curriculum
         self._continued: ContinuedLevels | None = None
         if learner.settings.continue_episodes:
@@ -248,8 +254,9 @@ class Experiment:
             self.learner.check()
             credits = [(batch, outcome_of(update.rollout))]
             played = batch.levels, update.rollout
-        for credit in credits:
-            self.curriculum.observe(self.student, *credit)
+        for batch, outcome in credits:
+            unscaled = outcome["return"] / self.task.reward_scale  # as performance is told
+            self.curriculum.observe(self.student, batch, outcome.set("return", unscaled))
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:

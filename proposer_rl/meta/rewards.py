@@ -69,7 +69,8 @@ def log_success_gain(step: TrainingStep) -> Tensor:
 def task_difficulty(step: TrainingStep) -> Tensor:
     """One minus the success rate on the levels just proposed (the paper's ablation).
 
-    The rate is that of the Solver's own training episodes, the first on every level.
+    The rate is that of the Solver's own training episodes, the first on every level. Where episodes
+    go on from update to update, the first to end may have begun on a level of the update before.
     """
     return 1.0 - first_episode_success(step.rollout).float().mean(1)
 

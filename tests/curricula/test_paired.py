@@ -5,9 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
+from proposer_rl import methods
+from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.methods import Components
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.curricula.living import live, solvers, student
 from tests.curricula.made import filtered, paired
+from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import TASK, evaluate
 
 P, T = 4, 8
@@ -51,3 +57,11 @@ def test_the_antagonist_trains_on_the_same_levels_with_its_own_chance() -> None:
 def test_it_learns_from_one_solver() -> None:
     with pytest.raises(ValueError, match="learns from one Solver, got 2"):
         live(paired(), solvers([0, 1]), [0, 1], range(1))
+
+
+def test_it_has_no_second_solver_whose_episodes_go_on() -> None:
+    ppo = PPOSettings(horizon=8, continue_episodes=True)
+    task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))
+    components = Components(task, ProposerSettings(), [0])
+    with pytest.raises(ArgumentError, match=r"^continue_episodes=True: the second Solver"):
+        methods.paired(components, 1, 1e-3, 0.1)
