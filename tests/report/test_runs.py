@@ -38,6 +38,13 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert np.isnan(run.mean_until("id_success", 30))
 
 
+def test_a_mean_in_float32_reaches_what_it_is(tmp_path: Path) -> None:
+    solved = float(np.mean([1] * 18 + [0] * 2, dtype=np.float32))
+    assert solved < 18 / 20
+    (run,) = read_run(write_run(tmp_path / "a", curve=[0.0, 0.5, solved]))
+    assert run.reached("id_success", 18 / 20) == 20 and np.isnan(run.reached("id_success", 0.9001))
+
+
 def test_seeds_trained_together_share_the_time(tmp_path: Path) -> None:
     found = read_run(write_run(tmp_path / "a", seeds=[4, 7]))
     assert [run.seed for run in found] == [4, 7]
