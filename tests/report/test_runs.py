@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from proposer_rl.report import reading
+from proposer_rl.report.pictures import draw_run
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means
@@ -232,6 +233,22 @@ def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(reading, "LARGEST_FILE", 100)
     with pytest.raises(UnreadableRun, match="is larger than"):
         read_run(folder)
+
+
+def test_a_run_with_too_many_pictures_is_read_without_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_run(tmp_path / "run", levels=[0.5, 0.9])
+    (before,) = read_run(folder)
+    pictures = folder / "curriculum.jsonl"
+    pictures.write_bytes(pictures.read_bytes() * 50)
+    others = [path.stat().st_size for path in folder.iterdir() if path != pictures]
+    monkeypatch.setattr(reading, "LARGEST_FILE", max(others))
+    (run,) = read_run(folder)
+    assert before.samples and not run.samples
+    assert run.metrics.equals(before.metrics) and run.training.equals(before.training)
+    assert run.finished and [v.tolist() for v in run.levels.values()] == [[0.5, 0.9]] * 2
+    assert draw_run(folder, "x").is_file()
 
 
 def test_a_share_is_never_more_than_all(tmp_path: Path) -> None:
