@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from proposer_rl.cli.arguments import check_file
 from proposer_rl.cli.errors import ConfigError, command
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 
@@ -58,15 +59,11 @@ def answer(
 
 
 def _answer(options: argparse.Namespace, measure: Any, show: Any) -> None:
-    file: Path | None = options.output
-    if file is not None and file.suffix != ".json":
-        raise ConfigError(f"--output {file}: must end in .json")
-    if file is not None and not file.parent.is_dir():
-        raise ConfigError(f"--output {file}: there is no folder {file.parent}")
+    check_file("output", options.output, ".json")
     try:
         rows: Rows = measure(options)
     except (ValueError, TypeError) as error:
         raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
     for run in dict.fromkeys(row["run"] for row in rows):
         Console().print(show(run, [row for row in rows if row["run"] == run]))
-    write_rows(rows, file)
+    write_rows(rows, options.output)

@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 from tqdm import tqdm
 
+from proposer_rl.cli.arguments import check_file
 from proposer_rl.cli.errors import ConfigError, command
 from proposer_rl.cli.evaluate import Evaluation, evaluate, load
 from proposer_rl.report.reading import find_runs
@@ -95,10 +96,7 @@ def _check(names: Sequence[str], output: Path | None) -> None:
                 f"--levels {stored:.80}: must be of one line, of at most {LONGEST_NAME} printable "
                 "characters"
             )
-    if output is not None and output.suffix != ".csv":
-        raise ConfigError(f"--output {output}: must end in .csv")
-    if output is not None and not output.parent.is_dir():
-        raise ConfigError(f"--output {output}: there is no folder {output.parent}")
+    check_file("output", output, ".csv")
 
 
 def _stored(output: Path | None) -> list[Score]:

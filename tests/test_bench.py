@@ -170,6 +170,10 @@ def test_what_was_trained_before_is_not_trained_again(tmp_path: Path) -> None:
         for seed in (7, 8)
     ]
     write_rows(file, rows[:3])
+    assert file.read_text().splitlines()[:2] == [
+        "code,environment,seed,frames,cpu_seconds,mean_return,least_return",
+        "proposer_rl,CartPole-v1,7,500,2.0,407.0,300.0",
+    ]
     result = measure("gymnasium", options)
     assert read_rows(file)[:3] == rows[:3] and len(read_rows(file)) == 4
     assert result.tables[0].lines[0][:6] == ["CartPole-v1", "proposer_rl", "2", "500", "407.5 ± 0.7", "407.0"]  # fmt: skip  # noqa: E501

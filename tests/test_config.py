@@ -580,9 +580,9 @@ def test_a_stored_configuration_instantiates_nothing(finished: Path, train, caps
 
 def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> None:
     Path("run").mkdir()
-    Path("run/years.csv").write_text("year\n1\n")
-    assert "holds years.csv but no config.json" in refused(train, capsys)
-    assert Path("run/years.csv").read_text() == "year\n1\n"
+    Path("run/training.csv").write_text("year\n1\n")
+    assert "holds training.csv but no config.json" in refused(train, capsys)
+    assert Path("run/training.csv").read_text() == "year\n1\n"
 
 
 def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from proposer_rl.cli.eval import main
-from proposer_rl.cli.evaluate import SHOWN
+from proposer_rl.cli.evaluate import SHOWN, Evaluation, _print, _sheet
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
+from proposer_rl.task import LevelResult
 from proposer_rl.tasks.mazes.level_files import shipped_levels
 from tests.commands import trained_pair
 
@@ -57,6 +62,26 @@ def test_a_distribution_gives_the_runs_own_measurements(
     assert {(row["max_steps"], row["height"], row["updates"]) for row in rows} == {(10, 5, 6)}
     assert f"the {SHOWN} hardest of 40 levels" in said and "mean of 40" in said
     assert "Means over the seeds" in " ".join(said.split())
+
+
+def test_the_hardest_levels_are_so_for_all_solvers_together(tmp_path: Path, capsys) -> None:
+    results = []
+    for number in range(SHOWN + 4):  # four that only the second Solver fails at, wholly
+        for solver, success in enumerate((1.0, 0.0) if number < 4 else (0.9, 1.0)):
+            values = {"success": success, "return": success}
+            results.append(LevelResult(f"<{number}>", solver, {}, values, "", picture))
+    run = SimpleNamespace(folder=tmp_path, config=SimpleNamespace(seeds=[0, 1]))
+    evaluation = Evaluation(run, 5, "id", results)
+    _print(evaluation)
+    said = capsys.readouterr().out
+    assert f"{SHOWN} hardest of {SHOWN + 4} levels" in " ".join(said.split())
+    shown = [int(number) for number in re.findall(r"<(\d+)>", said)]
+    assert shown == list(range(SHOWN))  # in their order
+    assert _sheet(evaluation).startswith(b"\x89PNG")
+
+
+def picture() -> NDArray[np.uint8]:
+    return np.zeros((2, 2, 3), np.uint8)
 
 
 @pytest.mark.slow

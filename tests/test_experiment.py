@@ -364,7 +364,8 @@ def test_a_threshold_is_reached_by_being_met(tmp_path: Path) -> None:
     best = max(rows, key=lambda row: row["id_success"])  # the first of equals
     for name, threshold, reached in (
         ("met", best["id_success"], best["updates"]),
-        ("above", np.nextafter(best["id_success"], 2), None),
+        ("rounded", np.nextafter(np.float32(best["id_success"]), 2), best["updates"]),
+        ("above", best["id_success"] + 1e-4, None),
     ):
         run = experiment(tmp_path / name, 7, threshold=float(threshold))
         assert _rows(run) == rows

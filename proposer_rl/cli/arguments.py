@@ -1,4 +1,4 @@
-"""What stands on a command line: numbers, and folders of runs."""
+"""What stands on a command line: numbers, files to be written, and folders of runs."""
 
 from __future__ import annotations
 
@@ -32,6 +32,14 @@ def number(
         raise argparse.ArgumentTypeError(f"must be {allowed}, got {text!r}")
 
     return parse
+
+
+def check_file(option: str, file: Path | None, *suffixes: str) -> None:
+    """Refuse a file that an option asks to be written, before anything is computed."""
+    if file is not None and file.suffix not in suffixes:
+        raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
+    if file is not None and not file.parent.is_dir():
+        raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
 
 
 def settings_file(folder: Path) -> Path:

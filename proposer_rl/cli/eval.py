@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.arguments import check_file, number
+from proposer_rl.cli.errors import ConfigError, command
 
 MOST_STEPS = 10**5
-SUFFIXES = {"output": (".json", ".csv"), "pictures": (".png",)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -20,14 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.cli.errors import ConfigError
-
-    for option, suffixes in SUFFIXES.items():
-        file: Path | None = getattr(options, option)
-        if file is not None and file.suffix not in suffixes:
-            raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
-        if file is not None and not file.parent.is_dir():
-            raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
+    check_file("output", options.output, ".json", ".csv")
+    check_file("pictures", options.pictures, ".png")
     from proposer_rl.cli.evaluate import list_levels
 
     try:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -83,9 +84,8 @@ def evaluate(
 
 
 def _print(evaluation: Evaluation) -> None:
-    first = [each for each in evaluation.results if each.solver == 0]
-    shown = _hardest(first)
-    some = f", the {len(shown)} hardest of {len(first)} levels" if len(shown) < len(first) else ""
+    shown, count = _hardest(evaluation.results), len({each.level for each in evaluation.results})
+    some = f", the {len(shown)} hardest of {count} levels" if len(shown) < count else ""
     seeds = evaluation.run.config.seeds
     run = f"{evaluation.run.folder.name}, seed {', '.join(map(str, seeds))}"
     run += f", {evaluation.updates} updates"
@@ -93,22 +93,29 @@ def _print(evaluation: Evaluation) -> None:
     caption = "Means over the seeds." if len(seeds) > 1 else ""
     table = Table(box=SIMPLE_HEAD, title=Text(title), caption=caption)
     table.add_column("level", overflow="fold", min_width=16)
-    for name in (*first[0].about, *first[0].results):
+    example = evaluation.results[0]
+    for name in (*example.about, *example.results):
         table.add_column(name.replace("_", " "), justify="right")
-    for level in shown:
-        of_level = [other for other in evaluation.results if other.level == level.level]
-        about = [f"{value:g}" for value in level.about.values()]
-        table.add_row(Text(level.level), *about, *_means(of_level))
+    for of_level in shown:
+        about = [f"{value:g}" for value in of_level[0].about.values()]
+        table.add_row(Text(of_level[0].level), *about, *_means(of_level))
     table.add_section()
-    table.add_row(f"mean of {len(first)}", *[""] * len(first[0].about), *_means(evaluation.results))
+    table.add_row(f"mean of {count}", *[""] * len(example.about), *_means(evaluation.results))
     Console().print(table)
 
 
-def _hardest(results: Sequence[LevelResult]) -> list[LevelResult]:
-    """All of a few levels; of many those with the least success, or return, in their order."""
-    ranked = sorted(results, key=lambda each: each.results.get("success", each.results["return"]))
-    kept = {each.level for each in ranked[:SHOWN]}
-    return [each for each in results if each.level in kept]
+def _hardest(results: Sequence[LevelResult]) -> list[list[LevelResult]]:
+    """Results by level: all of a few; of many those with the least success, or return.
+
+    It is the mean over the Solvers that counts; levels stay in their order.
+    """
+    found: dict[str, list[LevelResult]] = {}
+    for each in results:
+        found.setdefault(each.level, []).append(each)
+    kind = "success" if "success" in results[0].results else "return"
+    ranked = sorted(found, key=lambda level: np.mean([each.results[kind] for each in found[level]]))
+    kept = set(ranked[:SHOWN])
+    return [of_level for level, of_level in found.items() if level in kept]
 
 
 def _means(results: Sequence[LevelResult]) -> list[str]:
@@ -129,7 +136,7 @@ def _sheet(evaluation: Evaluation) -> bytes:
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
-    for axes, level in zip(grid.flat, shown, strict=False):
+    for axes, (level, *_) in zip(grid.flat, shown, strict=False):
         axes.imshow(level.picture())
         result = level.results.get("success", level.results["return"])
         caption = f"{level.level}: {result:.3g}\n{level.note}"

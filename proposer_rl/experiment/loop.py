@@ -25,7 +25,7 @@ from proposer_rl.experiment.schedule import ScheduleSettings, check_headline
 from proposer_rl.experiment.tables import Log, RunTables
 from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
-from proposer_rl.runs.folder import RunFolder, read_csv
+from proposer_rl.runs.folder import SLACK, RunFolder, read_csv
 from proposer_rl.runs.signals import StopRequested, StopSignals
 from proposer_rl.runs.status import Status
 from proposer_rl.settings import NotNegative, settings
@@ -190,7 +190,7 @@ class Experiment:
                 (
                     int(row["updates"])
                     for row in rows
-                    if row["seed"] == seed and row[headline] >= threshold
+                    if row["seed"] == seed and row[headline] >= threshold - SLACK
                 ),
                 None,
             )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 LARGEST_SIDE = 64  # cells of a drawing
 MOST_STEPS = 5000  # of an episode
@@ -78,17 +78,3 @@ class Write(Question):
 
 
 Source = Annotated[Drawn | OfSet | OfCurriculum | OfFile, Field(discriminator="source")]
-
-
-def parsed(kind: Any, body: bytes) -> Any:
-    """The question in a body of JSON.
-
-    Raises:
-        ValueError: in one line, with the place of the first thing that is wrong.
-    """
-    try:
-        return TypeAdapter(kind).validate_json(body)
-    except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False, include_context=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{place}{': ' * bool(place)}{first['msg']}") from error

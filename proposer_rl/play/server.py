@@ -27,9 +27,9 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from proposer_rl.play.requests import LARGEST_BODY, Examine, Source, Write, parsed
+from proposer_rl.play.requests import LARGEST_BODY, Examine, Source, Write
 from proposer_rl.play.session import Session
-from proposer_rl.report.records import printable
+from proposer_rl.report.records import checked, printable
 
 HOSTS = ["127.0.0.1", "localhost"]
 CONNECTIONS = 256  # at once; of more, the one that has asked nothing for longest is closed
@@ -187,7 +187,7 @@ async def _answered(kind: Any, function: Callable[[Any], Any], request: Request)
         return _closing(413, f"at most {LARGEST_BODY:,} bytes are read")
     if request.headers.get("content-type") != "application/json":
         return JSONResponse({"error": "must be application/json"}, status_code=415)
-    return await _result(lambda: function(parsed(kind, bytes(body))))
+    return await _result(lambda: function(checked(kind, bytes(body), "")))
 
 
 def _closing(status: int, error: str) -> Response:

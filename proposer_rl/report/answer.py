@@ -6,7 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from proposer_rl.report.comparisons import TOO_FEW, Decision, between, decisions, primary
+from proposer_rl.report.comparisons import (
+    NOT_LEARNT,
+    TOO_FEW,
+    Decision,
+    between,
+    decisions,
+    primary,
+)
 from proposer_rl.report.records import LONGEST_TEXT, printable
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
@@ -23,15 +30,17 @@ def answer(study: Study) -> tuple[str, str]:
     outcome, baseline = primary(study), study.baseline
     ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
     best, *others = ranked
-    reached = f"{outcome.name}: {write(outcome.median(best))} (median over seeds)"
+    median = write(outcome.median(best))
     if not others:
         return (
-            f"{best.label} is the only method here ({reached}).",
+            f"{best.label} is the only method here ({outcome.name}: {median}, median over seeds).",
             "Nothing is compared, so this page does not show whether that is good.",
         )
     found = decisions(study)
+    # By the mean, as in the tests: by the median another could be significantly better.
     first = (
-        f"Of {len(ranked)} methods, {best.label} has the highest {reached}; "
+        f"Of {len(ranked)} methods, {best.label} has the highest {outcome.name} and over seeds "
+        f"(median over seeds: {median}); "
         f"{_shown(best, [between(found, best, other) for other in others])}."
     )
     return first, _against(baseline, [group for group in ranked if group is not baseline], found)
@@ -58,6 +67,8 @@ def _shown(best: Group, pairs: Sequence[tuple[Group, Decision]]) -> str:
         return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
     if all(beaten):
         return f"it is significantly better than {'all others' if len(pairs) > 1 else 'the other'}"
+    if any(decision.verdict == NOT_LEARNT for _, decision in pairs):
+        return "but it is not shown to have learnt"
     if not any(beaten):
         return "but there is no significant difference to any of the others"
     left = [group.label for group, decision in pairs if decision.winner != best.label]
@@ -76,10 +87,12 @@ def _against(
         return f"Too few seeds for a comparison with the baseline, {baseline.label}."
     better = [group.label for group, decision in pairs if decision.winner == group.label]
     worse = [group.label for group, decision in pairs if decision.winner == baseline.label]
-    rest = len(pairs) - len(better) - len(worse)
+    unlearnt = sum(decision.verdict == NOT_LEARNT for _, decision in pairs)
+    rest = len(pairs) - len(better) - len(worse) - unlearnt
     first = f"{_listed(better) or 'No method'} {_is(better)}"
     parts = [f"{first} significantly better than the baseline, {baseline.label}"]
     parts += [f"{_listed(worse)} {_is(worse)} significantly worse"] if worse else []
+    parts += [f"for {unlearnt} the better one is not shown to have learnt"] if unlearnt else []
     parts += [f"no significant difference for {rest}"] if rest else []
     return f"{'; '.join(parts)}."
 

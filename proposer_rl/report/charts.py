@@ -15,7 +15,7 @@ from PIL import Image
 from proposer_rl.report import measures
 from proposer_rl.report.comparisons import Outcome, outcomes
 from proposer_rl.report.measures import Measure, Series, axis_text
-from proposer_rl.report.records import LevelRecord, number, picture
+from proposer_rl.report.records import LevelRecord, Record, number, picture
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
@@ -151,7 +151,8 @@ def _stages(study: Study) -> dict[str, Json] | None:
     runs = [
         next((run for run in group.runs if run.samples), None)
         or next(
-            (run for run in group.runs if any(like.shares(c) is not None for c in run.cycles)), None
+            (run for run in group.runs if any(like.shares(c) is not None for c in _cycles(run))),
+            None,
         )
         for group in study.groups
     ]
@@ -181,9 +182,8 @@ def _stages(study: Study) -> dict[str, Json] | None:
 def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict[str, Json]:
     moments: list[tuple[int, Sequence[LevelRecord]]] = [(s.updates, s.levels) for s in run.samples]
     if not moments:
-        recorded = [c for c in run.cycles if number(c.get("seed", run.seed)) == run.seed]
         moments = [
-            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in recorded})
+            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in _cycles(run)})
         ]
     last = len(moments) - 1
     chosen = np.unique(np.linspace(0, last, min(most, len(moments))).round()).astype(int)
@@ -200,6 +200,11 @@ def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict
             for i in chosen
         ],
     }
+
+
+def _cycles(run: Run) -> list[Record]:
+    """A run's cycles without those that say that they are another seed's."""
+    return [cycle for cycle in run.cycles if number(cycle.get("seed", run.seed)) == run.seed]
 
 
 def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
@@ -226,9 +231,7 @@ def _map(run: Run, like: Run, updates: int) -> Json:
     """The last shares of proposals that were on record after that many updates."""
     shares = [
         found
-        for cycle in run.cycles
-        if number(cycle["updates"]) <= updates
-        and number(cycle.get("seed", run.seed)) == run.seed
-        and (found := like.shares(cycle)) is not None
+        for cycle in _cycles(run)
+        if number(cycle["updates"]) <= updates and (found := like.shares(cycle)) is not None
     ]
     return [plain(row) for row in share_map(shares[-1])] if shares else None

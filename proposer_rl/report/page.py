@@ -182,6 +182,9 @@ def _command(run: Run) -> str | None:
         for word in (*words, paths or "", config or "")
     ):
         return None
+    # A task or curriculum of one's own that prl.train was given is in no override.
+    if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
+        return None
     before = [f"PYTHONPATH={shlex.quote(anywhere(paths))}"] if paths else []
     options = ["--config-dir", config, "-m"] if config else ["-m"]
     quoted = [shlex.quote(anywhere(word)) for word in [*options, *words]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,5 +104,9 @@ def _left(run: Run) -> str:
 
 
 def _age(folder: Path) -> float:
-    times = [entry.stat().st_mtime for entry in os.scandir(folder) if entry.is_file()]
+    times = []
+    for entry in os.scandir(folder):
+        with suppress(FileNotFoundError):  # its temporary name is gone once a file is written
+            if entry.is_file():
+                times.append(entry.stat().st_mtime)
     return max(time.time() - max(times), 0.0) if times else 0.0

@@ -105,7 +105,10 @@ def read_run(folder: Path) -> list[Run]:
 
 def _read_folder(folder: Path) -> list[Run]:
     summary = _read_json(folder, "summary.json") or {}
-    recorded = _optional(folder, "curriculum.jsonl", read_jsonl)
+    pictures = folder / "curriculum.jsonl"
+    # Of many seeds and evaluations they are too many; all else of the run can be shown.
+    large = pictures.is_file() and pictures.stat().st_size > LARGEST_FILE
+    recorded = [] if large else _optional(folder, pictures.name, read_jsonl)
     reached = _optional(folder, "levels.jsonl", read_jsonl)
     return _runs(
         folder,
@@ -125,7 +128,8 @@ def _read_study(folder: Path) -> list[Run]:
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
     for row in read_table(folder / STUDY).to_dict("records"):
-        name, config, facts = row["run"], json.loads(row["config"]), json.loads(row["facts"])
+        name, config = row["run"], json.loads(row["config"])
+        facts = checked(dict[str, Any], json.loads(row["facts"]), f"{STUDY}: facts")
         if ".." in Path(checked(Text, name, f"{STUDY}: run")).parts or Path(name).is_absolute():
             raise ValueError(f"{STUDY}: {name} leads out of the study")
         metrics, training, cycles, levels = (

@@ -110,17 +110,19 @@ _adapter = cache(TypeAdapter)  # making one takes longer than checking a value
 
 
 def checked(kind: type[T], value: Any, where: str) -> T:
-    """A value from a file as it should be.
+    """A value from a file or a request as it should be; bytes are its JSON.
 
     Raises:
         ValueError: with the place of the first thing that is not so.
     """
+    adapter = _adapter(cast(Hashable, kind))
+    check = adapter.validate_json if isinstance(value, bytes) else adapter.validate_python
     try:
-        return cast(T, _adapter(cast(Hashable, kind)).validate_python(value, strict=True))
+        return cast(T, check(value, strict=True))
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{where}: {place}{': ' * bool(place)}{first['msg']}") from error
+        raise ValueError(": ".join(filter(None, [where, place, first["msg"]]))) from error
 
 
 def small_json(path: Path, largest: int = 2**20) -> Any:

@@ -21,6 +21,7 @@ from proposer_rl.report.records import (
     TaskFacts,
     number,
 )
+from proposer_rl.runs.folder import SLACK
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
@@ -149,7 +150,7 @@ class Run:
 
     def reached(self, measurement: str, threshold: float) -> float:
         """Updates until a measurement first reached a threshold; NaN where it never did."""
-        found = self.columns["updates"][self.columns[measurement] >= threshold]
+        found = self.columns["updates"][self.columns[measurement] >= threshold - SLACK]
         return float(found.min()) if found.size else math.nan
 
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:

@@ -46,15 +46,19 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.Da
                 {k: json.dumps(v) for k, v in cycle.items() if v is not None and v == v}
                 for cycle in run.cycles
             )
-            found["cycles"].append(pd.DataFrame([whose | cycle for cycle in cells]))
+            # A curriculum may log a number of that name: a row stays its run's.
+            found["cycles"].append(pd.DataFrame([whose | cycle | {key: name} for cycle in cells]))
         seen.add(run.folder)
         for distribution in dict.fromkeys(name.rpartition("_")[0] for name in run.levels):
-            # Returns where there is no success, which is what is shown.
-            kind = "success" if f"{distribution}_success" in run.levels else "return"
-            where = place | {"updates": run.updates, "distribution": distribution}
-            values = run.levels[f"{distribution}_{kind}"]
-            level = {"level": range(len(values)), kind: values}
-            found["levels"].append(pd.DataFrame(where | level))
+            # Of returns what is shown: the headline, and where there is no success.
+            kinds = [
+                kind for kind in ("success", "return") if f"{distribution}_{kind}" in run.levels
+            ]
+            if run.headline != f"{distribution}_return":
+                kinds = kinds[:1]
+            own = pd.DataFrame({k: pd.Series(run.levels[f"{distribution}_{k}"]) for k in kinds})
+            where = {"updates": run.updates, "distribution": distribution, "level": own.index}
+            found["levels"].append(pd.DataFrame(place | where).join(own))
     known = {name: [part for part in parts if len(part)] for name, parts in found.items()}
     return {name: pd.concat(parts) for name, parts in known.items() if parts}
 

@@ -20,7 +20,11 @@ from pathlib import Path
 
 Number = int | float
 
+# What a run writes row by row; all else in its folder, tables of its user's too, is left alone.
+TABLES = ("curriculum.jsonl", "cycles.jsonl", "levels.jsonl", "metrics.csv", "training.csv")
 PROPOSER = "proposer.pt"  # what a run's curriculum has learnt, alone: a checkpoint without Solvers
+# By how much a mean may miss a threshold that it reached: 18 of 20 in float32 is 0.89999998.
+SLACK = 1e-6
 
 _PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 
@@ -47,7 +51,7 @@ class RunFolder:
         """Adds a row to a table and waits until it is on the disk: a crash loses at most this row.
 
         Args:
-            name: the table's file name, ending in ``.csv`` or ``.jsonl``.
+            name: the table's file name, one of :data:`TABLES`.
             row: for ``.csv`` numbers, with the same keys in every row of the table (the
                 first row makes the header); for ``.jsonl`` whatever JSON can hold.
 
@@ -102,12 +106,12 @@ class RunFolder:
         write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
 
     def _table(self, name: str) -> Path:
-        if Path(name).name != name or Path(name).suffix not in (".csv", ".jsonl"):
-            raise ValueError(f"a table is a file name ending in .csv or .jsonl, not {name!r}")
+        if name not in TABLES:
+            raise ValueError(f"a table is one of {', '.join(TABLES)}, not {name!r}")
         return self.path / name
 
     def _tables(self) -> list[Path]:
-        return sorted([*self.path.glob("*.csv"), *self.path.glob("*.jsonl")])
+        return [path for path in map(self.path.joinpath, TABLES) if path.is_file()]
 
 
 def is_rate(name: str) -> bool:

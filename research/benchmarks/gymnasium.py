@@ -7,13 +7,13 @@ row of a table, which is gone on with: what is in it is not trained again.
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any, NamedTuple
 
+import pandas as pd
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import parts
@@ -135,25 +135,12 @@ def read_rows(file: Path | None) -> list[Trained]:
     """The rows of a table; none where there is no such file."""
     if file is None or not file.exists():
         return []
-    with file.open(newline="", encoding="utf-8") as lines:
-        return [
-            Trained(
-                code=row["code"],
-                environment=row["environment"],
-                seed=int(row["seed"]),
-                frames=int(row["frames"]),
-                cpu_seconds=float(row["cpu_seconds"]),
-                mean_return=float(row["mean_return"]),
-                least_return=float(row["least_return"]),
-            )
-            for row in csv.DictReader(lines)
-        ]
+    return [Trained(*row) for row in pd.read_csv(file).itertuples(index=False)]
 
 
 def write_rows(file: Path, rows: Sequence[Trained]) -> None:
     """Write the table anew."""
-    lines = [",".join(Trained._fields), *(",".join(map(str, row)) for row in rows)]
-    write_atomically(file, "".join(f"{line}\n" for line in lines).encode())
+    write_atomically(file, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n").encode())
 
 
 def _missing(

@@ -8,17 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from proposer_rl.report.answer import answer, meaning
+from proposer_rl.report.comparisons import UNDECIDED
+from proposer_rl.report.outcomes import comparison_table
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import write_run
 
-NOISE = np.random.default_rng(1).normal(0, 0.01, (8, 6))
+NOISE = np.random.default_rng(1).normal(0, 1, (8, 6))
 
 
-def study_of(folder: Path, ends: Mapping[str, float], seeds: int = 6) -> Study:
+def study_of(folder: Path, ends: Mapping[str, float], seeds: int = 6, noise: float = 0.01) -> Study:
     """Methods whose mean along training is about half of their end."""
     for number, (method, end) in enumerate(ends.items()):
         for seed in range(seeds):
-            curve = [0.0, (end + NOISE[number, seed]) / 2, end + NOISE[number, seed]]
+            reached = end + noise * NOISE[number, seed]
+            curve = [0.0, reached / 2, reached]
             write_run(folder / f"{method}{seed}", method, [seed], curve)
     (study,), _ = read_studies(sorted(folder.iterdir()), None)
     return study
@@ -34,7 +37,8 @@ def test_the_best_is_named_with_how_sure_that_is(tmp_path: Path) -> None:
     ends = {"ours": 0.9, "domain_randomization": 0.5, "worse": 0.2}
     first, second = told(tmp_path / "all", ends)
     assert first.startswith(
-        "Of 3 methods, ours has the highest ID success, mean over 20 updates: 0.4"
+        "Of 3 methods, ours has the highest ID success, mean over 20 updates and over seeds "
+        "(median over seeds: 0.4"
     )
     assert first.endswith("it is significantly better than all others.")
     assert second == (
@@ -52,6 +56,32 @@ def test_what_is_undecided_is_said_to_be(tmp_path: Path) -> None:
     assert second == (
         "No method is significantly better than the baseline, domain_randomization; "
         "no significant difference for 1."
+    )
+
+
+def test_what_has_hardly_learnt_is_not_said_to_be_level(tmp_path: Path) -> None:
+    ends = {"ours": 0.09, "domain_randomization": 0.01, "twin": 0.01}
+    study = study_of(tmp_path, ends, noise=0.001)
+    verdicts = [row["verdict"] for row in comparison_table(study).rows]
+    assert verdicts.count("nothing learnt") == 2 and verdicts.count(UNDECIDED) == 1
+    first, second = answer(study)
+    assert first.endswith("but it is not shown to have learnt.") and "significant" not in first
+    assert second == (
+        "No method is significantly better than the baseline, domain_randomization; "
+        "for 1 the better one is not shown to have learnt; no significant difference for 1."
+    )
+
+
+def test_the_highest_is_so_by_the_mean_and_says_it(tmp_path: Path) -> None:
+    means = {"risky": [0.3, 0.31, 0.32, 0.95, 0.96], "steady": [0.5, 0.51, 0.52, 0.53, 0.54]}
+    for method, curves in means.items():
+        for seed, value in enumerate(curves):
+            write_run(tmp_path / f"{method}{seed}", method, [seed], [value] * 3)
+    assert np.mean(means["risky"]) > np.mean(means["steady"])
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert answer(study)[0].startswith(
+        "Of 2 methods, risky has the highest ID success, mean over 20 updates and over seeds "
+        "(median over seeds: 0.320 "
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from proposer_rl.report import reading
+from proposer_rl.report.pictures import draw_run
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means
@@ -36,6 +37,13 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     # Trapezoids of width 10: (0 + 0.5) / 2 and (0.5 + 0.9) / 2.
     assert run.mean_until("id_success", 20) == pytest.approx((0.25 + 0.7) / 2)
     assert np.isnan(run.mean_until("id_success", 30))
+
+
+def test_a_mean_in_float32_reaches_what_it_is(tmp_path: Path) -> None:
+    solved = float(np.mean([1] * 18 + [0] * 2, dtype=np.float32))
+    assert solved < 18 / 20
+    (run,) = read_run(write_run(tmp_path / "a", curve=[0.0, 0.5, solved]))
+    assert run.reached("id_success", 18 / 20) == 20 and np.isnan(run.reached("id_success", 0.9001))
 
 
 def test_seeds_trained_together_share_the_time(tmp_path: Path) -> None:
@@ -225,6 +233,22 @@ def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(reading, "LARGEST_FILE", 100)
     with pytest.raises(UnreadableRun, match="is larger than"):
         read_run(folder)
+
+
+def test_a_run_with_too_many_pictures_is_read_without_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_run(tmp_path / "run", levels=[0.5, 0.9])
+    (before,) = read_run(folder)
+    pictures = folder / "curriculum.jsonl"
+    pictures.write_bytes(pictures.read_bytes() * 50)
+    others = [path.stat().st_size for path in folder.iterdir() if path != pictures]
+    monkeypatch.setattr(reading, "LARGEST_FILE", max(others))
+    (run,) = read_run(folder)
+    assert before.samples and not run.samples
+    assert run.metrics.equals(before.metrics) and run.training.equals(before.training)
+    assert run.finished and [v.tolist() for v in run.levels.values()] == [[0.5, 0.9]] * 2
+    assert draw_run(folder, "x").is_file()
 
 
 def test_a_share_is_never_more_than_all(tmp_path: Path) -> None:

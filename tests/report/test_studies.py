@@ -119,6 +119,9 @@ def test_a_command_is_complete_without_the_folders_of_its_machine(tmp_path: Path
         {"overrides": ["a=" + "1" * 9999]},
         {"arguments": []},
         {"arguments": {"config_dir": 1}},
+        # As prl.train records a task, or a curriculum, of one's own.
+        {"overrides": ["~task", "+method=plr", "seed=0"]},
+        {"overrides": ["task=maze", "+scale=smoke", "seed=0"]},
     ],
 )
 def test_a_command_that_is_not_known_in_full_is_not_given(facts, tmp_path: Path) -> None:

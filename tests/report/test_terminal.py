@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.cli.watch import main
+from proposer_rl.report import progress
 from proposer_rl.report.progress import duration, find_progress, read_progress
 from proposer_rl.report.terminal import BLOCKS, sparkline
 from tests.report.folders import TASK, cycle, write_run
@@ -103,6 +105,22 @@ def test_the_age_is_that_of_the_newest_file(tmp_path: Path) -> None:
     old = read_progress(folder).age
     (folder / "metrics.csv").touch()
     assert old > 1e8 and read_progress(folder).age < 60
+
+
+def test_a_file_that_gets_its_name_meanwhile_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, listed = write_run(tmp_path / "run"), os.scandir
+    temporary = folder / ".progress.json.tmp"
+
+    def renamed_after(path: Path) -> Iterator[os.DirEntry[str]]:
+        temporary.write_text("{}")
+        found = list(listed(path))
+        os.replace(temporary, folder / "progress.json")
+        return iter(found)
+
+    monkeypatch.setattr(progress.os, "scandir", renamed_after)
+    assert 0 <= read_progress(folder).age < 60
 
 
 @pytest.mark.parametrize("arguments", [["missing"], ["."]])

@@ -7,6 +7,7 @@ import io
 import json
 import lzma
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from proposer_rl.cli.report import main as report
 from proposer_rl.report.curves import learning_curves
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.studies import read_studies
+from proposer_rl.report.tidy import tables
 from research import publish
 from research.publish import main
 from tests.report.folders import LEVEL, TASK, cycle, write_run
@@ -125,15 +127,30 @@ def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
     assert config["checkpoint"] == config["curriculum"]["checkpoint"] == "1/lifetime_2"
 
 
-def test_returns_of_single_levels_are_kept_where_there_is_no_success(tmp_path: Path) -> None:
-    written = {"a": {"success": [0.5], "return": [0.4]}, "b": {"return": [0.4]}}
-    for name, row in written.items():
-        folder = write_run(tmp_path / "runs" / name)
+def test_returns_of_single_levels_are_kept_where_they_are_shown(tmp_path: Path) -> None:
+    both = {"success": [0.5], "return": [0.4]}
+    schedule = {"headline": "id_return", "threshold": 1, "cycle_length": 20}
+    write_run(tmp_path / "runs" / "c", "plr", schedule=schedule)
+    for name, row in {"a": both, "b": {"return": [0.4]}, "c": both}.items():
+        folder = tmp_path / "runs" / name
+        if name != "c":
+            write_run(folder)
         head = {"seed": 0, "updates": 20, "distribution": "id"}
         (folder / "levels.jsonl").write_text(json.dumps({**head, **row}) + "\n")
     light = published(tmp_path / "runs", tmp_path / "light")
     found = [(row["run"], row["success"], row["return"]) for row in rows(light, "levels")]
-    assert found == [("a", "0.5", ""), ("b", "", "0.4")]
+    assert found == [("a", "0.5", ""), ("b", "", "0.4"), ("c", "0.5", "0.4")]
+
+
+def test_a_cycle_that_logs_a_number_called_run_stays_its_runs(tmp_path: Path) -> None:
+    cycles = [{"updates": 0, "score": 1, "run": 7, "method": 8}, {"updates": 20, "score": 2}]
+    write_run(tmp_path / "runs" / "a", "plr", [0], cycles=cycles)
+    light = published(tmp_path / "runs", tmp_path / "light")
+    (run,) = read_run(light)
+    assert [cycle["score"] for cycle in run.cycles] == [1, 2]
+    told = tables([("plr", replace(run, cycles=[*cycles, {"updates": 0, "seed": 3}]))], "method")
+    assert told["cycles"]["method"].tolist() == ["plr"] * 3
+    assert [int(seed) for seed in told["cycles"]["seed"]] == [0, 0, 3]  # its own, where it has one
 
 
 def test_fractions_have_six_digits_and_counts_all_of_theirs(tmp_path: Path) -> None:
@@ -208,6 +225,7 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     [
         ("runs", "run,config,facts\n../a,{},{}\n", "leads out of the study"),
         ("runs", "run,config\na,{}\n", "an entry 'facts' is missing"),
+        ("runs", "run,config,facts\na,{},[]\n", "facts: Input should be a valid dictionary"),
         ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
         ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
         ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),

@@ -49,8 +49,8 @@ def test_jsonl_reads_back(
 ) -> None:
     folder = RunFolder(tmp_path_factory.mktemp("run"))
     for row in rows:
-        folder.append("proposer.jsonl", row)
-    assert read_jsonl(folder.path / "proposer.jsonl") == rows
+        folder.append("cycles.jsonl", row)
+    assert read_jsonl(folder.path / "cycles.jsonl") == rows
 
 
 def test_csv_is_what_other_programs_read(folder: RunFolder) -> None:
@@ -91,15 +91,15 @@ def test_refuses_a_header_and_makes_no_table(folder: RunFolder, row: dict[str, o
     assert folder.lengths() == {}
 
 
-@pytest.mark.parametrize("name", ["metrics", "../metrics.csv", "sub/metrics.csv", "x.json"])
+@pytest.mark.parametrize("name", ["metrics", "../metrics.csv", "sub/metrics.csv", "scores.csv"])
 def test_refuses_a_name(folder: RunFolder, name: str) -> None:
-    with pytest.raises(ValueError, match="a table is a file name"):
+    with pytest.raises(ValueError, match="a table is one of curriculum"):
         folder.append(name, {"a": 1})
 
 
 def test_refuses_what_json_cannot_hold(folder: RunFolder) -> None:
-    with pytest.raises(ValueError, match=r"p\.jsonl: .*not JSON serializable"):
-        folder.append("p.jsonl", {"a": {1, 2}})
+    with pytest.raises(ValueError, match=r"cycles\.jsonl: .*not JSON serializable"):
+        folder.append("cycles.jsonl", {"a": {1, 2}})
     with pytest.raises(ValueError, match=r"s\.json: .*not JSON serializable"):
         folder.write_json("s.json", {"a": object()})
     assert list(folder.path.iterdir()) == []
@@ -108,7 +108,7 @@ def test_refuses_what_json_cannot_hold(folder: RunFolder) -> None:
 def _filled(folder: RunFolder, rows: int) -> None:
     for i in range(rows):
         folder.append("metrics.csv", {"update": i, "loss": i / 7})
-        folder.append("proposer.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
+        folder.append("cycles.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
 
 
 def test_a_resumed_run_looks_as_if_it_had_never_stopped(tmp_path: Path) -> None:
@@ -116,15 +116,15 @@ def test_a_resumed_run_looks_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     _filled(straight, 5)
     _filled(resumed, 3)
     lengths = resumed.lengths()
-    assert lengths == {"metrics.csv": 3, "proposer.jsonl": 3}
+    assert lengths == {"metrics.csv": 3, "cycles.jsonl": 3}
     resumed.append("metrics.csv", {"update": 3, "loss": 9.0})
-    resumed.append("late.csv", {"a": 1})
+    resumed.append("training.csv", {"a": 1})
     resumed.cut_back(json.loads(json.dumps(lengths)))
 
     assert resumed.lengths() == lengths
     for i in (3, 4):
         resumed.append("metrics.csv", {"update": i, "loss": i / 7})
-        resumed.append("proposer.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
+        resumed.append("cycles.jsonl", {"cycle": i, "gains": [i / 3, -0.0]})
     assert _contents(resumed) == _contents(straight)
 
 
@@ -147,7 +147,9 @@ def test_after_a_crash_at_any_byte(
     assert _contents(folder) == whole
 
 
-@pytest.mark.parametrize(("name", "read"), [("t.csv", read_csv), ("t.jsonl", read_jsonl)])
+@pytest.mark.parametrize(
+    ("name", "read"), [("training.csv", read_csv), ("levels.jsonl", read_jsonl)]
+)
 def test_half_a_row_is_not_read_nor_added_to(folder: RunFolder, name: str, read: object) -> None:
     assert callable(read)
     folder.append(name, {"a": 1})
@@ -163,20 +165,20 @@ def test_half_a_row_is_not_read_nor_added_to(folder: RunFolder, name: str, read:
 
 
 def test_half_a_header_is_no_row(folder: RunFolder) -> None:
-    (folder.path / "t.csv").write_text("upd")
-    assert folder.lengths() == {"t.csv": 0}
-    assert read_csv(folder.path / "t.csv") == []
-    folder.cut_back({"t.csv": 0})
+    (folder.path / "training.csv").write_text("upd")
+    assert folder.lengths() == {"training.csv": 0}
+    assert read_csv(folder.path / "training.csv") == []
+    folder.cut_back({"training.csv": 0})
     assert folder.lengths() == {}
 
 
 def test_cut_back_checks_all_before_it_changes_anything(folder: RunFolder) -> None:
     _filled(folder, 3)
     before = _contents(folder)
-    with pytest.raises(ValueError, match=r"proposer\.jsonl has 3 rows, fewer than the 4"):
-        folder.cut_back({"metrics.csv": 1, "proposer.jsonl": 4})
-    with pytest.raises(ValueError, match=r"gone\.csv has 0 rows"):
-        folder.cut_back({"gone.csv": 1})
+    with pytest.raises(ValueError, match=r"cycles\.jsonl has 3 rows, fewer than the 4"):
+        folder.cut_back({"metrics.csv": 1, "cycles.jsonl": 4})
+    with pytest.raises(ValueError, match=r"training\.csv has 0 rows"):
+        folder.cut_back({"training.csv": 1})
     assert _contents(folder) == before
 
 
@@ -184,8 +186,18 @@ def test_cut_back_leaves_other_files_alone(folder: RunFolder) -> None:
     _filled(folder, 1)
     folder.write_json("summary.json", {"seconds": 1.5})
     (folder.path / "checkpoints").mkdir()
+    own = {
+        "scores.csv": "run,level,success\nx,1,0.5\n",
+        "levels.txt": "S.G\n",
+        "notes.jsonl": "{}\n",
+    }
+    for name, content in own.items():
+        (folder.path / name).write_text(content)
+    assert folder.lengths() == {"metrics.csv": 1, "cycles.jsonl": 1}
+    folder.cut_back(folder.lengths())
     folder.cut_back({})
-    assert sorted(path.name for path in folder.path.iterdir()) == ["checkpoints", "summary.json"]
+    assert {path.name for path in folder.path.iterdir()} == {"checkpoints", "summary.json", *own}
+    assert {name: (folder.path / name).read_text() for name in own} == own
 
 
 @pytest.mark.parametrize(
