@@ -352,12 +352,15 @@ class ReplayCurriculum(Curriculum):
         fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
         now = TensorDict({"slot": slots, "key": self.buffer["key"].gather(1, slots)}, slots.shape)
         before = self._before
-        if before is None or before.shape != now.shape:
+        if before is None:
             before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
         each = replayed.unsqueeze(-1)
         there = self.buffer["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
         credited = torch.zeros_like(self.buffer["filled"]).scatter(1, before["slot"], there & each)
         self.buffer["score"] += self._co_learnability * fell * credited
+        width = torch.arange(max(before.shape[1], now.shape[1]))
+        # Batches differ in size: the last level over again is credited no more than once.
+        now, before = (known[:, width.clamp(max=known.shape[1] - 1)] for known in (now, before))
         self._before = now.where(each, before)
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
