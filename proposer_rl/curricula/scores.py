@@ -44,7 +44,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.exact_scores import EXACT
+from proposer_rl.curricula.exact_scores import EXACT, in_coins
 from proposer_rl.curricula.stepwise import STEPWISE
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import succeeded
@@ -149,7 +149,7 @@ class Scorer:
         }[source]
         if score not in available:
             raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
-        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score].needs
+        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score][0]
         self.reads: tuple[str, ...] = ()
         if self.from_episodes:
             self.asks = {"gradient_norm": ("policy_gradient_norms",)}.get(score, ())
@@ -252,10 +252,12 @@ class Scorer:
                     mean = torch.stack(played).mean(0)
                     scored.append(self.of_outcome(student, mean, new, new))
             else:
+                _, ask = EXACT[self._name]
                 with torch.no_grad():
-                    score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
+                    score = ask(student, some, self.rollouts).double().cpu()
                 scored.append(Scored(score, unseen(score.shape)))
-        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
+        score, best = (torch.cat(entries, 1) for entries in zip(*scored, strict=True))
+        return Scored(in_coins(score) if self._name == "spread" else score, best)
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
