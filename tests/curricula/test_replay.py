@@ -122,6 +122,25 @@ def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
         )
 
 
+def test_new_levels_without_a_critic_are_compared_with_what_was_reached_elsewhere() -> None:
+    """In a full buffer they take the place of levels on which nothing changes."""
+    reached = 0.5
+
+    def play(levels: Any, generators: Any) -> TensorDict:
+        return TensorDict({"return": torch.full(levels.shape, reached)}, levels.shape)
+
+    curriculum, taught = replay("l1_value_loss", capacity=8), Student(play=play)
+    for number in range(4):
+        batch = curriculum.propose(taught, P, [streams_of(number)])
+        curriculum.observe(taught, batch, TensorDict({"return": torch.full((1, P), 0.5)}, [1, P]))
+    buffer = curriculum.buffer[0]
+    assert bool(buffer["filled"].all()) and bool((buffer["score"] == 0).all())
+    known, reached = set(buffer["key"].tolist()), 0.75
+    curriculum.propose(taught, P, [streams_of(4)])
+    score = dict(zip(buffer["key"].tolist(), buffer["score"].tolist(), strict=True))
+    assert [score[key] for key in score.keys() - known] == [0.25] * P
+
+
 def test_a_level_that_has_left_the_buffer_meanwhile_scores_no_other() -> None:
     curriculum, taught = replay("regret", train_on_new=True, replay_probability=1.0), student(0)
     for number in range(4):
