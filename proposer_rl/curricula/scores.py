@@ -44,7 +44,7 @@ the optimum.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -271,7 +271,7 @@ class Scorer:
                 if "next" in played[0].keys():
                     scored.append(self.of_rollouts(student, played, unseen(some.shape[:2])))
                 else:
-                    told = torch.stack(played).cpu()  # [rollouts, K, P]
+                    told: Any = torch.stack(played).cpu()  # [rollouts, K, P]
                     mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
                     outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
                     scored.append(self.of_outcome(student, outcome, best, known[batch]))
