@@ -36,6 +36,7 @@ CALLED = {
     "alp_gmm": ["+method=alp_gmm", *QUIET, *FITTED],
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET, *CYCLE],
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
+    "modelled": ["+method=regret", "+source=model", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
     "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],

@@ -11,82 +11,47 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from proposer_rl.curricula.batches import SomeBins, level_keys
-from proposer_rl.curricula.bins import BinCurriculum
-from proposer_rl.curricula.buffer import (
-    ReplayRule,
-    draw_slots,
-    empty_buffer,
-    insert,
-    replay_weights,
-    rescore,
+from proposer_rl.curricula.batches import SomeBins as SomeBins
+from proposer_rl.curricula.batches import level_keys as level_keys
+from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
+from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
+from proposer_rl.curricula.buffer import draw_slots as draw_slots
+from proposer_rl.curricula.buffer import empty_buffer as empty_buffer
+from proposer_rl.curricula.buffer import insert as insert
+from proposer_rl.curricula.buffer import replay_weights as replay_weights
+from proposer_rl.curricula.buffer import rescore as rescore
+from proposer_rl.curricula.combinators import Filtered as Filtered
+from proposer_rl.curricula.combinators import Mixed as Mixed
+from proposer_rl.curricula.combinators import Schedule as Schedule
+from proposer_rl.curricula.contract import Advance as Advance
+from proposer_rl.curricula.contract import Batch as Batch
+from proposer_rl.curricula.contract import Curriculum as Curriculum
+from proposer_rl.curricula.contract import Improvement as Improvement
+from proposer_rl.curricula.contract import Inbox as Inbox
+from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
+from proposer_rl.curricula.contract import outcome_of as outcome_of
+from proposer_rl.curricula.first_order import FirstOrderCurriculum as FirstOrderCurriculum
+from proposer_rl.curricula.first_order import (
+    SampledFirstOrderCurriculum as SampledFirstOrderCurriculum,
 )
-from proposer_rl.curricula.combinators import Filtered, Mixed, Schedule
-from proposer_rl.curricula.contract import (
-    Advance,
-    Batch,
-    Curriculum,
-    Improvement,
-    Inbox,
-    LearnedCurriculum,
-    outcome_of,
-)
-from proposer_rl.curricula.first_order import FirstOrderCurriculum, SampledFirstOrderCurriculum
-from proposer_rl.curricula.gaussians import MixtureCurriculum
-from proposer_rl.curricula.modelled import Modelled
-from proposer_rl.curricula.problem_proposer import ProblemProposer
-from proposer_rl.curricula.problem_rewards import FirstOrderProposer, PairedProposer
-from proposer_rl.curricula.progress import LearningProgressCurriculum
-from proposer_rl.curricula.proposer import ProposerCurriculum, ProposerTrainer
-from proposer_rl.curricula.replay import ReplayCurriculum
-from proposer_rl.curricula.sampling import SamplingCurriculum
-from proposer_rl.curricula.scores import Scorer
-from proposer_rl.curricula.selection import SelectionCurriculum
-from proposer_rl.curricula.student import Student, TaskStudent, UnfitStudentError, require
-from proposer_rl.curricula.transport import TransportCurriculum
+from proposer_rl.curricula.gaussians import MixtureCurriculum as MixtureCurriculum
+from proposer_rl.curricula.modelled import Modelled as Modelled
+from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
+from proposer_rl.curricula.problem_rewards import FirstOrderProposer as FirstOrderProposer
+from proposer_rl.curricula.problem_rewards import PairedProposer as PairedProposer
+from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
+from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
+from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
+from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
+from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
+from proposer_rl.curricula.scores import Scorer as Scorer
+from proposer_rl.curricula.selection import SelectionCurriculum as SelectionCurriculum
+from proposer_rl.curricula.student import Student as Student
+from proposer_rl.curricula.student import TaskStudent as TaskStudent
+from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError
+from proposer_rl.curricula.student import require as require
+from proposer_rl.curricula.transport import TransportCurriculum as TransportCurriculum
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
-
-__all__ = [
-    "Advance",
-    "Batch",
-    "BinCurriculum",
-    "Curriculum",
-    "Filtered",
-    "FirstOrderCurriculum",
-    "FirstOrderProposer",
-    "Improvement",
-    "Inbox",
-    "LearnedCurriculum",
-    "LearningProgressCurriculum",
-    "Mixed",
-    "MixtureCurriculum",
-    "Modelled",
-    "PairedProposer",
-    "ProblemProposer",
-    "ProposerCurriculum",
-    "ProposerTrainer",
-    "ReplayCurriculum",
-    "ReplayRule",
-    "SampledFirstOrderCurriculum",
-    "SamplingCurriculum",
-    "Schedule",
-    "Scorer",
-    "SelectionCurriculum",
-    "SomeBins",
-    "Student",
-    "TaskStudent",
-    "TransportCurriculum",
-    "UnfitStudentError",
-    "draw_slots",
-    "empty_buffer",
-    "insert",
-    "level_keys",
-    "outcome_of",
-    "own",
-    "replay_weights",
-    "require",
-    "rescore",
-]
 
 
 def own(make: Callable[..., Any], **settings: Any) -> Recipe:
@@ -99,4 +64,9 @@ def __getattr__(name: str) -> Callable[..., Recipe]:
 
 
 def __dir__() -> list[str]:
-    return [*available("method"), *__all__]
+    here = [
+        name
+        for name, value in globals().items()
+        if getattr(value, "__module__", "").startswith(__name__) and not name.startswith("_")
+    ]
+    return [*available("method"), *here]

@@ -32,6 +32,13 @@ from proposer_rl.learning import Update, first_episode_return, first_episode_suc
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
+PATIENCE = 32
+"""Newer batches that are proposed before one is taken as complete, some of which may be lost.
+
+Where episodes go on, a level may be two of them on its way, its own and the one before; the longest
+that come with a task are 1600 steps, 13 updates of 128.
+"""
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -70,7 +77,7 @@ class Batch:
             index: places of the levels that are kept, in their new order, int64 [K, m].
         """
         notes = levels_at(self.notes, index)
-        _renumber(notes)
+        _renumber(notes, torch.ones(notes.batch_size, dtype=torch.bool))
         return Batch(levels_at(self.levels, index), notes)
 
 
@@ -238,7 +245,7 @@ class Inbox:
         copies, count = levels.shape[:2]
         number = torch.full((copies, count), self._next)
         self._next += 1
-        every = {**notes, "number": number, **_places(copies, count)}
+        every = {**notes, "number": number, **_places(torch.ones_like(number, dtype=torch.bool))}
         return Batch(levels, TensorDict(every, (copies, count)))
 
     def check(self, batch: Batch, outcome: TensorDictBase) -> None:
@@ -246,7 +253,8 @@ class Inbox:
 
         Raises:
             ValueError: if it has another shape than the batch, a number in it is not finite, or the
-                batch is none of this curriculum's, or was observed before.
+                batch is none of this curriculum's, or some of it was observed before and has not
+                been taken yet.
         """
         notes, told = dict(batch.notes.items()), dict(outcome.items())
         shape = list(batch.notes.batch_size)
@@ -287,6 +295,7 @@ class Inbox:
 
         Args:
             whole: whether parts stay until their batch is complete, and later batches with them.
+                Once :data:`PATIENCE` newer ones have been proposed, it is taken as it is.
         """
         batches: dict[int, list[TensorDict]] = {}
         for part in self._parts:
@@ -295,7 +304,8 @@ class Inbox:
         for number in sorted(batches):
             parts = batches[number]
             evidence: Any = torch.cat(parts, 1) if len(parts) > 1 else parts[0]
-            if self._parts or (whole and evidence.shape[1] < int(evidence["size"][0, 0])):
+            waits = whole and self._next - 1 - number < PATIENCE
+            if self._parts or (waits and evidence.shape[1] < int(evidence["size"][0, 0])):
                 self._parts += parts
             elif bool((evidence["place"].diff() > 0).all()):
                 taken.append(evidence)
@@ -313,15 +323,22 @@ class Inbox:
         self._parts = [unpacked(part, self._like) for part in state["parts"]]
 
 
-def _places(copies: int, count: int) -> dict[str, Tensor]:
-    place = torch.arange(count).expand(copies, -1)
-    return {"place": place, "size": torch.full_like(place, count)}
+def _places(own: Tensor) -> dict[str, Tensor]:
+    """Numbers the levels of a batch [K, n] that are its curriculum's own, bool [K, n]."""
+    return {"place": own.cumsum(1) - 1, "size": own.sum(1, keepdim=True).expand_as(own)}
 
 
-def _renumber(notes: TensorDictBase) -> None:
-    """Count the places of all numbered notes [K, n] anew, also of those within."""
+def _renumber(notes: TensorDictBase, own: Tensor) -> None:
+    """Count the places of all numbered notes [K, n] anew, also of those within.
+
+    Args:
+        notes: of a curriculum, and in them of those that it is made of; of a mixture these are
+            named by the numbers in ``part``.
+        own: the levels that it has proposed, bool [K, n]; in a mixture not all of them.
+    """
     if "place" in notes.keys():
-        notes.update(_places(*notes.batch_size))
-    for within in notes.values():
+        notes.update(_places(own))
+    mixed = "part" in notes.keys()
+    for name, within in notes.items():
         if isinstance(within, TensorDictBase):
-            _renumber(within)
+            _renumber(within, own & (notes["part"] == int(name)) if mixed else own)

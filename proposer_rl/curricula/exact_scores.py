@@ -7,8 +7,6 @@ more of them the mean of the score from episodes is this number.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,33 +15,23 @@ from proposer_rl.curricula.student import Student
 from proposer_rl.task import EpisodeLaw, Levels, NoSuccessError
 
 
-class ExactScore(NamedTuple):
-    """How a score is asked for.
-
-    Attributes:
-        needs: of the student, names of its methods.
-        ask: of a student, levels [K, n] and the episodes of which ``max_mc`` takes the expected
-            highest return: float [K, n].
-    """
-
-    needs: tuple[str, ...]
-    ask: Callable[[Student, Levels, int], Tensor]
-
-
-def return_variance(law: EpisodeLaw, gamma: float, episodes: int) -> Tensor:
-    """Variance of an episode's return, float64 [*B]."""
+def return_variance(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """Variance of an episode's return, float64 [K, n]."""
+    law = student.episode_law(levels)
     mean = (law.probability * law.outcome).sum(-1, keepdim=True)
     return (law.probability * (law.outcome - mean).square()).sum(-1)
 
 
-def max_mc(law: EpisodeLaw, gamma: float, episodes: int) -> Tensor:
+def max_mc(student: Student, levels: Levels, episodes: int) -> Tensor:
     """Expected highest return of so many episodes, minus the mean value of an episode's states."""
+    law = student.episode_law(levels)
     return expected_best(law, episodes) - (law.weight * law.value).sum(-1)
 
 
-def one_step_td_error(law: EpisodeLaw, gamma: float, episodes: int) -> Tensor:
-    """Expected mean of abs(r + gamma V' - V) over the steps of an episode, float64 [*B]."""
-    delta = law.reward + gamma * law.next_value - law.value
+def one_step_td_error(student: Student, levels: Levels, episodes: int) -> Tensor:
+    """Expected mean of abs(r + gamma V' - V) over the steps of an episode, float64 [K, n]."""
+    law = student.episode_law(levels)
+    delta = law.reward + student.gamma * law.next_value - law.value
     return (law.weight * delta.abs()).sum(-1)
 
 
@@ -79,13 +67,8 @@ def regret(student: Student, levels: Levels, episodes: int) -> Tensor:
     return student.optimal_return(levels) - student.exact_performance(levels)["return"]
 
 
-def gradient_norm(student: Student, levels: Levels, episodes: int) -> Tensor:
-    """Squared length of the gradient of the return."""
-    return student.gradient_norms(levels)
-
-
 def spread(student: Student, levels: Levels, episodes: int) -> Tensor:
-    """Variance of the return as a model tells it, in units in which the largest is a coin's, 1/4.
+    """Variance of the return as a model tells it; see :func:`in_coins`.
 
     Raises:
         NoSuccessError: if no model answers.
@@ -93,26 +76,28 @@ def spread(student: Student, levels: Levels, episodes: int) -> Tensor:
     performance = student.exact_performance(levels)
     if "spread" not in performance.keys():
         raise NoSuccessError("spread: only a model tells it, as with +source=model")
-    variance = performance["spread"]
+    return performance["spread"]
+
+
+def in_coins(variance: Tensor) -> Tensor:
+    """Variances [K, n] in units in which the largest is a coin's, 1/4."""
     return variance / (4 * variance.amax(-1, keepdim=True)).clamp(min=torch.finfo().tiny)
 
 
-def _by_law(
-    score: Callable[[EpisodeLaw, float, int], Tensor],
-    student: Student,
-    levels: Levels,
-    episodes: int,
-) -> Tensor:
-    return score(student.episode_law(levels), student.gamma, episodes)
-
-
-EXACT = {
-    "learnability": ExactScore(("exact_performance",), learnability),
-    "regret": ExactScore(("optimal_return", "exact_performance"), regret),
-    "spread": ExactScore(("exact_performance",), spread),
-    "gradient_norm": ExactScore(("gradient_norms",), gradient_norm),
-    **{
-        score.__name__: ExactScore(("episode_law",), partial(_by_law, score))
-        for score in (return_variance, max_mc, one_step_td_error)
-    },
+EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels, int], Tensor]]] = {
+    "learnability": (("exact_performance",), learnability),
+    "regret": (("optimal_return", "exact_performance"), regret),
+    "spread": (("exact_performance",), spread),
+    "gradient_norm": (
+        ("gradient_norms",),
+        lambda student, levels, _: student.gradient_norms(levels),
+    ),
+    "return_variance": (("episode_law",), return_variance),
+    "max_mc": (("episode_law",), max_mc),
+    "one_step_td_error": (("episode_law",), one_step_td_error),
 }
+"""Of each score what it needs of a student, and what it is: float [K, n].
+
+That is a function of the student, levels [K, n], and the episodes of which ``max_mc`` takes the
+expected highest return.
+"""

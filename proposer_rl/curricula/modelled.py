@@ -10,6 +10,7 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, Inbox
 from proposer_rl.curricula.outcome_model import Labels, OutcomeModel
@@ -78,9 +79,7 @@ class Modelled(Combinator):
         self._inbox.check(batch, outcome)
         if self._labels == "success" and "success" not in outcome.keys():
             raise ValueError("labels=success: the outcome has no success; above_worst needs none")
-        reached = {
-            name: outcome[name].double() for name in ("return", "success") if name in outcome.keys()
-        }
+        reached = {name: outcome[name].double() for name in self._model.reads}
         self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
         self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
 
@@ -131,7 +130,7 @@ class Modelled(Combinator):
         self._model.add(evidence["features"], outcome)
 
     def _predict(self, levels: Levels) -> TensorDict:
-        return self._model.predict(self._phi(levels))
+        return self._model.predict(self._phi(levels)).to(device_of(levels))
 
     def _phi(self, levels: Levels) -> Tensor:
         phi = self._features(levels).double().cpu()

@@ -116,12 +116,17 @@ class OutcomeModel:
             episode is above the worst: no level is silent, and each teaches something.
         ridge: on the coefficients.
         half_life: batches after which a row counts half.
+
+    Attributes:
+        reads: entries of an outcome that it takes in.
     """
 
     def __init__(
         self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
+        # One that is not needed is not always told.
+        self.reads = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
@@ -131,9 +136,9 @@ class OutcomeModel:
 
         Args:
             features: float64 [K, m, F]; a constant one is a further intercept.
-            outcome: ``return`` and, where that is what is labelled, ``success``: float64 [K, m].
+            outcome: what it ``reads``, float64 [K, m].
         """
-        kept = {name: outcome[name] for name in ("return", "success") if name in outcome}
+        kept = {name: outcome[name] for name in self.reads}
         self._batches = [*self._batches, {"features": features, **kept}]
         self._batches = self._batches[-round(KEPT * self._half_life) :]
         self._worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
@@ -181,7 +186,7 @@ class OutcomeModel:
     def _fit(self) -> _Fitted:
         entries = {
             name: torch.cat([batch[name] for batch in self._batches], 1)
-            for name in self._batches[0]
+            for name in ("features", *self.reads)
         }
         ages = torch.cat(
             [

@@ -14,7 +14,7 @@ from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
-from proposer_rl.meta.copies import Copies, CopiesHere
+from proposer_rl.meta.copies import Copies
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.view import SolverView
 from proposer_rl.models import ActorCritic, draw
@@ -167,7 +167,7 @@ class ProposerTrainer:
             )
         self.learner = learner
         self.env = env
-        self.copies = copies or CopiesHere(learner)
+        self.copies = copies or Copies(learner)
         self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:

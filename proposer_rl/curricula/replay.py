@@ -44,7 +44,7 @@ from proposer_rl.curricula.buffer import (
 )
 from proposer_rl.curricula.children import Children, Edit, Parents, lineage
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.scores import Scored, Scorer
+from proposer_rl.curricula.scores import Scored, Scorer, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
@@ -174,15 +174,13 @@ class ReplayCurriculum(Curriculum):
                 levels[~replayed] = new[~replayed]
         buffer = dict(self.buffer.items())
         known = {name: buffer[name].gather(1, slots) for name in ("best", "key", "reached")}
-        reached = buffer["reached"]
-        mean = reached.where(reached.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return self._inbox.batch(
             moved(levels, self._device),
             slot=slots,
             replayed=each.expand(copies, count),
             key=known["key"],
             best=known["best"].where(each, -torch.inf),
-            before=known["reached"].where(each, mean.nan_to_num(-torch.inf)),
+            before=self._expected(known["reached"].where(each, -torch.inf)),
         )
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
@@ -306,17 +304,35 @@ class ReplayCurriculum(Curriculum):
         self._scored += new.shape[1]
 
     def _score(
-        self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
+        self,
+        student: Student,
+        levels: Levels,
+        streams: Sequence[Streams],
+        *purpose: str | int,
+        reached: Tensor | None = None,
     ) -> Scored:
-        """Score levels [K, n] that nobody trains on."""
-        return self.scorer(student, moved(levels, self._device), streams, *purpose)
+        """Score levels [K, n] that nobody trains on; ``reached`` as of :meth:`_expected`."""
+        before = self._expected(unseen(levels.shape[:2]) if reached is None else reached)
+        return self.scorer(student, moved(levels, self._device), streams, *purpose, before=before)
+
+    def _expected(self, reached: Tensor) -> Tensor:
+        """The returns on levels when they were trained on last, float32 [K, n].
+
+        Args:
+            reached: the same, but minus infinity where they never were: there it becomes the mean
+                over the buffer.
+        """
+        known = self.buffer["reached"]
+        mean = known.where(known.isfinite(), torch.nan).nanmean(-1, keepdim=True)
+        return reached.where(reached.isfinite(), mean.nan_to_num(-torch.inf))
 
     def _score_all(self, student: Student, streams: Sequence[Streams]) -> None:
         """Renew all scores."""
         filled, place = self.buffer["filled"], torch.arange(self._capacity)
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
-        scored = self._score(student, levels_at(self.buffer["level"], slots), streams, "all")
+        levels, reached = levels_at(self.buffer["level"], slots), self.buffer["reached"]
+        scored = self._score(student, levels, streams, "all", reached=reached.gather(1, slots))
         rescore(self.buffer, slots, *scored)
 
     def _take(
@@ -352,12 +368,15 @@ class ReplayCurriculum(Curriculum):
         fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
         now = TensorDict({"slot": slots, "key": self.buffer["key"].gather(1, slots)}, slots.shape)
         before = self._before
-        if before is None or before.shape != now.shape:
+        if before is None:
             before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
         each = replayed.unsqueeze(-1)
         there = self.buffer["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
         credited = torch.zeros_like(self.buffer["filled"]).scatter(1, before["slot"], there & each)
         self.buffer["score"] += self._co_learnability * fell * credited
+        width = torch.arange(max(before.shape[1], now.shape[1]))
+        # Batches differ in size: the last level over again is credited no more than once.
+        now, before = (known[:, width.clamp(max=known.shape[1] - 1)] for known in (now, before))
         self._before = now.where(each, before)
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:

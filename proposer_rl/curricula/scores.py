@@ -5,9 +5,14 @@ the mean over the steps of each, then the mean over the episodes of a level; min
 none ends (``gradient_norm``: over all steps). A score from evaluation asks the student
 instead, and needs no episode.
 
-With A_t the generalised advantage, delta_t the error of one step, V the critic, p the probability
-of success, J the expected return, J* the largest that any policy reaches, and R the highest return
-ever seen on the level, or from evaluation the expected highest of as many episodes as ``rollouts``:
+With V the critic, gamma the discount and lambda the decay of the traces,
+
+    delta_t = r_t + gamma V(s_(t+1)) - V(s_t),    V = 0 where the episode terminated,
+
+the error of one step, A_t the generalised advantage, which is the sum of
+(gamma lambda)^i delta_(t+i), p the probability of success, J the expected return, J* the largest
+that any policy reaches, and R the highest return ever seen on the level, or from evaluation the
+expected highest of as many episodes as ``rollouts``:
 
 =======================  =============================  ====================================
 score                    from episodes                  from evaluation
@@ -29,24 +34,24 @@ mean of these over the buffer): value losses are then absolute learning progress
 2019, arXiv 1910.07224), and only ``return_variance`` and ``gradient_norm`` cannot be had. A score
 that the loop gives itself takes the place of all this.
 
-Sources: learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4), variance of a return
-that is 0 or 1; regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm: PACE (arXiv
-2605.01358); the first four: :mod:`~proposer_rl.curricula.stepwise`. The critic is discounted and R
-is not, so that ``max_mc`` is biased even at the optimum.
+Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
+MaxMC: the latter, appendix; learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4),
+variance of a return that is 0 or 1; regret: Dennis et al. 2020 (arXiv 2012.02096); gradient norm:
+PACE (arXiv 2605.01358). The critic is discounted and R is not, so that ``max_mc`` is biased even at
+the optimum.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.exact_scores import EXACT
-from proposer_rl.curricula.stepwise import STEPWISE
-from proposer_rl.curricula.student import Student
+from proposer_rl.curricula.exact_scores import EXACT, in_coins
+from proposer_rl.curricula.student import VALUE, Student, advantages
 from proposer_rl.learning import succeeded
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -60,6 +65,17 @@ READS = {
     "gradient_norm": ("rollout",),
 }
 AT_ONCE = 1024  # levels of each Solver that are evaluated at once
+
+STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
+    "positive_value_loss": lambda student, rollout, _: advantages(student, rollout).clamp_min(0),
+    "l1_value_loss": lambda student, rollout, _: advantages(student, rollout).abs(),
+    "one_step_td_error": lambda student, rollout, _: advantages(student, rollout, lmbda=0.0).abs(),
+    "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double(),
+}
+"""Scores that are read off every single step of a rollout [K, P, T]: float64 [K, P, T].
+
+The last argument is R, the highest return ever seen on each level, [K, P].
+"""
 
 
 class Episodes(NamedTuple):
@@ -149,7 +165,7 @@ class Scorer:
         }[source]
         if score not in available:
             raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
-        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score].needs
+        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score][0]
         self.reads: tuple[str, ...] = ()
         if self.from_episodes:
             self.asks = {"gradient_norm": ("policy_gradient_norms",)}.get(score, ())
@@ -225,7 +241,12 @@ class Scorer:
         return Scored(score.cpu(), best.float().cpu())
 
     def __call__(
-        self, student: Student, levels: Levels, streams: Sequence[Streams], *purpose: str | int
+        self,
+        student: Student,
+        levels: Levels,
+        streams: Sequence[Streams],
+        *purpose: str | int,
+        before: Tensor | None = None,
     ) -> Scored:
         """Score levels [K, n] that nobody trains on; the student counts what that costs.
 
@@ -234,10 +255,12 @@ class Scorer:
             levels: of each.
             streams: of the present proposal.
             purpose: below which is drawn what actions draw at random.
+            before: see :meth:`of_outcome`; None where nothing is known.
         """
-        size = student.batch_size if self.from_episodes else AT_ONCE
+        size = (student.batch_size if self.from_episodes else AT_ONCE) or levels.shape[1]
+        known = (unseen(levels.shape[:2]) if before is None else before).split(size, 1)
         scored = []
-        for batch, some in enumerate(levels.split(size or levels.shape[1], 1)):
+        for batch, some in enumerate(levels.split(size, 1)):
             if self.from_episodes:
                 played = [
                     student.play(
@@ -245,17 +268,20 @@ class Scorer:
                     )
                     for again in range(self.rollouts)
                 ]
-                new = unseen(some.shape[:2])
                 if "next" in played[0].keys():
-                    scored.append(self.of_rollouts(student, played, new))
+                    scored.append(self.of_rollouts(student, played, unseen(some.shape[:2])))
                 else:
-                    mean = torch.stack(played).mean(0)
-                    scored.append(self.of_outcome(student, mean, new, new))
+                    told: Any = torch.stack(played).cpu()  # [rollouts, K, P]
+                    mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
+                    outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
+                    scored.append(self.of_outcome(student, outcome, best, known[batch]))
             else:
+                _, ask = EXACT[self._name]
                 with torch.no_grad():
-                    score = EXACT[self._name].ask(student, some, self.rollouts).double().cpu()
+                    score = ask(student, some, self.rollouts).double().cpu()
                 scored.append(Scored(score, unseen(score.shape)))
-        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
+        score, best = (torch.cat(entries, 1) for entries in zip(*scored, strict=True))
+        return Scored(in_coins(score) if self._name == "spread" else score, best)
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:

@@ -29,7 +29,7 @@ from proposer_rl.meta.first_order import (
     over_steps,
     surrogate,
 )
-from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
+from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.task import (
     DifferentiableTask,
     EnumerableTask,
@@ -198,8 +198,7 @@ class TaskStudent(Student):
         )
         self._task, self._learner = task, learner
         self._beside: tuple[EnvBase, RolloutCollector] | None = None
-        self._norms: Callable[..., Tensor] | None = None
-        self._policy_norms: Callable[..., Tensor] | None = None
+        self._gradients: LevelGradients | None = None
 
     def lacks(self, name: str) -> str | None:
         """Why its task does not allow it; None if it does."""
@@ -248,12 +247,15 @@ class TaskStudent(Student):
 
     def _gradient_norms(self, levels: Levels) -> Tensor:
         self.spend(evaluations=levels.shape[-1])
-        self._norms = self._norms or squared_gradients(self._task)
-        return self._norms(self._learner, levels)
+        return self._of_levels().of_returns(self._learner, levels)
 
     def _policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
-        self._policy_norms = self._policy_norms or squared_policy_gradients(self._task)
-        return self._policy_norms(self._learner, rollout, advantages(self, rollout).float())
+        advantage = advantages(self, rollout).float()
+        return self._of_levels().of_rollouts(self._learner, rollout, advantage)
+
+    def _of_levels(self) -> LevelGradients:
+        self._gradients = self._gradients or LevelGradients(self._task)
+        return self._gradients
 
     def _target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
         self.spend(evaluations=levels.shape[-1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -38,8 +38,18 @@ def taken_out(env: SolverTrainingEnv, index: int) -> Trained:
     return Trained(env.solvers.snapshot()[own], levels[own], Update(rollout[own], metrics[own]))
 
 
-class Copies(Protocol):
-    """Where the replicas of the Solver are trained while the Proposer acts on them."""
+class Copies:
+    """The replicas of the Solver, which are trained while the Proposer acts on them.
+
+    All of them are in this process, as the Proposer's environment.
+
+    Args:
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv`.
+    """
+
+    def __init__(self, proposer: PPO) -> None:
+        self._proposer = proposer
+        self._env: SolverTrainingEnv = proposer.env
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
         """One episode of K replicas of a Solver.
@@ -52,35 +62,14 @@ class Copies(Protocol):
             The Proposer's rollout, [K, T], ready for
             :meth:`~proposer_rl.learning.ppo.PPO.optimise`.
         """
-
-    def trained(self, copy: int) -> Trained:
-        """One replica, by its number, as the last episode has left it."""
-
-    def close(self) -> None:
-        """Let go of all that is held outside of this process; a further episode starts anew."""
-
-
-class CopiesHere:
-    """All replicas in this process, as the Proposer's environment.
-
-    Args:
-        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv`.
-    """
-
-    def __init__(self, proposer: PPO) -> None:
-        self._proposer = proposer
-        self._env: SolverTrainingEnv = proposer.env
-
-    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
-        """See :meth:`Copies.roll_out`."""
         env = self._env
         env.fork(solver, streams)
         copies = range(env.batch_size[0])
         return self._proposer.collect(action_generators(streams, copies))
 
     def trained(self, copy: int) -> Trained:
-        """See :meth:`Copies.trained`."""
+        """One replica, by its number, as the last episode has left it."""
         return taken_out(self._env, copy)
 
     def close(self) -> None:
-        """Nothing is held outside."""
+        """Let go of all that is held outside of this process; a further episode starts anew."""

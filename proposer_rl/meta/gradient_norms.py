@@ -35,84 +35,73 @@ Value = Callable[[ActorCritic, int, Tensor], Tensor]
 """Of m agents in a population, a Solver and the places of m of its levels, int64 [m]: float [m]."""
 
 
-def squared_gradients(task: Task) -> Callable[[PPO, Levels], Tensor]:
-    """Makes the function that scores levels by the gradient of their exact return.
-
-    Args:
-        task: a :class:`~proposer_rl.task.DifferentiableTask`.
-
-    Returns:
-        A function of a learner of K Solvers, which it leaves as it is, and levels [K, n], each to
-        be scored for its Solver: float [K, n], without gradients.
-    """
-    lengths, exact = level_gradients(task), cast(DifferentiableTask, task)
-
-    def score(learner: PPO, levels: Levels) -> Tensor:
-        def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
-            some = levels[solver, which].unsqueeze(-1)
-            return exact.differentiable_performance(agent, some)["return"].squeeze(-1)
-
-        return lengths(learner, returns, *levels.batch_size)
-
-    return score
-
-
-def squared_policy_gradients(
-    task: Task,
-) -> Callable[[PPO, TensorDictBase, Tensor], Tensor]:
-    """Makes the function that scores levels by the policy gradient of episodes on them.
-
-    The estimate of a level's gradient has the length of its noise, too: short rollouts score higher
-    than the exact gradient by its variance.
-
-    Returns:
-        A function of a learner of K Solvers, a rollout [K, n, T] of theirs and its advantages,
-        float [K, n, T]: float [K, n], the squared length of the gradient of the mean over the steps
-        of A_t log pi(a_t | s_t).
-    """
-    lengths = level_gradients(task)
-
-    def score(learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
-        def gained(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
-            steps = rollout[solver][which].unsqueeze(1)  # [m, 1, T]
-            return surrogate(agent, steps, advantage[solver, which].unsqueeze(1)).squeeze(-1)
-
-        return lengths(learner, gained, *rollout.batch_size[:2])
-
-    return score
-
-
-def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
-    """Makes what takes the gradient of each level by itself, and a population for it to work with.
+class LevelGradients:
+    """Squared lengths of the gradients of single levels, and a population to take them with.
 
     The population has :data:`AT_ONCE` Solvers. All of them become copies of one whose levels are to
     be scored, and each gets one level of its own. So the sum of their values, differentiated once,
     gives each the gradient of its level.
 
-    Returns:
-        A function of a learner of K Solvers, the value of a level, K, and the number n of levels
-        of each: the squared lengths of its gradients, float [K, n].
+    Args:
+        task: whose learners' levels are scored; the learners are left as they are.
     """
-    agent = task.learner([Streams(0)] * AT_ONCE).agent
-    parameters, values = dict(agent.named_parameters()), agent_values(agent)
 
-    def become(learner: PPO, solver: int) -> None:
-        with torch.no_grad():
-            for name, value in agent_values(learner.agent).items():
-                values[name].copy_(value[solver])
+    def __init__(self, task: Task) -> None:
+        self._task, self._agent = task, task.learner([Streams(0)] * AT_ONCE).agent
 
-    def lengths(learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
+    def of_returns(self, learner: PPO, levels: Levels) -> Tensor:
+        """Of the exact return, where the task is a :class:`~proposer_rl.task.DifferentiableTask`.
+
+        Args:
+            learner: of K Solvers.
+            levels: [K, n], each to be scored for its Solver.
+
+        Returns:
+            float [K, n], without gradients.
+        """
+        task = cast(DifferentiableTask, self._task)
+
+        def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            some = levels[solver, which].unsqueeze(-1)
+            return task.differentiable_performance(agent, some)["return"].squeeze(-1)
+
+        return self.lengths(learner, returns, *levels.batch_size)
+
+    def of_rollouts(self, learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
+        """Of the mean over the steps of A_t log pi(a_t | s_t): the policy gradient of episodes.
+
+        The estimate of a level's gradient has the length of its noise, too: short rollouts score
+        higher than the exact gradient by its variance.
+
+        Args:
+            learner: of K Solvers.
+            rollout: of theirs, [K, n, T].
+            advantage: float [K, n, T].
+
+        Returns:
+            float [K, n], without gradients.
+        """
+
+        def gained(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            steps = rollout[solver][which].unsqueeze(1)  # [m, 1, T]
+            return surrogate(agent, steps, advantage[solver, which].unsqueeze(1)).squeeze(-1)
+
+        return self.lengths(learner, gained, *rollout.batch_size[:2])
+
+    def lengths(self, learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
+        """Of any value of a level, for K Solvers with n levels each: float [K, n]."""
+        parameters = dict(self._agent.named_parameters())
         parts = []
         for solver in range(solvers):
-            become(learner, solver)
+            self._become(learner, solver)
             for start in range(0, count, AT_ONCE):
                 # Filled up with the last one.
-                which = torch.arange(start, start + AT_ONCE, device=task.device).clamp_(
+                which = torch.arange(start, start + AT_ONCE, device=self._task.device).clamp_(
                     max=count - 1
                 )
                 with torch.enable_grad():
                     gradients = torch.autograd.grad(
-                        value(agent, solver, which).sum(),
+                        value(self._agent, solver, which).sum(),
                         list(parameters.values()),
                         allow_unused=True,
                         materialize_grads=True,
@@ -121,4 +110,8 @@ def level_gradients(task: Task) -> Callable[[PPO, Value, int, int], Tensor]:
                 parts.append(squared_length(named)[: count - start])
         return torch.cat(parts).unflatten(0, (solvers, count))
 
-    return lengths
+    @torch.no_grad()
+    def _become(self, learner: PPO, solver: int) -> None:
+        own = agent_values(self._agent)
+        for name, value in agent_values(learner.agent).items():
+            own[name].copy_(value[solver])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations
 from math import exp
 from typing import Any
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from proposer_rl.curricula import (
     Batch,
+    Curriculum,
     Filtered,
     Improvement,
+    Inbox,
     LearnedCurriculum,
     Mixed,
     SamplingCurriculum,
@@ -98,6 +101,41 @@ def test_a_proposers_student_trains_on_some_of_its_proposals() -> None:
     assert set(level_keys(batch.levels)[0].tolist()) <= set(level_keys(many.levels)[0].tolist())
     assert some.trains_replicas and some.learnt().keys() == {"proposer", "observed"}
     assert not filtered(LEARNED["frozen"]()).trains_replicas
+
+
+class Numbered(Curriculum):
+    """Has an inbox, and takes nothing but whole batches."""
+
+    def __init__(self) -> None:
+        self.inbox = Inbox()
+
+    def propose(self, student: Student, count: int, streams: Any) -> Batch:
+        return self.inbox.batch(torch.zeros(len(streams), count))
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        self.inbox.check(batch, outcome)
+        self.inbox.put(batch, reached=outcome["return"])
+
+
+@pytest.mark.parametrize("kept", [range(9), [1, 2, 4, 7], [8]])
+def test_what_is_kept_of_a_mixture_is_a_whole_batch_of_each(kept: Sequence[int]) -> None:
+    """Also of a mixture within a schedule within the mixture, whose levels are 2 to 7."""
+    parts = [Numbered() for _ in range(4)]
+    inner = Schedule([Mixed(parts[1:3], [1, 2])], [])
+    curriculum = Mixed([parts[0], inner, parts[3]], [2, 6, 1])
+    batch = curriculum.propose(Student(), 9, [Streams(0), Streams(1)])
+    some = batch.keep(torch.tensor([[*kept]] * 2))
+    reached = torch.tensor([[*kept]] * 2).float()
+    for place in reversed(range(some.count)):  # in parts, the last one first
+        told = TensorDict({"return": reached[:, [place]]}, [2, 1])
+        curriculum.observe(Student(), some[:, [place]], told)
+    own = range(2), range(2, 4), range(4, 8), range(8, 9)
+    for part, its in zip(parts, own, strict=True):
+        expected = [place for place in kept if place in its]
+        taken = part.inbox.take(whole=True)
+        assert [evidence["reached"][1].tolist() for evidence in taken] == [expected] * (
+            len(expected) > 0
+        )
 
 
 class Noted(LearnedCurriculum):

@@ -25,6 +25,7 @@ from proposer_rl.curricula import (
     outcome_of,
     require,
 )
+from proposer_rl.curricula.contract import PATIENCE
 from proposer_rl.curricula.student import ABILITIES
 from proposer_rl.learning import PPO
 from proposer_rl.recipes import CONFIG_FOLDER
@@ -257,6 +258,23 @@ def test_an_inbox_hands_out_in_order_and_waits_for_what_is_incomplete() -> None:
     taken = inbox.take(whole=True)
     assert [evidence["seen"][1].tolist() for evidence in taken] == [[0, 1, 2, 3], [0, 1, 2]]
     assert inbox.take() == []
+
+
+def test_a_level_that_never_comes_back_holds_nothing_up_for_good() -> None:
+    inbox = Inbox()
+    batches = [inbox.batch(torch.full((1, 3), number)) for number in range(PATIENCE)]
+    inbox.put(batches[0][:, 1:], seen=batches[0].levels[:, 1:])
+    for batch in batches[1:]:
+        inbox.put(batch, seen=batch.levels)
+    assert inbox.take(whole=True) == []  # it may still come
+    inbox.batch(torch.zeros(1, 3))
+    taken = inbox.take(whole=True)
+    assert [evidence["seen"].tolist() for evidence in taken] == [[[0, 0]]] + [
+        [[number] * 3] for number in range(1, PATIENCE)
+    ]
+    late = batches[0][:, :1]
+    inbox.put(late, seen=late.levels)
+    assert [evidence["seen"].tolist() for evidence in inbox.take(whole=True)] == [[[0]]]
 
 
 def test_no_module_hides_a_method() -> None:

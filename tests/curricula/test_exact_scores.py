@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
-from proposer_rl.curricula import TaskStudent
+from proposer_rl.curricula import Student, TaskStudent
 from proposer_rl.curricula.exact_scores import expected_best, return_variance
-from proposer_rl.curricula.scores import Scored, Scorer, unseen
+from proposer_rl.curricula.scores import AT_ONCE, Scored, Scorer, unseen
 from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import EpisodeLaw, NoSuccessError
@@ -32,7 +32,8 @@ def of_returns(outcome: list[float], probability: list[float]) -> EpisodeLaw:
 
 
 def test_they_are_those_of_the_table() -> None:
-    assert float(return_variance(TABLE, 0.9, 1)) == pytest.approx(0.248925)
+    student = Student(episode_law=lambda levels: TABLE)
+    assert float(return_variance(student, None, 1)) == pytest.approx(0.248925)
     for count, best in ((1, 0.42), (2, 0.66796875), (4, 0.886723)):
         assert float(expected_best(TABLE, count)) == pytest.approx(best, abs=1e-6)
 
@@ -80,6 +81,23 @@ def test_scores_of_ever_more_episodes_are_the_exact_ones() -> None:
         for each, expected in zip(sampled.score.view(2, -1), exact.score[0] * shrunk, strict=True):
             error = float(each.std()) / math.sqrt(COPIES)
             assert float(each.mean()) == pytest.approx(float(expected), abs=4 * error)
+
+
+def test_the_largest_spread_of_all_levels_is_a_coins() -> None:
+    """However many are asked about at once."""
+    count = 2 * AT_ONCE + 5
+    variance = torch.rand(2, count, generator=torch.Generator().manual_seed(0)).double() * 0.1
+    variance[:, -1] = torch.tensor([0.4, 30.0])
+    told = {"success": variance, "return": variance, "spread": variance}
+    student = Student(
+        exact_performance=lambda places: TensorDict(
+            {name: entry.gather(1, places) for name, entry in told.items()}, places.shape
+        )
+    )
+    places = torch.arange(count).expand(2, -1)
+    found = Scorer("spread", "exact")(student, places, [Streams(0), Streams(1)]).score
+    unit = 4 * torch.tensor([[0.4], [30.0]])
+    torch.testing.assert_close(found, variance / unit, check_dtype=False)
 
 
 def test_learnability_needs_a_task_that_tells_success() -> None:

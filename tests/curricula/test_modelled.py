@@ -109,6 +109,25 @@ def test_it_takes_a_student_of_whom_nothing_is_known_but_what_it_did() -> None:
     curriculum.propose(Student(), 3, [Streams(1)])
 
 
+def test_success_that_is_not_needed_may_be_told_of_some_levels_alone() -> None:
+    """In parts of a batch, and in some batches: it makes no difference."""
+    skills = torch.tensor([[0.0, 0.2, 0.8, 1.0]])
+    predicted = []
+    for told in (True, False):
+        student = Scripted(skills)
+        curriculum = scripted_filter(student)
+        for update in range(3):
+            batch = curriculum.propose(student, 8, [Streams(0, update)])
+            outcome = reached(skills.gather(1, batch.levels))
+            for part in (slice(0, 4), slice(4, 8)):
+                some = outcome[:, part]
+                if not told or update == 1 or part.start:
+                    some = some.exclude("success")
+                curriculum.observe(student, batch[:, part], some)
+        predicted.append(curriculum.propose(student, 8, [Streams(0)]).notes["predicted"])
+    assert predicted[0].equal(predicted[1])
+
+
 def test_features_that_are_not_finite_are_refused() -> None:
     uniform = SimpleNamespace(sample=lambda n, g: torch.zeros(n))
     features = lambda levels: levels.unsqueeze(-1) / 0  # noqa: E731

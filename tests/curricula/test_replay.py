@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.errors import ConfigError
-from proposer_rl.curricula import ReplayCurriculum, Scorer, TaskStudent, outcome_of
+from proposer_rl.curricula import ReplayCurriculum, Scorer, Student, TaskStudent, outcome_of
 from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (
     ReplayRule,
@@ -122,6 +122,25 @@ def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
         )
 
 
+def test_new_levels_without_a_critic_are_compared_with_what_was_reached_elsewhere() -> None:
+    """In a full buffer they take the place of levels on which nothing changes."""
+    reached = 0.5
+
+    def play(levels: Any, generators: Any) -> TensorDict:
+        return TensorDict({"return": torch.full(levels.shape, reached)}, levels.shape)
+
+    curriculum, taught = replay("l1_value_loss", capacity=8), Student(play=play)
+    for number in range(4):
+        batch = curriculum.propose(taught, P, [streams_of(number)])
+        curriculum.observe(taught, batch, TensorDict({"return": torch.full((1, P), 0.5)}, [1, P]))
+    buffer = curriculum.buffer[0]
+    assert bool(buffer["filled"].all()) and bool((buffer["score"] == 0).all())
+    known, reached = set(buffer["key"].tolist()), 0.75
+    curriculum.propose(taught, P, [streams_of(4)])
+    score = dict(zip(buffer["key"].tolist(), buffer["score"].tolist(), strict=True))
+    assert [score[key] for key in score.keys() - known] == [0.25] * P
+
+
 def test_a_level_that_has_left_the_buffer_meanwhile_scores_no_other() -> None:
     curriculum, taught = replay("regret", train_on_new=True, replay_probability=1.0), student(0)
     for number in range(4):
@@ -215,6 +234,60 @@ def test_credit_goes_to_the_levels_trained_on_before() -> None:
     assert curriculum._before["slot"].equal(slots)
     expected[4:7] += 0.5 * (0.4 + 0.8 + 0.2 + 0.2) / 4
     torch.testing.assert_close(buffer["score"][0], expected)
+
+
+SIZES = [8, 5, 3, 6, 6, 1, 7]
+
+
+def credited(seeds: list[int], probability: float) -> tuple[ReplayCurriculum, list[Any]]:
+    """Batches of many sizes with scores that are told: who was taught, and the scores over time."""
+    curriculum = replay(
+        "regret",
+        train_on_new=True,
+        capacity=8,
+        replay_probability=probability,
+        co_learnability=0.5,
+    )
+    seen = []
+    for number, count in enumerate(SIZES):
+        streams = [Streams(seed, number) for seed in seeds]
+        batch = curriculum.propose(Student(), count, streams)
+        score = torch.stack([torch.rand(count, generator=s.generator("score")) for s in streams])
+        before = curriculum.buffer["score"].clone()
+        outcome = TensorDict({"return": torch.zeros_like(score), "score": score}, score.shape)
+        curriculum.observe(Student(), batch, outcome)
+        curriculum.log()
+        seen.append((batch, score.double(), before, curriculum.buffer["score"].clone()))
+    return curriculum, seen
+
+
+def test_credit_needs_no_batches_of_one_size() -> None:
+    """By a plain loop over the levels of each batch."""
+    _, seen = credited([0], 1.0)
+    last: set[int] = set()
+    raised = 0.0
+    for batch, score, before, after in seen[1:]:  # the first one fills the buffer
+        assert bool(batch.notes["replayed"].all())
+        expected, slots = before[0].tolist(), batch.notes["slot"][0].tolist()
+        for slot in {*slots}:
+            told = [float(new) for new, where in zip(score[0], slots, strict=True) if where == slot]
+            expected[slot] = sum(told) / len(told)
+        fell = sum(float(before[0, slot]) - expected[slot] for slot in slots) / len(slots)
+        for slot in last:
+            expected[slot] += 0.5 * fell
+            raised += abs(fell)
+        assert after[0].tolist() == pytest.approx(expected)
+        last = {*slots}
+    assert raised > 1
+
+
+def test_each_student_gets_its_own_credit() -> None:
+    """Where one replays and the other does not, in batches of many sizes."""
+    both, seen = credited([0, 1], 0.6)
+    assert any(batch.notes["replayed"][:, 0].tolist() in ([0, 1], [1, 0]) for batch, *_ in seen)
+    for k in (0, 1):
+        alone, _ = credited([k], 0.6)
+        assert both.buffer["score"][k].tolist() == alone.buffer["score"][0].tolist()
 
 
 def test_what_is_logged_shows_levels() -> None:

@@ -12,8 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.curricula import Student, TaskStudent
-from proposer_rl.curricula.scores import Scorer, episodes, unseen
-from proposer_rl.curricula.stepwise import STEPWISE
+from proposer_rl.curricula.scores import STEPWISE, Scorer, episodes, unseen
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
@@ -188,25 +187,54 @@ def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
         torch.testing.assert_close(here, share * (1 - share), atol=1e-6, rtol=0)
 
 
+def one_step(reached: Tensor, success: Tensor, value: Tensor) -> TensorDict:
+    """A rollout [1, n, 1] of an episode on each level, all [1, n]."""
+    done = torch.ones(*reached.shape, 1, 1, dtype=torch.bool)
+    after = {"done": done, "terminated": done, "success": success.view_as(done)}
+    after |= {"reward": reached.view(done.shape), "state_value": torch.zeros(done.shape)}
+    return TensorDict(
+        {"state_value": value.view(done.shape), "next": after},
+        [*reached.shape, 1],
+        names=[None, None, "time"],
+    )
+
+
 def test_without_a_rollout_an_episode_is_a_step_and_the_last_return_the_critic() -> None:
     """As of a rollout of one step, whose value is the return before."""
     reached, value = torch.tensor([[0.2, 0.9, -1.0]]), torch.tensor([[0.5, 0.3, -torch.inf]])
     best = torch.tensor([[0.5, 0.7, -torch.inf]])
     outcome = TensorDict({"return": reached, "success": (reached > 0).float()}, [1, 3])
     known = value.where(value.isfinite(), reached)  # at first there is nothing to learn
-    step = torch.ones(1, 3, 1, 1, dtype=torch.bool)
-    after = {"done": step, "terminated": step, "success": outcome["success"].view(1, 3, 1, 1) > 0}
-    after |= {"reward": reached.view(1, 3, 1, 1), "state_value": torch.zeros(1, 3, 1, 1)}
-    rollout = TensorDict(
-        {"state_value": known.view(1, 3, 1, 1), "next": after},
-        [1, 3, 1],
-        names=[None, None, "time"],
-    )
+    rollout = one_step(reached, reached > 0, known)
     for name in (*STEPWISE, "regret"):
         scorer = Scorer(name, "episodes")
         found = scorer.of_outcome(LEARNER, outcome, best, value)
         expected = scorer.of_rollouts(LEARNER, [rollout], best)
         torch.testing.assert_close(found, expected, msg=name)
+
+
+def test_of_outcomes_of_several_plays_the_mean_and_the_highest_count() -> None:
+    """As of as many rollouts of one step; value losses are those of the mean return."""
+    g, shape = torch.Generator().manual_seed(0), (1, 5)
+    plays = [torch.rand(shape, generator=g) for _ in range(4)]
+    before, mean = torch.rand(shape, generator=g), torch.stack(plays).mean(0)
+
+    def play(places: Tensor, generators: Any) -> TensorDict:
+        reached = next(left).gather(1, places)
+        ones = torch.ones(places.shape, dtype=torch.int64)
+        told = {"return": reached, "success": (reached > 0.5).float()}
+        return TensorDict({**told, "episodes": ones, "steps": ones}, places.shape)
+
+    levels, student = torch.arange(5)[None], Student(play=play, batch_size=3)
+    for name in (*STEPWISE, "regret", "learnability"):
+        of_the_mean = name in STEPWISE.keys() - {"max_mc"}
+        rollouts = [one_step(r, r > 0.5, before) for r in ([mean] if of_the_mean else plays)]
+        left = iter(plays * 2)  # for the first three levels, and for the others
+        scorer = Scorer(name, "episodes", rollouts=4)
+        found = scorer(student, levels, [Streams(0)], before=before)
+        expected = scorer.of_rollouts(LEARNER, rollouts, unseen(shape))
+        torch.testing.assert_close(found.score, expected.score, msg=name)
+        torch.testing.assert_close(found.best, torch.stack(plays).amax(0))
 
 
 def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own() -> None:

@@ -15,7 +15,7 @@ from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import PPO
 from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.learning.snapshot import agent_weights, load_agent
-from proposer_rl.meta.gradient_norms import level_gradients
+from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.models.normalization import LARGEST, RunningMoments
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
@@ -155,7 +155,7 @@ def test_only_training_moves_the_moments(trained: Any) -> None:
         values.append(clones(shown)["state_value"])
         return values[-1].flatten()
 
-    level_gradients(task)(learner, value, K, 1)
+    LevelGradients(task).lengths(learner, value, K, 1)
     for k in range(K):
         expected = agent(state.clone())["state_value"][k, 0, 0]
         torch.testing.assert_close(values[k][0, 0, 0], expected)

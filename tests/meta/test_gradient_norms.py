@@ -11,7 +11,7 @@ from torch import Tensor
 
 from proposer_rl.learning.ppo import PPO
 from proposer_rl.meta import gradient_norms
-from proposer_rl.meta.gradient_norms import squared_gradients, squared_policy_gradients
+from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level
@@ -60,14 +60,14 @@ def test_they_are_those_of_finite_differences(
 ) -> None:
     monkeypatch.setattr(gradient_norms, "AT_ONCE", at_once)
     ppo, levels = learner(some_levels(2, 1)), some_levels(2, 4)
-    found = squared_gradients(Precise())(ppo, levels)
+    found = LevelGradients(Precise()).of_returns(ppo, levels)
     torch.testing.assert_close(found, numerical(ppo, levels), rtol=1e-6, atol=1e-12)
     assert not found.requires_grad and (found[0] != found[1]).all()
 
 
 def test_they_are_those_of_single_levels_also_after_training() -> None:
     ppo = TASK.learner([Streams(0), Streams(1)])
-    score = squared_gradients(TASK)
+    score = LevelGradients(TASK).of_returns
     levels = torch.stack([TASK.space.sample(5, Streams(k).generator()) for k in (0, 1)])
     for _ in range(2):  # the same population serves Solvers that have changed
         before = ppo.snapshot()
@@ -82,7 +82,7 @@ def test_those_of_episodes_are_of_single_policy_gradients() -> None:
     ppo.update([Streams(k).generator("first") for k in (0, 1)])  # a fresh policy is nearly even
     rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
     advantage = torch.randn(rollout.shape, generator=torch.Generator().manual_seed(0))
-    found = squared_policy_gradients(TASK)(ppo, rollout, advantage)
+    found = LevelGradients(TASK).of_rollouts(ppo, rollout, advantage)
     expected = torch.zeros(found.shape)
     for k in range(2):
         for i in range(found.shape[1]):
@@ -101,14 +101,14 @@ def test_nothing_is_drawn_at_random() -> None:
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    squared_gradients(TASK)(ppo, levels)
+    LevelGradients(TASK).of_returns(ppo, levels)
     assert torch.equal(torch.rand(4), expected)
 
 
 def test_where_the_return_cannot_change_it_is_zero() -> None:
     solvable, walled = "S..\n...\n..G", "S#.\n##.\n..G"
     levels = Level.from_text([walled, solvable, walled]).reshape(1, 3)
-    found = squared_gradients(Precise())(learner(levels, 1), levels)
+    found = LevelGradients(Precise()).of_returns(learner(levels, 1), levels)
     assert found[0, 0] == found[0, 2] == 0 < found[0, 1]
 
 
@@ -124,5 +124,5 @@ def test_the_uniform_policy_next_to_the_goal_in_closed_form() -> None:
         parameter.data.zero_()
     slope = 8 * 0.75**7 + 0.01 * sum(t * 0.75 ** (t - 1) for t in range(8))
     expected = 3 * slope**2 * sum((0.25 * ((a == 3) - 0.25)) ** 2 for a in range(4))
-    found = squared_gradients(Precise())(ppo, levels)
+    found = LevelGradients(Precise()).of_returns(ppo, levels)
     assert found.item() == pytest.approx(expected, rel=1e-12)

@@ -14,8 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector
 
 from proposer_rl.learning import PPO, DivergedError
-from proposer_rl.meta.copies import Trained
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.copies import Copies, Trained
 from proposer_rl.meta.workers.engines import (
     WorkersError,
     WorkerSettings,
@@ -31,7 +30,7 @@ from proposer_rl.streams import Streams
 ATTEMPTS = 3
 
 
-class CopiesInWorkers:
+class CopiesInWorkers(Copies):
     """Copies that are trained by workers, each of which has a share of them.
 
     Where a worker is lost, all are started anew and the episode is repeated, with the same numbers.
@@ -52,8 +51,7 @@ class CopiesInWorkers:
         make_env: MakeEnv,
         settings: WorkerSettings,
     ) -> None:
-        self._proposer = proposer
-        self._env: SolverTrainingEnv = proposer.env
+        super().__init__(proposer)
         self._make_env = make_env
         self._settings = settings
         self._shares = shares(self._env.batch_size[0], settings.workers)
