@@ -73,7 +73,8 @@ class PairedProposer(ProblemProposer):
 
     Of the students' performance, which may be exact; published are the antagonist's best and the
     protagonist's mean episode. The levels are draws from the space's bins rather than built cell by
-    cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back.
+    cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back, or
+    32 newer ones have been proposed.
 
     Args:
         space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
