@@ -196,11 +196,9 @@ class GymnasiumTask(Task):
         module = TensorDictModule(population, seen, ["logits", "state_value"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
-    def evaluation_levels(self, name: str) -> TensorDictBase:
-        """The fixed evaluation levels [E] of a distribution, of other seeds than the training's."""
-        distribution = self._test.get(name, self.distributions[name])
-        levels: TensorDictBase = distribution.sample(self._levels, self.stream("levels", name))
-        return levels
+    def evaluation_distribution(self, name: str) -> ParameterSpace:
+        """A distribution, of other seeds than the training's."""
+        return self._test.get(name, self.distributions[name])
 
     def stream(self, use: str, name: str) -> torch.Generator:
         """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
