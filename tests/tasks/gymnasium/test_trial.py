@@ -17,7 +17,12 @@ from tensordict import TensorDict
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
+    MakeEnvironment,
+    Play,
+    WrapperError,
+)
 from proposer_rl.tasks.gymnasium.settings import (
     NetworkSettings,
     ParameterSettings,
@@ -157,16 +162,35 @@ def test_a_nested_or_optional_entry_of_the_info_can_tell_success() -> None:
     line_task(odd(**only), success=SuccessSettings(kind="info", key="won", optional=True))
 
 
+NEVER_OVER = {"step": lambda self, a: (*Line.step(self, 0)[:4], {})}
+
+
 def test_survival_is_the_time_limit_and_nothing_else() -> None:
     """An environment that cuts an episode off by itself has not let it survive."""
     cut = odd(step=lambda self, a: (*Line.step(self, a)[:2], False, self.t >= 5, {}))
     rule = SuccessSettings(kind="survived")
     with pytest.warns(UserWarning, match="cut an episode off after 5 steps, before the time limit"):
         task = line_task(cut, success=rule)
-    whole = line_task(odd(step=lambda self, a: (*Line.step(self, 0)[:4], {})), success=rule)
+    whole = line_task(odd(**NEVER_OVER), success=rule)
     for made, survives in ((task, 0.0), (whole, 1.0)):
         agent = made.learner([Streams(0)]).agent
         assert made.measure(agent)["target_success"] == survives
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 5}},
+        {"gymnasium.wrappers.MaxAndSkipObservation": {"skip": 5}},
+    ],
+)
+def test_a_wrapper_may_hold_the_time_limit_or_take_several_steps_at_once(wrapper: Any) -> None:
+    """The limit of 12 steps ends an episode at the third action where each is taken five times."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rule = SuccessSettings(kind="survived")
+        task = line_task(odd(**NEVER_OVER), success=rule, wrappers=[wrapper])
+    assert task.measure(task.learner([Streams(0)]).agent)["target_success"] == 1.0
 
 
 KINDS = odd(__init__=with_parts)
@@ -337,6 +361,31 @@ def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
         with pytest.raises(UnfitEnvironmentError, match=f"{said}.* level goal={goal:g}, seed=7$"):
             env.rollout(5 * LIMIT, break_when_any_done=False)
         env.close()
+
+
+def that_fits_the_ends(env: Any) -> Any:
+    if env.unwrapped.goal not in (1.0, 3.0):  # which the trial plays
+        raise RuntimeError("it fits\nno other")
+    return env
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_a_wrapper_that_fails_after_the_trial_is_blamed(vectorization: Any) -> None:
+    """Also where it fails in a process of its own, whose error has to be sent."""
+
+    def built(self: Any, goal: float = 3.0, render_mode: str | None = None) -> None:
+        self.goal = goal
+
+    goal = {"goal": ParameterSettings(set="argument", low=1.0, high=3.0, target=3.0)}
+    task = line_task(
+        odd(__init__=built), parameters=goal, vectorization=vectorization,
+        wrappers=["tests.tasks.gymnasium.test_trial.that_fits_the_ends"],
+    )  # fmt: skip
+    level = TensorDict({"goal": torch.tensor([[2.0]]), "seed": torch.tensor([[7]])}, [1, 1])
+    with pytest.raises(
+        WrapperError, match=r"wrappers: .*that_fits_the_ends: RuntimeError: it fits"
+    ):
+        task.environment(level)
 
 
 @pytest.mark.parametrize("drawn", [True, False])
