@@ -18,7 +18,7 @@ from proposer_rl.curricula import Batch, Curriculum, SamplingCurriculum, Student
 from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
-from tests.tasks.gymnasium.toys import TINY
+from tests.tasks.gymnasium.toys import CHOICES, TINY
 
 # Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
@@ -36,6 +36,7 @@ CALLED = {
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
+    "choices": ["+method=plr", *CHOICES, *FEW],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
 }
 
