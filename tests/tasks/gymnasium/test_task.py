@@ -337,6 +337,16 @@ def test_levels_can_be_seeds_alone_of_separate_sets() -> None:
     assert record["level"].keys() == {"seed"}
 
 
+@pytest.mark.usefixtures("own_folder")
+def test_a_model_of_outcomes_needs_more_than_seeds(
+    train: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk = [f"task.env_id={WALK}", "task.success.kind=terminated", *TINY, "hydra.run.dir=run"]
+    assert train("task=gymnasium", "+method=plr", "+filter=model", *walk) == 2
+    said = capsys.readouterr().err.strip()
+    assert "space: must have axes" in said and "\n" not in said and not Path("run").exists()
+
+
 def test_single_levels_are_of_the_seeds_that_are_measured_on() -> None:
     """Of an environment that pays for the seeds below 3 alone."""
 
