@@ -68,13 +68,13 @@ def _observations(space: spaces.Space[Any]) -> Change:
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
 
     def changed(seen: Any) -> Any:
-        values = dict(_values(seen))
+        shown = dict(values(seen))
         out: dict[str, Any] = {
-            f"image {name}": _of_three_axes(_typed(box, values[name]))
+            f"image {name}": _of_three_axes(_typed(box, shown[name]))
             for name, box in images.items()
         }
         if rest.spaces:
-            out[NUMBERS] = spaces.flatten(rest, {name: values[name] for name in rest.spaces})
+            out[NUMBERS] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
         return out if len(out) > 1 else next(iter(out.values()))
 
     return changed, _space_of(images, rest)
@@ -253,11 +253,11 @@ def leaves(space: spaces.Space[Any], name: str = "") -> Iterator[tuple[str, spac
         yield name, space
 
 
-def _values(seen: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """The same of a value."""
+def values(seen: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """The parts of an observation that are no dictionaries or tuples, by their dotted names."""
     if isinstance(seen, Mapping | tuple):
         for part, inner in seen.items() if isinstance(seen, Mapping) else enumerate(seen):
-            yield from _values(inner, f"{name}.{part}" if name else str(part))
+            yield from values(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, seen
 
