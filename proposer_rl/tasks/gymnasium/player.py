@@ -162,7 +162,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def in_time(self) -> bool:
         """Whether the episode has reached no time limit, each counting the steps it has seen."""
         limits = [one for one in _wrappers(self.env) if isinstance(one, TimeLimit)]
-        return all(one._elapsed_steps < one._max_episode_steps for one in limits)
+        return all((one._elapsed_steps or 0) < one._max_episode_steps for one in limits)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
