@@ -43,13 +43,17 @@ def plain(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     acts = _actions(env.action_space)
     if acts is not None:
         env = TransformAction(env, *acts)
-    return TransformObservation(env, *_observations(env.observation_space))
+    seen = _observations(env.observation_space)
+    return env if seen is None else TransformObservation(env, *seen)
 
 
-def _observations(space: spaces.Space[Any]) -> Change:
-    """What makes observations plain, and their space."""
+def _observations(space: spaces.Space[Any]) -> Change | None:
+    """What makes observations plain, and their space; None where they are.
+
+    Any numbers are floats to a vector environment, which keeps whole ones only of their own type.
+    """
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
-        return partial(_typed, space), space
+        return (partial(_typed, space), space) if space.dtype.kind in "biu" else None
     parts = dict(leaves(space))
     for name, part in parts.items():
         if not isinstance(
@@ -81,7 +85,7 @@ def _observations(space: spaces.Space[Any]) -> Change:
 
 
 def _typed(space: spaces.Box, seen: Any) -> Array:
-    """An observation in the type of its box, in which vector environments keep it.
+    """An observation in the type of its box.
 
     Raises:
         UnfitEnvironmentError: where a whole number would become another.
