@@ -19,7 +19,7 @@ from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
 from tests.same_run import assert_same_run
-from tests.tasks.gymnasium.toys import TINY
+from tests.tasks.gymnasium.toys import CHOICES, TINY
 
 # Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
@@ -40,6 +40,7 @@ CALLED = {
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
     "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],
+    "choices": ["+method=plr", *CHOICES, *FEW],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
 }
 

@@ -27,7 +27,7 @@ from proposer_rl.streams import Streams
 from tests.commands import trained_run
 from tests.same_run import assert_same_run
 from tests.stops import StopAt
-from tests.tasks.gymnasium.toys import GATE, TINY
+from tests.tasks.gymnasium.toys import CHOICES, GATE, TINY
 from tests.tiny import EXAMPLES, composed
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -44,6 +44,7 @@ TASKS = {
     "cartpole": ["task=cartpole", *TINY, *QUIET],
     "cartpole_normalized": ["task=cartpole", *TINY, *QUIET, *NORMALIZED],
     "cartpole_memory": ["task=cartpole", *TINY, *QUIET, "task.network.memory=8"],
+    "choices": [*CHOICES, *QUIET],
     "lunar_lander": ["task=lunar_lander", *TINY, *QUIET],
     "minigrid": ["task=minigrid", *TINY, *QUIET],
     "point_mass": ["task=point_mass", *GATE, *QUIET],

@@ -231,7 +231,7 @@ def first_episode_return(rollout: TensorDictBase) -> Tensor:
         >>> first_episode_return(TensorDict({"next": {"done": ends, "reward": rewards}}, [1, 4]))
         tensor([3.])
     """
-    return (rollout["next", "reward"].squeeze(-1) * _in_first_episode(rollout)).sum(-1)
+    return (rollout["next", "reward"].squeeze(-1) * in_first_episode(rollout)).sum(-1)
 
 
 def succeeded(rollout: TensorDictBase) -> Tensor:
@@ -262,10 +262,10 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
         >>> first_episode_success(rollout)  # the second one does not count
         tensor([False])
     """
-    return (succeeded(rollout) & _in_first_episode(rollout)).any(-1)
+    return (succeeded(rollout) & in_first_episode(rollout)).any(-1)
 
 
-def _in_first_episode(rollout: TensorDictBase) -> Tensor:
+def in_first_episode(rollout: TensorDictBase) -> Tensor:
     """Steps up to and including the first end, bool [*B, T]."""
     done = rollout["next", "done"].squeeze(-1).long()
     return done.cumsum(-1) - done == 0

@@ -152,7 +152,7 @@ class Session:
         updates, learner = self._learner(question.checkpoint, question.solver)
         copies, batch = learner.env.batch_size
         streams = Streams(question.seed, "play", question.name)
-        distribution = self._task.distributions[question.name]
+        distribution = self._task.evaluation_distribution(question.name)
         levels = distribution.sample(batch, streams.generator("levels"))
         env, collector = self._task.spectators(learner)
         env.set_levels(levels.expand(copies, batch))

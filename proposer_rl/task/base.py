@@ -271,7 +271,13 @@ class Task(ABC):
 
     def evaluation_levels(self, name: str) -> Levels:
         """The fixed evaluation levels [E] of a distribution."""
-        return self.distributions[name].sample(self._levels, self.stream("levels", name))
+        distribution = self.evaluation_distribution(name)
+        return distribution.sample(self._levels, self.stream("levels", name))
+
+    def evaluation_distribution(self, name: str) -> Distribution:
+        """What the levels are drawn from on which Solvers are measured on a distribution."""
+        distribution: Distribution = self.distributions[name]
+        return distribution
 
     def stream(self, use: str, name: str) -> torch.Generator:
         """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
@@ -368,7 +374,7 @@ class Task(ABC):
         if max_steps is not None:
             raise ValueError("--max-steps: the step limit of this task's levels is fixed")
         streams = Streams(0, "eval", name)
-        levels = self.distributions[name].sample(NAMED, streams.generator())
+        levels = self.evaluation_distribution(name).sample(NAMED, streams.generator())
         performance = self.performance(agent, levels, streams.generator()).cpu()
         copies, count = performance.batch_size
 

@@ -28,7 +28,7 @@ def space_features(space: Any, levels: Levels) -> Tensor:
         float64 [*B, 1 + 2 D + N] on the CPU.
 
     Raises:
-        ArgumentError: if the space cannot locate levels.
+        ArgumentError: if the space cannot locate levels, or has no axes.
     """
     if not hasattr(space, "locate"):
         raise ArgumentError(
@@ -36,6 +36,11 @@ def space_features(space: Any, levels: Levels) -> Tensor:
             "from which a model of outcomes tells them apart"
         )
     c = space.locate(levels).double().cpu()
+    if not c.shape[-1]:
+        raise ArgumentError(
+            "space: must have axes, by which a model of outcomes tells levels apart; levels that "
+            "are seeds alone have none"
+        )
     parts = [torch.ones_like(c[..., :1]), c, c.square()]
     if space.size <= MANY_BINS:
         places = space.coordinates.double()

@@ -210,7 +210,7 @@ class ParameterSpace:
         Along the only bin of an axis from -1 to 1.
         """
         lines = [part.scaled(levels[name].cpu().double()) for name, part in self.bins.items()]
-        return torch.stack(lines, -1).float()
+        return torch.stack(lines, -1).float() if lines else torch.zeros(*levels.batch_size, 0)
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""

@@ -17,25 +17,13 @@ class UnfitEnvironmentError(ValueError):
 
 
 class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that is held to Gymnasium's interface, and its steps are counted.
+    """An environment that is held to Gymnasium's interface.
 
     Rewards become floats, ends of episodes become truth values.
-
-    Args:
-        env: the environment.
-        limit: steps of an episode; None for any number.
-
-    Attributes:
-        in_time: whether the limit has not been reached.
     """
-
-    def __init__(self, env: gymnasium.Env[Any, Any], limit: int | None) -> None:
-        super().__init__(env)
-        self._limit, self._steps, self.in_time = limit, 0, True
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; what comes back must be an observation and an info."""
-        self._steps, self.in_time = 0, True
         try:
             result = self.env.reset(**given)
         except TypeError as error:
@@ -60,8 +48,6 @@ class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
                 f"info, which is a dictionary; it returns {_what(result)} (as in old Gym?)"
             )
         seen, reward, terminated, truncated, info = result
-        self._steps += 1
-        self.in_time = self._limit is None or self._steps < self._limit
         over = flag(terminated, "terminated"), flag(truncated, "truncated")
         return seen, number(reward, "the reward"), *over, info
 

@@ -15,6 +15,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.learning import in_first_episode
 from proposer_rl.runs.pictures import written
 from proposer_rl.tasks.gymnasium.env import as_actions, plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
@@ -66,9 +67,12 @@ class Camera:
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """Pictures uint8 [H, W, 3] of levels [n], and of first episodes there [n, T]."""
+        if rollout is None:
+            return [self.picture(play, None) for play in plays(levels)]
+        first = in_first_episode(rollout)
         return [
-            self.picture(play, None if rollout is None else _first_actions(rollout[index]))
-            for index, play in enumerate(plays(levels))
+            self.picture(play, actions[steps])
+            for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
         ]
 
     def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
@@ -119,9 +123,3 @@ def _without_display() -> Iterator[None]:
         yield
     finally:
         del os.environ["MUJOCO_GL"]
-
-
-def _first_actions(rollout: TensorDictBase) -> Tensor:
-    """Of a rollout [T], the actions of its first episode."""
-    ended = rollout["next", "done"].squeeze(-1).long()
-    return rollout["action"][ended.cumsum(0) - ended == 0]

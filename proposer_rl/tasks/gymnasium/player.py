@@ -31,9 +31,11 @@ class WrapperError(ValueError):
 
     exit_code = 2
 
-    def __init__(self, wrapper: WrapperSettings, error: Exception | str) -> None:
-        name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
-        super().__init__(f"wrappers: {name}: {error if isinstance(error, str) else told(error)}")
+
+def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> WrapperError:
+    """What is wrong with a wrapper, as an error that another process can send."""
+    name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
+    return WrapperError(f"wrappers: {name}: {error if isinstance(error, str) else told(error)}")
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,14 @@ class MakeEnvironment:
             self.env_id, max_episode_steps=-1, disable_env_checker=not self.check, **given
         )
         limit = self.limit(env)
-        env = Answers(env, limit)
+        env = Answers(env)
         if limit is not None:
             env = TimeLimit(env, limit)
         for wrapper in self.wrappers:
             try:
                 env = wrapper_of(wrapper)(env)
             except Exception as error:
-                raise WrapperError(wrapper, error) from error
+                raise wrapper_error(wrapper, error) from error
         return env if self.as_it_is else plain(env)
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
@@ -156,6 +158,12 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def play(self, play: Play) -> None:
         self._play, self._played, self._still = play, False, False
 
+    @property
+    def in_time(self) -> bool:
+        """Whether the episode has reached no time limit, each counting the steps it has seen."""
+        limits = [one for one in _wrappers(self.env) if isinstance(one, TimeLimit)]
+        return all((one._elapsed_steps or 0) < one._max_episode_steps for one in limits)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -191,9 +199,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._return += float(reward)
         succeeded = False
         if self._succeeded is not None and (terminated or truncated):
-            in_time = self._answers.in_time
             succeeded = self._succeeded(
-                Step(terminated, truncated, in_time, self._return, self.told)
+                Step(terminated, truncated, self.in_time, self._return, self.told)
             )
         info = {"success": True} if succeeded else {}
         return self._seen, float(reward), terminated, truncated, info
@@ -235,7 +242,6 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             if arguments:
                 raise self._refused(play, error) from error
             raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
-        self._answers = next(one for one in _wrappers(env) if isinstance(one, Answers))
         return env
 
     def _named(self, way: str, play: Play) -> dict[str, float]:

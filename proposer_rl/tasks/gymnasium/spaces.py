@@ -14,7 +14,7 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
 from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec
 
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
 
 Seen = spaces.Box | spaces.Dict
 Acts = spaces.Discrete | spaces.MultiDiscrete | spaces.Box
@@ -48,9 +48,12 @@ def plain(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
 
 
 def _observations(space: spaces.Space[Any]) -> Change | None:
-    """What makes observations plain, and their space; None where they are."""
+    """What makes observations plain, and their space; None where they are.
+
+    Any numbers are floats to a vector environment, which keeps whole ones only of their own type.
+    """
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
-        return None
+        return (partial(_typed, space), space) if space.dtype.kind in "biu" else None
     parts = dict(leaves(space))
     for name, part in parts.items():
         if not isinstance(
@@ -69,15 +72,28 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
 
     def changed(seen: Any) -> Any:
-        values = dict(_values(seen))
+        shown = dict(values(seen))
         out: dict[str, Any] = {
-            f"image {name}": _of_three_axes(np.asarray(values[name])) for name in images
+            f"image {name}": _of_three_axes(_typed(box, shown[name]))
+            for name, box in images.items()
         }
         if rest.spaces:
-            out[NUMBERS] = spaces.flatten(rest, {name: values[name] for name in rest.spaces})
+            out[NUMBERS] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
         return out if len(out) > 1 else next(iter(out.values()))
 
     return changed, _space_of(images, rest)
+
+
+def _typed(space: spaces.Box, seen: Any) -> Array:
+    """An observation in the type of its box.
+
+    Raises:
+        UnfitEnvironmentError: where a whole number would become another.
+    """
+    array = np.asarray(seen)
+    if array.dtype != space.dtype and space.dtype.kind in "biu":
+        check_seen(space, array, "the environment")
+    return array.astype(space.dtype, copy=False)
 
 
 def _space_of(images: Mapping[str, spaces.Box], rest: spaces.Dict) -> spaces.Space[Any]:
@@ -107,7 +123,7 @@ def spaces_of(seen: Composite, acts: TensorSpec) -> tuple[Seen, Acts]:
         low, high, kind = (0, 255, np.uint8) if bytes_ else (-np.inf, np.inf, np.float32)
         boxes[str(name)] = spaces.Box(low, high, tuple(spec.shape), kind)
     if isinstance(acts, MultiCategorical):  # which is a Categorical, too
-        return spaces.Dict(boxes), spaces.MultiDiscrete(acts.nvec.numpy())
+        return spaces.Dict(boxes), spaces.MultiDiscrete(acts.nvec.cpu().numpy())
     if isinstance(acts, Categorical):
         return spaces.Dict(boxes), spaces.Discrete(int(acts.n))
     return spaces.Dict(boxes), spaces.Box(-np.inf, np.inf, tuple(acts.shape))
@@ -241,11 +257,11 @@ def leaves(space: spaces.Space[Any], name: str = "") -> Iterator[tuple[str, spac
         yield name, space
 
 
-def _values(seen: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """The same of a value."""
+def values(seen: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """The parts of an observation that are no dictionaries or tuples, by their dotted names."""
     if isinstance(seen, Mapping | tuple):
         for part, inner in seen.items() if isinstance(seen, Mapping) else enumerate(seen):
-            yield from _values(inner, f"{name}.{part}" if name else str(part))
+            yield from values(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, seen
 

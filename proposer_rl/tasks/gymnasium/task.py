@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import pickle
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from typing import Annotated, Any
@@ -13,11 +13,12 @@ import gymnasium
 import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le
+from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
 from proposer_rl.extras import install_command
 from proposer_rl.learning.settings import SolverSettings
@@ -45,8 +46,8 @@ from proposer_rl.tasks.ranges import spaces
 class GymnasiumTask(Task):
     """An environment of Gymnasium some of whose numbers make a level.
 
-    Environments are stepped by Gymnasium's vector environments, Solvers are small networks: both
-    are on the CPU, whatever the context says.
+    Gymnasium's vector environments step it on the CPU; levels, states and Solvers are on the
+    context's device.
 
     Args:
         env_id: as :func:`gymnasium.make` takes it; ``module:name`` imports the module first.
@@ -63,8 +64,9 @@ class GymnasiumTask(Task):
             there are cores.
         extra: of this package, that the environment needs; None for none.
         solver: the Solver's training.
-        context: precision and cores.
-        transforms: TorchRL's, of the environments as one; of rewards, in training only.
+        context: device, precision and cores.
+        transforms: TorchRL's, of the environments as one; those that change the reward only in
+            training.
         train_seeds: number of seeds of the levels that are trained on; ``target`` and ``all`` are
             then measured on others, and ``train`` on those. None for any seed.
 
@@ -102,7 +104,7 @@ class GymnasiumTask(Task):
         self._network = network
         self._evaluation = evaluation
         self._vectorization = vectorization
-        self._transforms = _checked_transforms(transforms or [])
+        self._transforms = list(_checked_transforms(transforms or []))
         self._envs: dict[torch.Size, EnvBase] = {}
         train = range(LARGEST_SEED) if train_seeds is None else range(train_seeds)
         space, target = spaces(parameters, seeds=train, device=context.device)
@@ -175,7 +177,7 @@ class GymnasiumTask(Task):
         """The same environments for the same number of levels, played once."""
         shape = levels.batch_size
         if shape not in self._envs:
-            kept = [one for one in self._transforms if "reward" not in one.in_keys]
+            kept = [one for one in self._transforms if "reward" not in one.out_keys]
             self._envs[shape] = self._env(
                 levels, kept, vectorization=self._vectorization, once=True
             )
@@ -196,11 +198,9 @@ class GymnasiumTask(Task):
         module = TensorDictModule(population, seen, ["logits", "state_value"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
-    def evaluation_levels(self, name: str) -> TensorDictBase:
-        """The fixed evaluation levels [E] of a distribution, of other seeds than the training's."""
-        distribution = self._test.get(name, self.distributions[name])
-        levels: TensorDictBase = distribution.sample(self._levels, self.stream("levels", name))
-        return levels
+    def evaluation_distribution(self, name: str) -> ParameterSpace:
+        """A distribution, of other seeds than the training's."""
+        return self._test.get(name, self.distributions[name])
 
     def stream(self, use: str, name: str) -> torch.Generator:
         """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
@@ -236,7 +236,7 @@ class GymnasiumTask(Task):
             reward_scale=self.reward_scale,
             **how,
         )
-        return TransformedEnv(env, Compose(*map(deepcopy, transforms))) if transforms else env
+        return TransformedEnv(env, Compose(*map(_copied, transforms))) if transforms else env
 
     def _spaces(self, level: TensorDictBase) -> tuple[Seen, Acts]:
         """What Solvers see and do, after the transforms; the network is tried on them.
@@ -259,14 +259,34 @@ class GymnasiumTask(Task):
         return seen, acts
 
 
-def _checked_transforms(transforms: list[Any]) -> list[Transform]:
+def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
+    """The transforms one by one, also those of a Compose.
+
+    Raises:
+        ValueError: for what is none, or keeps running statistics.
+    """
     for one in transforms:
-        if not isinstance(one, Transform):
+        if isinstance(one, Compose):
+            yield from _checked_transforms(part.clone() for part in one.transforms)
+        elif isinstance(one, VecNorm | VecNormV2):
+            raise ValueError(
+                f"transforms: {type(one).__name__}: it keeps running statistics, of which training "
+                "and evaluations would have their own. What all environments share is normalised "
+                "by PPO's normalize_observations and normalize_rewards"
+            )
+        elif isinstance(one, Transform):
+            yield one
+        else:
             raise ValueError(
                 f"transforms: must be transforms of TorchRL's, as {{_target_: "
                 f"torchrl.envs.StepCounter}}, not {one!r}"
             )
-    return list(transforms)
+
+
+def _copied(transform: Transform) -> Transform:
+    """A copy for another environment; deepcopy takes no buffers that have no shape yet."""
+    copy: Transform = pickle.loads(pickle.dumps(CloudpickleWrapper(transform))).fn
+    return copy
 
 
 @contextmanager

@@ -25,10 +25,11 @@ from proposer_rl.tasks.gymnasium.player import (
     WrapperError,
     imported,
     told,
+    wrapper_error,
     wrapper_of,
 )
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
-from proposer_rl.tasks.gymnasium.spaces import leaves
+from proposer_rl.tasks.gymnasium.spaces import leaves, values
 from proposer_rl.tasks.parameters import Bins
 
 EXACT = 2**24  # up to which float32 has all whole numbers
@@ -134,14 +135,14 @@ def _check_wrappers(
             raise
         except Exception as error:  # whatever an environment of somebody's may raise
             if count:
-                raise WrapperError(make.wrappers[count - 1], error) from error
+                raise wrapper_error(make.wrappers[count - 1], error) from error
             if isinstance(error, RefusedLevelError | UnfitEnvironmentError):
                 raise
             raise UnfitEnvironmentError(f"it does not work: {told(error)}") from error
         if _alike(first, second) and not hasattr(player.env, "update_running_mean"):
             continue
         if count:
-            raise WrapperError(
+            raise wrapper_error(
                 make.wrappers[count - 1],
                 "it keeps running statistics or the like, or draws numbers without the seed: the "
                 "same actions on the same level can end otherwise the second time. What all "
@@ -168,7 +169,7 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
     steps = list(_played(player, limit + 1))
     success.check_told(player.told)
     *_, last = steps
-    early = last.truncated and len(steps) < limit
+    early = last.truncated and player.in_time
     if success.kind == "survived" and early:
         warnings.warn(
             f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
@@ -289,7 +290,7 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
             raise UnfitEnvironmentError(
                 f"step pays a reward of {reward}: it must be finite, also as float32"
             )
-        yield _Played([np.array(part) for part in _arrays(seen)], reward, terminated, truncated)
+        yield _Played([np.array(part) for _, part in values(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
 
@@ -333,11 +334,3 @@ def _alike(one: list[_Played], other: list[_Played]) -> bool:
         a[1:] == b[1:] and all(map(np.array_equal, a.seen, b.seen))
         for a, b in zip(one, other, strict=True)
     )
-
-
-def _arrays(seen: Any) -> Iterator[Any]:
-    if isinstance(seen, Mapping | tuple):
-        for part in seen.values() if isinstance(seen, Mapping) else seen:
-            yield from _arrays(part)
-    else:
-        yield seen

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from proposer_rl.tasks.mazes.levels import Level, cell_index
 
-_STEPS_BETWEEN_CHECKS = 8  # asking whether the frontier is empty waits for the device
+STEPS_BETWEEN_CHECKS = 8  # asking whether the frontier is empty waits for the device
 
 
 def shortest_path_length(level: Level) -> Tensor:
@@ -43,7 +43,7 @@ def shortest_path_length(level: Level) -> Tensor:
         _spread(frontier, spare, unvisited)
         frontier, spare = spare, frontier
         length.masked_fill_(frontier.flatten(0, 1).gather(0, goal).squeeze(0), step)
-        if step % _STEPS_BETWEEN_CHECKS == 0 and not (frontier.any() and (length < 0).any()):
+        if step % STEPS_BETWEEN_CHECKS == 0 and not (frontier.any() and (length < 0).any()):
             break
     return length.reshape(level.batch_size)
 

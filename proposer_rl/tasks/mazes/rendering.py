@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from proposer_rl.learning import in_first_episode
 from proposer_rl.runs.pictures import png
 from proposer_rl.tasks.mazes.levels import FREE, Level
 
@@ -83,7 +84,7 @@ def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dic
     """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
     levels = levels.cpu()
     for i, text in enumerate(levels.to_text()):
-        path = None if rollout is None else first_path(rollout[i])
+        path = None if rollout is None else _first_path(rollout[i])
         lines = [list(line) for line in text.splitlines()]
         for row, column in path or []:
             if lines[row][column] == FREE:
@@ -100,11 +101,10 @@ def recorded_drawing(record: Mapping[str, Any]) -> list[str]:
     return [line.replace(" ", "").replace(EPISODE, FREE) for line in record["text"]]
 
 
-def first_path(steps: TensorDictBase) -> list[list[int]]:
+def _first_path(steps: TensorDictBase) -> list[list[int]]:
     """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
-    ended = steps["next", "done"].squeeze(-1).tolist()
-    count = ended.index(True) + 1 if True in ended else len(ended)
-    return steps["agent"][:1].tolist() + steps["next", "agent"][:count].tolist()
+    first = in_first_episode(steps)
+    return steps["agent"][:1].tolist() + steps["next", "agent"][first].tolist()
 
 
 def _paint(

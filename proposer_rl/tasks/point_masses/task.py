@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torch import nn
 
+from proposer_rl.learning import in_first_episode
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext, Task
@@ -112,8 +113,7 @@ class PointMassTask(Task):
         gates = list(zip(levels["position"].tolist(), levels["width"].tolist(), strict=True))
         if rollout is None:
             return [draw(x, width, []) for x, width in gates]
-        after = rollout["next", "done"].squeeze(-1).long()
-        first = after.cumsum(-1) - after == 0
+        first = in_first_episode(rollout)
         before, end = (part["observation"][..., [0, 2]] for part in (rollout, rollout["next"]))
         ways = [torch.cat([b[:1], e[f]]) for b, e, f in zip(before, end, first, strict=True)]
         return [draw(*gate, way.tolist()) for gate, way in zip(gates, ways, strict=True)]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from proposer_rl.tasks.mazes.distance import STEPS_BETWEEN_CHECKS
 from proposer_rl.tasks.view_mazes.env import PENALTY
 from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
 
@@ -44,7 +45,9 @@ def fewest_actions(levels: ViewLevel) -> Tensor:
         reached |= frontier
         arrived = frontier.any(0)[goal] & (actions < 0)
         actions = actions.masked_fill(arrived, number)
-        if not bool((frontier.flatten(2).any(2).any(0) & (actions < 0)).any()):
+        if number % STEPS_BETWEEN_CHECKS == 0 and not bool(
+            (frontier.flatten(2).any(2).any(0) & (actions < 0)).any()
+        ):
             break
     return actions.reshape(levels.batch_size)
 

@@ -13,20 +13,19 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import RolloutPolicy
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import planes
-from proposer_rl.tasks.mazes.rendering import draw_level, first_path
+from proposer_rl.tasks.mazes.rendering import draw_level
 from proposer_rl.tasks.mazes.settings import Channels
 from proposer_rl.tasks.view_mazes.board import ViewBoard
 from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
 from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import played_performance, visits
+from proposer_rl.tasks.view_mazes.evaluation import played_performance, visits, walks
 from proposer_rl.tasks.view_mazes.level_files import SUFFIXES, read_view_levels
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
@@ -184,14 +183,11 @@ class ViewMazeTask(GridTask):
         solvable = ", solvable" if kind.solvable else ""
         return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
 
-    @torch.no_grad()
     def _picture(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int
     ) -> NDArray[np.uint8]:
         """A level, and one episode of one Solver there."""
-        env = ViewMazeEnv(level.expand(agent.copies, 1), max_steps=max_steps)
-        policy = RolloutPolicy(agent)
-        noise = torch.rand(max_steps, 1, 1, generator=self._draws.generator("picture"))
-        policy.begin(noise.to(self.device).expand(max_steps, *env.batch_size))
-        rollout = env.rollout(max_steps, policy, break_when_any_done=False)
-        return draw_level(level, first_path(rollout[solver, 0])).numpy()
+        noise = torch.rand(max_steps, 1, generator=self._draws.generator("picture"))
+        went, steps = walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
+        path = went[solver, 0, : int(steps[solver, 0]) + 1, :2]
+        return draw_level(level, path).numpy()

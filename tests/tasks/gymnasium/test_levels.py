@@ -189,6 +189,12 @@ def test_a_target_beyond_the_range_is_told(target: Any, outside: bool) -> None:
     assert all("outside of low=0 to high=3: is that meant?" in str(one.message) for one in told)
 
 
+def test_without_parameters_levels_lie_along_no_axis() -> None:
+    space = ParameterSpace({})
+    levels = space.generate(torch.zeros(2, 3).long(), [torch.Generator()] * 2)
+    assert space.locate(levels).shape == (2, 3, 0) and space.coordinates.shape == (1, 0)
+
+
 def test_points_of_the_box_are_levels_of_all_of_the_range() -> None:
     """The ends are the range's, not the middles of bins; single values have equal parts of it."""
     points = torch.linspace(-1, 1, 5).view(1, 5, 1).expand(1, 5, 4)

@@ -23,6 +23,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import env, pictures
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
+from tests.tasks.gymnasium.odd import Line, odd
 from tests.tasks.gymnasium.toys import NO_BOX2D, PARAMETERS, TINY, WALK, Walk, walk_task
 from tests.test_readme import ROOT, commands, write_files
 from tests.tiny import composed
@@ -335,6 +336,31 @@ def test_levels_can_be_seeds_alone_of_separate_sets() -> None:
     learner.update([Streams(1).generator()])
     (record,) = task.record(task.target.sample(1, torch.Generator()), None)
     assert record["level"].keys() == {"seed"}
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_a_model_of_outcomes_needs_more_than_seeds(
+    train: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk = [f"task.env_id={WALK}", "task.success.kind=terminated", *TINY, "hydra.run.dir=run"]
+    assert train("task=gymnasium", "+method=plr", "+filter=model", *walk) == 2
+    said = capsys.readouterr().err.strip()
+    assert "space: must have axes" in said and "\n" not in said and not Path("run").exists()
+
+
+def test_single_levels_are_of_the_seeds_that_are_measured_on() -> None:
+    """Of an environment that pays for the seeds below 3 alone."""
+
+    def reset(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+        self.pays = float(seed < 3)
+        return Line.reset(self, seed=seed)
+
+    paying = odd(reset=reset, step=lambda self, a: (self.seen(), self.pays, False, False, {}))
+    task = walk_task(env_id=paying, parameters={}, train_seeds=3)
+    agent = task.learner([Streams(0)]).agent
+    for name, trained in (("train", True), ("target", False), ("all", False)):
+        results = [one.results["return"] for one in task.level_results(agent, name, None)]
+        assert results and {value > 0 for value in results} == {trained}
 
 
 def test_one_parameter_can_set_several_numbers() -> None:

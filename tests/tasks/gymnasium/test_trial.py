@@ -13,16 +13,34 @@ import torch
 from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 from tensordict import TensorDict
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    ObservationNorm,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    UnaryTransform,
+    VecNorm,
+    VecNormV2,
+)
 
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
+    MakeEnvironment,
+    Play,
+    WrapperError,
+)
 from proposer_rl.tasks.gymnasium.settings import (
     NetworkSettings,
     ParameterSettings,
     SuccessSettings,
 )
+from proposer_rl.tasks.gymnasium.spaces import boxes_of
 from tests.tasks.gymnasium.odd import (
     LIMIT,
     Line,
@@ -157,16 +175,35 @@ def test_a_nested_or_optional_entry_of_the_info_can_tell_success() -> None:
     line_task(odd(**only), success=SuccessSettings(kind="info", key="won", optional=True))
 
 
+NEVER_OVER = {"step": lambda self, a: (*Line.step(self, 0)[:4], {})}
+
+
 def test_survival_is_the_time_limit_and_nothing_else() -> None:
     """An environment that cuts an episode off by itself has not let it survive."""
     cut = odd(step=lambda self, a: (*Line.step(self, a)[:2], False, self.t >= 5, {}))
     rule = SuccessSettings(kind="survived")
     with pytest.warns(UserWarning, match="cut an episode off after 5 steps, before the time limit"):
         task = line_task(cut, success=rule)
-    whole = line_task(odd(step=lambda self, a: (*Line.step(self, 0)[:4], {})), success=rule)
+    whole = line_task(odd(**NEVER_OVER), success=rule)
     for made, survives in ((task, 0.0), (whole, 1.0)):
         agent = made.learner([Streams(0)]).agent
         assert made.measure(agent)["target_success"] == survives
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 5}},
+        {"gymnasium.wrappers.MaxAndSkipObservation": {"skip": 5}},
+    ],
+)
+def test_a_wrapper_may_hold_the_time_limit_or_take_several_steps_at_once(wrapper: Any) -> None:
+    """The limit of 12 steps ends an episode at the third action where each is taken five times."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rule = SuccessSettings(kind="survived")
+        task = line_task(odd(**NEVER_OVER), success=rule, wrappers=[wrapper])
+    assert task.measure(task.learner([Streams(0)]).agent)["target_success"] == 1.0
 
 
 KINDS = odd(__init__=with_parts)
@@ -316,6 +353,42 @@ def test_what_a_network_gets_otherwise_is_told(members: dict[str, Any], message:
         line_task(odd(**members))
 
 
+FEW_BYTES, SMALL = spaces.Box(0, 255, (2,), np.uint8), spaces.Box(-9, 9, (2,), np.int32)
+IMAGE, GREY = (spaces.Box(0, 255, shape, np.uint8) for shape in ((20, 24, 3), (20, 24)))
+
+
+@pytest.mark.parametrize(
+    ("space", "seen"),
+    [
+        (FEW_BYTES, np.array([0, 255])),
+        (FEW_BYTES, [0.0, 255.0]),
+        (SMALL, np.array([-9.0, 3.0])),
+        (IMAGE, np.arange(20 * 24 * 3).reshape(20, 24, 3) % 256),
+        (GREY, np.arange(20 * 24).reshape(20, 24) % 256),
+        (spaces.Dict({"a": GREY, "b": GREY}), {"a": np.ones((20, 24)), "b": np.ones((20, 24))}),
+    ],
+)
+def test_whole_numbers_of_another_type_are_seen_as_they_are(space: Any, seen: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's own checker
+        network = NetworkSettings(hidden=[8], channels=None if space.shape == (2,) else [4])
+        task = line_task(odd(**showing(space, seen)), network=network)
+    state = task.environment(task.target.sample(2, torch.Generator())).reset()
+    shown = seen.values() if isinstance(seen, dict) else [seen]
+    names = [f"image {name}" for name in seen] if isinstance(seen, dict) else ["observation"]
+    for name, part in zip(names, shown, strict=True):
+        assert np.array_equal(state[name][1].numpy().squeeze(), part)
+
+
+def test_what_a_type_cannot_hold_is_also_refused_after_the_trial() -> None:
+    shown = showing(FEW_BYTES, np.array([1, 2]))
+    player = LevelPlayer(MakeEnvironment(odd(**shown)), GOAL, Play({"goal": 3.0}, 0))
+    player.reset()
+    player.unwrapped.seen = lambda: np.array([1, 256])  # type: ignore[attr-defined]
+    with pytest.raises(UnfitEnvironmentError, match=r"\[ 1 256\] of int64, which uint8 cannot"):
+        player.step(0)
+
+
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
     """The environment is as it should be until it has been stepped often."""
@@ -337,6 +410,31 @@ def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
         with pytest.raises(UnfitEnvironmentError, match=f"{said}.* level goal={goal:g}, seed=7$"):
             env.rollout(5 * LIMIT, break_when_any_done=False)
         env.close()
+
+
+def that_fits_the_ends(env: Any) -> Any:
+    if env.unwrapped.goal not in (1.0, 3.0):  # which the trial plays
+        raise RuntimeError("it fits\nno other")
+    return env
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_a_wrapper_that_fails_after_the_trial_is_blamed(vectorization: Any) -> None:
+    """Also where it fails in a process of its own, whose error has to be sent."""
+
+    def built(self: Any, goal: float = 3.0, render_mode: str | None = None) -> None:
+        self.goal = goal
+
+    goal = {"goal": ParameterSettings(set="argument", low=1.0, high=3.0, target=3.0)}
+    task = line_task(
+        odd(__init__=built), parameters=goal, vectorization=vectorization,
+        wrappers=["tests.tasks.gymnasium.test_trial.that_fits_the_ends"],
+    )  # fmt: skip
+    level = TensorDict({"goal": torch.tensor([[2.0]]), "seed": torch.tensor([[7]])}, [1, 1])
+    with pytest.raises(
+        WrapperError, match=r"wrappers: .*that_fits_the_ends: RuntimeError: it fits"
+    ):
+        task.environment(level)
 
 
 @pytest.mark.parametrize("drawn", [True, False])
@@ -447,8 +545,6 @@ def test_memory_is_that_of_one_episode() -> None:
 
 
 def test_transforms_change_what_is_seen_and_leave_measured_returns_alone() -> None:
-    from torchrl.envs import ObservationNorm, RewardScaling
-
     norm = ObservationNorm(loc=1.0, scale=2.0, in_keys=["observation"])
     paid = RewardScaling(loc=0.0, scale=100.0)
     plainly, changed = line_task(odd()), line_task(odd(), transforms=[norm, paid])
@@ -465,5 +561,48 @@ def test_transforms_change_what_is_seen_and_leave_measured_returns_alone() -> No
                 state = env.step(state.set("action", action))["next"]
                 paid_out.append(state["reward"])
         torch.testing.assert_close(sum(paid_out[3:]), factor * sum(paid_out[:3]))
-    with pytest.raises(ValueError, match="transforms: must be transforms of TorchRL"):
-        line_task(odd(), transforms=["torchrl.envs.RewardScaling"])
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [Compose(Compose(RewardClipping(-0.1, 0.1)), StepCounter())],
+        [RewardSum()],
+        [CatFrames(N=3, dim=-1, in_keys=["observation"])],
+        [UnaryTransform(["observation"], ["observation"], fn=lambda seen: 2 * seen)],
+    ],
+    ids=lambda transforms: type(transforms[0]).__name__,
+)
+def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
+    transforms: Any,
+) -> None:
+    paid = odd(step=lambda self, a: (Line.step(self, 0)[0], 0.5, False, False, {}))
+    task = line_task(paid, success=SuccessSettings(kind="survived"), transforms=transforms)
+    levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
+    shown = [
+        env.rollout(3)["next"].select(*boxes_of(task._seen))
+        for env in (task.environment(levels), task.evaluation_environment(levels))
+    ]
+    assert (shown[0] == shown[1]).all()
+    learner = task.learner([Streams(0)])
+    learner.update([Streams(1).generator()])
+    assert task.measure(learner.agent)["target_return"] == 0.5 * LIMIT
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: "torchrl.envs.RewardScaling", "must be transforms of TorchRL"),
+        (
+            lambda: Compose(VecNorm(in_keys=["observation"])),
+            "VecNorm: it keeps running statistics",
+        ),
+        (lambda: VecNormV2(in_keys=["observation"]), "VecNormV2: it keeps running statistics"),
+    ],
+)
+def test_what_is_no_transform_or_one_with_a_memory_is_refused(make: Any, message: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # TorchRL's: VecNorm is to become VecNormV2
+        transform = make()
+    with pytest.raises(ValueError, match=f"transforms: {message}"):
+        line_task(odd(), transforms=[transform])

@@ -34,6 +34,13 @@ TINY = [
 ]  # fmt: skip
 
 
+CHOICES = [  # an environment of several choices at once
+    "task=gymnasium", "task.env_id=tests.tasks.gymnasium.odd:Mixed-v0", *TINY,
+    "task.success.kind=terminated", "task.network.channels=[4]",
+    "+task.parameters.goal={values: [1.0, 3.0], target: 3.0}",
+]  # fmt: skip
+
+
 GATE = [word.replace("task.evaluation.levels", "task.levels") for word in TINY]  # the point mass's
 
 

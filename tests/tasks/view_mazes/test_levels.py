@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import networkx as nx
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.levels import validate_levels
@@ -99,6 +101,23 @@ def test_shortest_ways_are_those_of_networkx() -> None:
         assert actions == min((lengths[at] for at in there if at in lengths), default=-1)
     folded = fewest_actions(levels.reshape(5, 8))
     assert torch.equal(folded.flatten(), found)
+
+
+class Reads(TorchDispatchMode):
+    """Counts numbers that are handed to Python, for which a GPU's host would wait."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += func.overloadpacket.__name__ == "_local_scalar_dense"
+        return func(*args, **(kwargs or {}))
+
+
+def test_shortest_ways_are_found_without_waiting_at_each_step() -> None:
+    levels = perfect_mazes(8, 9, 9, generator())
+    with Reads() as reads:
+        longest = fewest_actions(levels).amax()
+    assert longest > 24 and 1 <= reads.count <= longest / 8 + 1
 
 
 def test_the_optimum_is_a_shortest_way_within_the_limit() -> None:
