@@ -121,11 +121,14 @@ class Modelled(Combinator):
         }
 
     def _take_in(self) -> None:
-        for evidence in self._inbox.take():
-            outcome = {name: evidence[name] for name in evidence.keys()}
-            label = self._model.labels(outcome)
-            self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
-            self._model.add(evidence["features"], outcome)
+        taken = self._inbox.take()
+        if not taken:
+            return
+        # What comes late, of batches of before, is of the student as it is now.
+        outcome = {name: torch.cat([part[name] for part in taken], 1) for name in taken[0].keys()}
+        label = self._model.labels(outcome)
+        self._told = [*self._told, {"predicted": outcome["predicted"], "label": label}]
+        self._model.add(outcome["features"], outcome)
 
     def _predict(self, levels: Levels) -> TensorDict:
         return self._model.predict(self._phi(levels))
