@@ -14,6 +14,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
+from tests.host_reads import CountedReads
 from tests.teaching.counting import ITEMS, Counting, LevelsEnv, check, length, set_level
 
 LEVELS = 4
@@ -160,3 +161,15 @@ def test_success_is_asked_for() -> None:
         env()
     assert {success for _, success in env(success="terminated").values()} == {1.0}
     assert {s for _, s in env(success=lambda after: ~after["terminated"]).values()} == {0.0}
+
+
+def test_the_end_of_episodes_waits_for_the_device_once() -> None:
+    teacher = prl.Teacher(Counting(), ITEMS)
+    env = taught(teacher)
+    env.reset()
+    ended = torch.tensor([True, False, True, False])
+    env.transform._knows = True
+    with CountedReads() as reads:
+        env.transform._end(ended)
+        env.transform._end(torch.zeros_like(ended))
+    assert reads.count == 2
