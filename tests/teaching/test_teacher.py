@@ -197,6 +197,16 @@ def test_all_that_need_nothing_are_here() -> None:
     assert free - {"learning_progress"} == FREE.keys() - {"learning_progress"}
 
 
+def test_many_parameters_have_one_bin_each() -> None:
+    """8 ** 21 is more than int64 can count."""
+    ranges = {f"friction_{i}": (0.0, 1.0) for i in range(21)}
+    for bins in ({}, {"bins": {"friction_3": 16}}):
+        with pytest.raises(ArgumentError, match=r"bins=.*: too many comb.*; give bins=1"):
+            prl.Parameters(ranges, **bins)  # type: ignore[arg-type]
+    _, level = prl.Teacher("plr", prl.Parameters(ranges, bins=1)).ask()
+    assert level.keys() == ranges.keys()
+
+
 def test_every_update_has_draws_of_its_own() -> None:
     """One ``Streams(0)`` at each update gives the same levels for ever; here there is none."""
     teacher = prl.Teacher(prl.curricula.domain_randomization(), SPACE)
