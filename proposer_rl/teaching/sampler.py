@@ -18,6 +18,9 @@ T = TypeVar("T")
 class TeacherSampler(Sampler[int]):
     """Items that a teacher proposes, for any loader; whoever scores them tells by item.
 
+    Importing TorchRL makes processes spawn: a script whose loader has workers needs its
+    ``if __name__ == "__main__":``.
+
     Args:
         teacher: of :class:`Items`.
         length: items of an epoch.
