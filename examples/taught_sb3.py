@@ -6,6 +6,7 @@ python examples/taught_sb3.py [steps]
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import gymnasium
 from stable_baselines3 import PPO
@@ -13,9 +14,16 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import proposer_rl as prl
+from proposer_rl.tasks.gymnasium.cartpole import set_length
 from proposer_rl.teaching.sb3 import TeacherCallback
 
 SPACE = prl.Parameters({"gravity": (5.0, 25.0), "length": (0.3, 1.0)})
+
+
+def set_level(env: Any, level: Any) -> None:
+    """CartPole computes more of its length once; that is set, too."""
+    env.gravity = level["gravity"]
+    set_length(env, level["length"])
 
 
 def main(steps: int = 20_000) -> PPO:
@@ -26,7 +34,7 @@ def main(steps: int = 20_000) -> PPO:
         env = prl.TaughtEnv(
             gymnasium.make("CartPole-v1"),
             teacher,
-            {"gravity": "gravity", "length": "length"},
+            set_level,
             success="truncated",  # it survived
         )
         return Monitor(env)

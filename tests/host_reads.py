@@ -50,3 +50,16 @@ def refuse_host_reads(func: Any, args: tuple[Any, ...]) -> None:
     # torch.tensor([...]): on a GPU a copy from memory that the host may change at once.
     if name in READS or masks or lengths or name == "lift_fresh":
         raise HostRead(f"{func} waits for the device")
+
+
+class CountedReads(TorchDispatchMode):
+    """Counts the operations that :class:`NoHostReads` refuses."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        try:
+            refuse_host_reads(func, args)
+        except HostRead:
+            self.count += 1
+        return func(*args, **(kwargs or {}))

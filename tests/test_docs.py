@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.util
 import json
 import re
 import shlex
@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.recipes import CONFIG_FOLDER
 from tests.commands import call, trained_run
@@ -176,6 +177,18 @@ def test_pages_link_to_what_is_there() -> None:
     for page, text in PAGES.items():
         for target in re.findall(r"\]\(((?:\.\./)+[^)#]+)\)", text):
             assert (DOCS / page).parent.joinpath(target).is_file(), f"{page}.md: {target}"
+
+
+def test_the_names_of_the_api_are_there() -> None:
+    """Each where the page says it is, and all that loops of one's own need."""
+    rows = [line for line in PAGES["api"].splitlines() if line.startswith("| ")][1:]
+    names = {name for row in rows for name in re.findall(r"`([\w.]+)", row)}
+    assert len(names) > 40
+    for name in names:
+        module, _, last = f"proposer_rl.{name}".rpartition(".")
+        found = hasattr(importlib.import_module(module), last)
+        assert found or importlib.util.find_spec(f"proposer_rl.{name}"), name
+    assert {*dir(prl)} & {*vars(importlib.import_module("proposer_rl.teaching"))} <= names
 
 
 def test_every_example_is_on_the_site() -> None:

@@ -204,7 +204,8 @@ def test_runs_are_evaluated_there(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_a_teacher_in_a_loop_on_the_gpu() -> None:
-    teacher = prl.Teacher(prl.curricula.plr(capacity=8), prl.Parameters({"gravity": (5.0, 25.0)}))
+    space = prl.Parameters({"gravity": (5.0, 25.0)})
+    teacher = prl.Teacher(prl.curricula.plr(capacity=8), space, block=8)
     device = torch.device("cuda")
     made = GymEnv("CartPole-v1", device=device, categorical_action_encoding=True)
     env = TransformedEnv(made, prl.LevelTransform(teacher, lambda env, level: None))

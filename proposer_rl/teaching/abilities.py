@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula import Student
+from proposer_rl.curricula.batches import moved
 from proposer_rl.curricula.student import VALUE, advantages
 from proposer_rl.meta.first_order import Direction, alignment, over_steps
 from proposer_rl.settings import ArgumentError
@@ -17,13 +18,19 @@ from proposer_rl.settings import ArgumentError
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
-def adapted(name: str, function: Any, given: Callable[[Any], Any]) -> Any:
+def adapted(
+    name: str,
+    function: Any,
+    given: Callable[[Any], Any],
+    device: torch.device | None = None,
+) -> Any:
     """A function of levels [n] as one of levels [1, n], with the argument checked.
 
     Args:
         name: of the function; see :class:`~proposer_rl.curricula.Student`.
         function: of a loop, with levels as that gets them.
         given: from levels to these.
+        device: where that gets them; None for where they are.
     """
     if name not in OF_LEVELS:
         return function
@@ -32,6 +39,7 @@ def adapted(name: str, function: Any, given: Callable[[Any], Any]) -> Any:
 
     def of_one(levels: Any, *more: Any) -> Any:
         some = levels[0] if levels.ndim > 1 else levels
+        some = some if device is None else moved(some, device)
         draws = [more[0][0]] if name == "play" else []
         found = function(given(some), *draws)
         if isinstance(found, TensorDictBase):

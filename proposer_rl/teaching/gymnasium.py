@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium
 
 from proposer_rl.settings import ArgumentError
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -26,16 +27,16 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         env: the environment.
         teacher: of one student; in another process than its own, its client.
         set: how a level gets into the environment before its reset: attributes of the unwrapped
-            environment by the parameters' names, dots leading to its parts; or a function of the
-            unwrapped environment and the level; or ``"options"`` for those of the reset. A level's
-            ``seed`` is that of the reset.
+            environment by the parameters' names, as in ``{"gravity": "model.opt.gravity.2"}``; or a
+            function of the unwrapped environment and the level; or ``"options"`` for those of the
+            reset. A level's ``seed`` is that of the reset.
         success: whether an episode was one: ``"terminated"``, ``"truncated"``, another entry of the
             last info, or a function of that; None for its entry ``success`` or ``is_success``.
 
     Raises:
         ArgumentError: if the teacher is of several students; at the first reset, if the environment
-            has no such attribute; at the first end, if the curriculum reads success and nothing
-            says it.
+            has no such attribute, or more than a number there; at the first end, if the curriculum
+            reads success and nothing says it.
     """
 
     def __init__(
@@ -90,14 +91,16 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Set an attribute that the environment has."""
         if name not in self._level:
             raise ArgumentError(f"set.{name}: no parameter; there are: {', '.join(self._level)}")
-        *parts, last = path.split(".")
-        place: Any = self.env.unwrapped
-        for part in parts:
-            place = getattr(place, part, None)
-        if not hasattr(place, last):
-            kind = type(self.env.unwrapped).__name__
-            raise ArgumentError(f"set.{name}={path!r}: {kind} has no such attribute")
-        setattr(place, last, self._level[name])
+        env, value = self.env.unwrapped, self._level[name]
+        within, _, last = path.rpartition(".")
+        try:
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                write(env, path, value)
+            else:
+                read(env, path)
+                setattr(read(env, within) if within else env, last, value)
+        except (AttributeError, AttributeRefusedError) as error:
+            raise ArgumentError(f"set.{name}={path!r}: {error}") from error
 
     def _marked(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return {**info, "level": self._level, "level_id": self._ticket}

@@ -37,7 +37,7 @@ class TeacherClient:
         """As :meth:`Teacher.tell`."""
         self._call("tell", ids, return_, success, **more)
 
-    def drop(self, ids: Any) -> None:
+    def drop(self, ids: Any = None) -> None:
         """As :meth:`Teacher.drop`."""
         self._call("drop", ids)
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 from torch.utils.data import Sampler
 
@@ -12,9 +12,14 @@ from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.teaching.spaces import Items
 from proposer_rl.teaching.teacher import Teacher
 
+T = TypeVar("T")
+
 
 class TeacherSampler(Sampler[int]):
     """Items that a teacher proposes, for any loader; whoever scores them tells by item.
+
+    Importing TorchRL makes processes spawn: a script whose loader has workers needs its
+    ``if __name__ == "__main__":``.
 
     Args:
         teacher: of :class:`Items`.
@@ -64,17 +69,65 @@ class TeacherSampler(Sampler[int]):
             return_: of each; None for the success.
 
         Raises:
-            ArgumentError: for an item that is not out, or another number of results.
+            ArgumentError: for an item that is not out, or another number of results; none of them
+                counts then.
         """
-        items, returns = [int(item) for item in items], success if return_ is None else return_
-        if not len(items) == len(success) == len(returns):
-            raise ArgumentError(f"success: {len(success)} results for {len(items)} items")
-        if len(items) % self._repeat:
-            raise ArgumentError(f"items: {len(items)} are no groups of {self._repeat}")
-        for start in range(0, len(items), self._repeat):
-            here = slice(start, start + self._repeat)
-            if not self._out[items[start]] or len({*items[here]}) > 1:
-                raise ArgumentError(f"items={items[start]}: is not out")
-            means = [sum(map(float, each[here])) / self._repeat for each in (returns, success)]
-            self._teacher.tell(self._out[items[start]][0], *means, episodes=self._repeat)
-            self._out[items[start]].popleft()
+        told = self._told(items)
+        means = self._means("success", success, len(told))
+        returns = means if return_ is None else self._means("return_", return_, len(told))
+        self._teacher.tell([t for _, t in told], returns, means, episodes=self._repeat)
+        self._forget(told)
+
+    def drop(self, items: Sequence[int] | None = None) -> None:
+        """Nothing will come of items.
+
+        Args:
+            items: as of :meth:`tell`; None for all that are out, as where a resumed loop begins
+                an epoch anew.
+        """
+        every = [(item, ticket) for item, tickets in self._out.items() for ticket in tickets]
+        dropped = every if items is None else self._told(items)
+        self._teacher.drop([ticket for _, ticket in dropped])
+        self._forget(dropped)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The tickets of the items that are out; the teacher has a state of its own."""
+        return {"out": {item: list(tickets) for item, tickets in self._out.items() if tickets}}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with it."""
+        self._out.clear()
+        self._out.update({item: deque(tickets) for item, tickets in state["out"].items()})
+
+    def _told(self, items: Sequence[int]) -> list[tuple[int, int]]:
+        """The item and the ticket of each group of items [n]."""
+        numbers = _plain("items", items, int)
+        if len(numbers) % self._repeat:
+            raise ArgumentError(f"items: {len(numbers)} are no groups of {self._repeat}")
+        left = {item: list(self._out[item]) for item in {*numbers} & self._out.keys()}
+        told = []
+        for start in range(0, len(numbers), self._repeat):
+            item = numbers[start]
+            if not left.get(item) or len({*numbers[start : start + self._repeat]}) > 1:
+                raise ArgumentError(f"items={item}: is not out")
+            told.append((item, left[item].pop(0)))
+        return told
+
+    def _forget(self, told: list[tuple[int, int]]) -> None:
+        for item, ticket in told:
+            self._out[item].remove(ticket)
+
+    def _means(self, name: str, values: Any, groups: int) -> list[float]:
+        """Of each group the mean of its numbers."""
+        numbers, size = _plain(name, values, float), self._repeat
+        if len(numbers) != groups * size:
+            raise ArgumentError(f"{name}: {len(numbers)} results for {groups * size} items")
+        return [sum(numbers[at : at + size]) / size for at in range(0, len(numbers), size)]
+
+
+def _plain(name: str, values: Any, kind: Callable[[Any], T]) -> list[T]:
+    """Numbers [n] as Python's, brought from a device all at once."""
+    try:
+        return [*map(kind, values.tolist() if hasattr(values, "tolist") else values)]
+    except TypeError as error:
+        raise ArgumentError(f"{name}: must be numbers [n]") from error

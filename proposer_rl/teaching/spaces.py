@@ -69,7 +69,8 @@ class Parameters(LevelSpace, ParameterSpace):
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
             for whole numbers, a list for choices among rising numbers, or among texts.
-        bins: equal parts of a range that curricula tell apart; one number for all, or by name.
+        bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
+            twenty parameters or more, 1.
         target: what is to be mastered, for some of the parameters, by name: a value or a part of
             the range, as in ``ranges``; the others have all of theirs. None for no target.
         named: further distributions like ``target``, by name, for hand-designed curricula.
@@ -103,7 +104,13 @@ class Parameters(LevelSpace, ParameterSpace):
             name: _bins(f"ranges.{name}", values, counts.get(name, 8), self._labels[name])
             for name, values in ranges.items()
         }
-        super().__init__(parts, seeded)
+        try:
+            super().__init__(parts, seeded)
+        except ValueError as error:  # of many parameters
+            raise ArgumentError(
+                f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
+                "bins=1, which suffices for curricula that need none"
+            ) from error
         given = {"target": target} if target is not None else {}
         self.distributions = {
             "all": self,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from operator import index
 from threading import RLock
-from typing import Any, Literal
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import Segments
 from proposer_rl.teaching.spaces import LevelSpace
-from proposer_rl.teaching.tickets import OUT, RESULTS, Block, Tickets, as_array
+from proposer_rl.teaching.tickets import COUNTS, OUT, RESULTS, Block, Tickets, as_array
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -87,7 +88,7 @@ class Teacher:
         curriculum: Recipe | Curriculum | str,
         space: LevelSpace | Task,
         *,
-        seed: int = 0,
+        seed: SupportsIndex = 0,
         students: Count = 1,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
@@ -97,18 +98,21 @@ class Teacher:
         **can: Any,
     ) -> None:
         self.space, self.device, self.block = space, torch.device(device), block
-        self._seeds = [seed + copy for copy in range(students)]
+        self._seeds = [_whole("seed", seed) + copy for copy in range(students)]
         self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
         given = getattr(space, "given", _same)
         self.student = student or Student(
-            **{name: adapted(name, one, given) if self._alone else one for name, one in can.items()}
+            **{
+                name: adapted(name, one, given, self.device) if self._alone else one
+                for name, one in can.items()
+            }
         )
         named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
         self._given, self._rows_of = given, getattr(space, "rows", list)
         self._success = success
-        self._tickets = Tickets(students)
+        self._tickets = Tickets()
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._use(None, 0)
@@ -126,16 +130,15 @@ class Teacher:
         """What must be told beside the return: ``success``, ``rollout``."""
         return self.curriculum.reads
 
-    @checked
-    def propose(self, n: Count) -> Any:
+    def propose(self, n: SupportsIndex) -> Any:
         """Levels [n] ([K, n] of several students) to be observed together."""
         with self._here():
-            block = self._next(n)
-            self._tickets.hand_out(block.start, block.end)
+            block = self._next(_whole("n", n, 1))
+            block.hand_out(block.start, block.end)
             self._whole.append(block.start)
             return self._levels(block, slice(None))
 
-    def ask(self, n: int | None = None) -> tuple[Any, Any]:
+    def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
         """The next level and its ticket.
 
         Args:
@@ -148,20 +151,19 @@ class Teacher:
         with self._here():
             if n is None:
                 return self._one()
-            if not isinstance(n, int) or n < 0:
-                raise ArgumentError(f"n={n!r}: must be a whole number, not negative")
+            left = _whole("n", n, 0)
             ids: list[Tensor] = []
             levels: list[Any] = []
-            while n or not ids:
-                if self._block is None or (n and self._at == self._block.end):
-                    self._refill(max(self.block, n))
+            while left or not ids:
+                if self._block is None or (left and self._at == self._block.end):
+                    self._refill(max(self.block, left))
                 block, start = self._block, self._at
                 assert block is not None
-                self._at = end = min(start + n, block.end)
-                self._tickets.hand_out(start, end)
+                self._at = end = min(start + left, block.end)
+                block.hand_out(start, end)
                 ids.append(torch.arange(start, end, device=self.device))
                 levels.append(self._levels(block, slice(start - block.start, end - block.start)))
-                n -= end - start
+                left -= end - start
             if len(ids) == 1:
                 return ids[0], levels[0]
             return torch.cat(ids), torch.cat(levels, 0 if self._alone else 1)
@@ -181,12 +183,13 @@ class Teacher:
         Args:
             ids: a ticket, or tickets [n] in any order.
             return_: undiscounted, of an episode on each level or a mean of several: a number, or
-                numbers [n] ([K, n] of several students).
+                numbers [n] ([K, n] of several students; [K] for one ticket).
             success: whether, or of how many of them; from 0 to 1.
             score: how much there is to learn on the level, where the loop says so itself, such as
-                the mean of its absolute advantages; for curricula that score levels.
-            episodes: how many there were; None for one.
-            steps: how long they took together.
+                the mean of its absolute advantages; for curricula that score levels. For all
+                levels of the teacher or for none.
+            episodes: how many there were; None for one. One number may stand for all tickets.
+            steps: how long they took together; likewise.
 
         Raises:
             ArgumentError: naming the argument: a ticket that is not out, a number that is missing
@@ -200,15 +203,23 @@ class Teacher:
             if success is None:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
-                numbers = [(name, _number(name, value)) for name, value in told.items()]
+                numbers = {name: _number(name, value) for name, value in told.items()}
                 self._tickets.tell_one(ids, numbers)
             else:
                 self._tell(self._ids(ids), told)
 
-    def drop(self, ids: Any) -> None:
-        """Nothing will come of these levels: episodes that were cut off."""
+    def drop(self, ids: Any = None) -> None:
+        """Nothing will come of these levels: episodes that were cut off.
+
+        Args:
+            ids: the tickets; None for all that are out, as where a resumed loop begins anew.
+        """
         with self._here():
-            self._tickets.close(self._tickets.places(self._ids(ids)))
+            if ids is None:
+                self._tickets.close_all()
+                self._whole.clear()
+            else:
+                self._tickets.close(self._tickets.find(self._ids(ids)))
 
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
@@ -228,9 +239,8 @@ class Teacher:
         with self._here():
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 tickets, whole = self._segments.ended(outcome)
-                if not len(tickets):
-                    return
-                self._observe_rollout(tickets, whole)
+                if len(tickets):
+                    self._observe_rollout(tickets, whole)
                 self._segments.keep()
                 return
             tickets = self._proposed() if ids is None else self._ids(ids)
@@ -248,9 +258,11 @@ class Teacher:
                 self._whole.clear()
 
     def log(self) -> dict[str, Any]:
-        """What the curriculum has to tell since the last call; empty if there is nothing."""
+        """What the curriculum has to tell since the last call; empty if there is nothing.
+
+        What was told since the last proposal is not in it, so that logs change no curriculum.
+        """
         with self._here():
-            self._tickets.collect(self._observe)
             return self.curriculum.log()
 
     def state_dict(self) -> dict[str, Any]:
@@ -267,12 +279,13 @@ class Teacher:
             }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on, bit by bit, with what :meth:`state_dict` returned."""
+        """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is."""
         with self._here():
+            state = _on_cpu(state)
             source: Any = self.space.space
             like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
-            self._tickets.load_state_dict(state["tickets"], like, self.students)
+            self._tickets.load_state_dict(state["tickets"], like)
             self._proposals, self._at = state["proposals"], state["at"]
             self._whole = list(state["proposed"])
             blocks = {block.start: block for block in self._tickets.blocks}
@@ -310,8 +323,7 @@ class Teacher:
             assert block is not None
         ticket = self._at
         self._at += 1
-        tickets = self._tickets
-        tickets.state[ticket - tickets.first] = OUT
+        block.state[ticket - block.start] = OUT
         if not self._rows:
             each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU)]
             self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
@@ -347,12 +359,12 @@ class Teacher:
     def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
-            name: as_array(_argument(name), value, shape).reshape(self.students, -1)
+            name: as_array(_argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
             for name, value in told.items()
         }
         if "success" in arrays:
             _check_share(arrays["success"])
-        self._tickets.tell(self._tickets.places(ids), arrays)
+        self._tickets.tell(self._tickets.find(ids), arrays)
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
         """Observe a rollout [K, n, T], each row of which is of one ticket."""
@@ -361,7 +373,7 @@ class Teacher:
                 f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
                 f"{len(ids)} levels of {self.students} student(s)"
             )
-        place = self._tickets.places(ids)
+        parts = self._tickets.find(ids)
         rollout, after = rollout.copy(), rollout["next"].copy()
         known = "success" in after.keys()
         if not known and self._success is not None:
@@ -375,11 +387,10 @@ class Teacher:
             outcome = outcome.exclude("success")
         for name in ("return", "success") if known else ("return",):
             as_array(name, outcome[name], tuple(outcome.batch_size))
-        for block, which in self._tickets.parts(ids):
-            rows = torch.from_numpy(which)
-            part = block.batch[:, torch.from_numpy(ids[which] - block.start)]
-            self._observe(part, outcome[:, rows.to(outcome["return"].device)])
-        self._tickets.close(place)
+        for block, which, place in parts:
+            rows = torch.from_numpy(which).to(outcome["return"].device)
+            self._observe(block.batch[:, torch.from_numpy(place)], outcome[:, rows])
+        self._tickets.close(parts)
 
     def _of_students(self, rollout: TensorDictBase) -> TensorDictBase:
         return rollout if not self._alone or rollout.ndim > 2 else rollout.unsqueeze(0)
@@ -413,6 +424,24 @@ class Teacher:
                 f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
             )
         return array.reshape(-1).astype(np.int64)
+
+
+def _whole(name: str, value: SupportsIndex, least: int | None = None) -> int:
+    try:
+        number = index(value)
+    except TypeError as error:
+        raise ArgumentError(f"{name}={value!r:.60}: must be a whole number") from error
+    if least is not None and number < least:
+        raise ArgumentError(f"{name}={number}: must be a whole number, at least {least}")
+    return number
+
+
+def _on_cpu(state: Any) -> Any:
+    if isinstance(state, Mapping):
+        return {name: _on_cpu(entry) for name, entry in state.items()}
+    if isinstance(state, list | tuple):
+        return type(state)(map(_on_cpu, state))
+    return state.cpu() if isinstance(state, Tensor) else state
 
 
 def _number(name: str, value: Any) -> float:

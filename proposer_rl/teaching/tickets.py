@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from bisect import bisect_right
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -23,186 +24,199 @@ Ids = NDArray[np.int64]
 WAITS, OUT, TOLD, OVER = range(4)  # not handed out; handed out; told; observed or dropped
 STATES = ("has not been handed out", "", "has been told before", "is over")
 RESULTS = ("return", "success", "score", "episodes", "steps")
-FIRST = 1024  # tickets that there is room for
+COUNTS = ("episodes", "steps")
 
 
 @dataclass
 class Block:
-    """A batch of the curriculum's, and its first ticket."""
+    """A batch [K, n] of the curriculum's, its first ticket, and what has become of its levels.
+
+    Attributes:
+        end: the ticket after its last.
+        state: of each ticket, uint8 [n].
+        results: by name, [K, n]; NaN where nothing was told.
+    """
 
     start: int
     batch: Batch
+    end: int = field(init=False)
+    state: NDArray[np.uint8] = field(init=False)
+    results: dict[str, NDArray[np.float64]] = field(init=False)
 
-    @cached_property
-    def end(self) -> int:
-        """The ticket after its last."""
-        return self.start + self.batch.count
+    def __post_init__(self) -> None:
+        shape = tuple(self.batch.levels.shape[:2])
+        self.end = self.start + shape[1]
+        self.state = np.full(shape[1], WAITS, np.uint8)
+        self.results = {name: np.full(shape, np.nan) for name in RESULTS}
+
+    def hand_out(self, start: int, end: int) -> None:
+        """Note that tickets are out."""
+        self.state[start - self.start : end - self.start] = OUT
+
+
+Parts = list[tuple[Block, Ids, Ids]]
+"""Blocks that some tickets are of; which of them, and at which places of the block these are."""
 
 
 class Tickets:
-    """Tickets in the order of their numbers; those of blocks that are over are forgotten.
+    """Tickets in the order of their numbers; those of blocks that are over are forgotten."""
 
-    Args:
-        students: K, for each of which there is a result.
-    """
-
-    def __init__(self, students: int) -> None:
-        self.first = self.next = 0
+    def __init__(self) -> None:
+        self.next = 0
         self.blocks: list[Block] = []
-        self.state = np.zeros(FIRST, np.uint8)
-        self.results = {name: np.full((students, FIRST), np.nan) for name in RESULTS}
         self.told = False  # whether anything has been since the last collection
+        self.scored: bool | None = None  # whether with a score; None where nothing was told yet
 
     def add(self, batch: Batch) -> Block:
         """Number the levels of a batch."""
         block = Block(self.next, batch)
         self.blocks.append(block)
         self.next = block.end
-        room = self.next - self.first - len(self.state)
-        if room > 0:
-            more = max(room, len(self.state))
-            self.state = np.pad(self.state, (0, more))
-            self.results = {
-                name: np.pad(entry, ((0, 0), (0, more)), constant_values=np.nan)
-                for name, entry in self.results.items()
-            }
         return block
 
-    def hand_out(self, start: int, end: int) -> None:
-        """Note that tickets are out."""
-        self.state[start - self.first : end - self.first] = OUT
-
-    def places(self, ids: Ids) -> Ids:
-        """Where tickets [n] stand that are out.
+    def find(self, ids: Ids) -> Parts:
+        """Where tickets [n] are that are out.
 
         Raises:
             ArgumentError: for one that is not out, or stands there twice.
         """
-        place = ids - self.first
-        inside = (ids >= self.first) & (ids < self.next)
-        states = np.where(inside, self.state[place.clip(0, len(self.state) - 1)], OVER)
-        wrong = np.flatnonzero(states != OUT)
-        if len(wrong):
-            ticket = int(ids[wrong[0]])
-            known = 0 <= ticket < self.next
-            reason = STATES[int(states[wrong[0]])] if known else "is no ticket of this teacher"
-            raise ArgumentError(f"ids={ticket}: {reason}")
+        starts = np.array([block.start for block in self.blocks])
+        number = starts.searchsorted(ids, "right") - 1
+        parts = []
+        for each in np.unique(number).tolist():
+            which = np.flatnonzero(number == each)
+            if each < 0:
+                self._refuse(int(ids[which[0]]), OVER)
+            block = self.blocks[each]
+            place = ids[which] - block.start
+            states = np.append(block.state, OVER).take(place, mode="clip")  # what is between blocks
+            wrong = np.flatnonzero(states != OUT)
+            if len(wrong):
+                self._refuse(int(ids[which[wrong[0]]]), states[wrong[0]])
+            parts.append((block, which, place))
         if len(ids) > 1 and (np.diff(ids) <= 0).any():  # else they rise
             tickets, counts = np.unique(ids, return_counts=True)
             if (counts > 1).any():
                 raise ArgumentError(f"ids={tickets[counts > 1][0]}: is there more than once")
-        return place
+        return parts
 
-    def tell(self, place: Ids, results: Mapping[str, NDArray[Any]]) -> None:
-        """Note results [K, n] of tickets at places [n]."""
+    def tell(self, parts: Parts, results: Mapping[str, NDArray[Any]]) -> None:
+        """Note results [K, n] of tickets [n] that were found.
+
+        Raises:
+            ArgumentError: if these have a score and others had none, or the other way round.
+        """
+        self._check_score("score" in results)
+        for block, which, place in parts:
+            for name, result in results.items():
+                block.results[name][:, place] = result[:, which]
+            block.state[place] = TOLD
+        self.told = True
+
+    def tell_one(self, ticket: int, results: Mapping[str, float]) -> None:
+        """Note what came of one ticket of one student, as :meth:`find` and :meth:`tell` do."""
+        number = bisect_right(self.blocks, ticket, key=attrgetter("start")) - 1
+        place = ticket - self.blocks[number].start if number >= 0 else 0
+        inside = number >= 0 and ticket < self.blocks[number].end
+        if not (inside and self.blocks[number].state[place] == OUT):
+            self.find(np.array([ticket]))  # says what is wrong with it
+        self._check_score("score" in results)
+        block = self.blocks[number]
         for name, result in results.items():
-            self.results[name][:, place] = result
-        self.state[place] = TOLD
+            block.results[name][0, place] = result
+        block.state[place] = TOLD
         self.told = True
 
-    def tell_one(self, ticket: int, results: Iterable[tuple[str, float]]) -> None:
-        """Note what came of one ticket of one student."""
-        place = ticket - self.first
-        if not (0 <= place < self.next - self.first and self.state[place] == OUT):
-            self.places(np.array([ticket]))  # says what is wrong with it
-        for name, number in results:
-            self.results[name][0, place] = number
-        self.state[place] = TOLD
-        self.told = True
+    def close(self, parts: Parts) -> None:
+        """Note that nothing more comes of tickets that were found."""
+        for block, _, place in parts:
+            block.state[place] = OVER
 
-    def parts(self, ids: Ids) -> Iterator[tuple[Block, Ids]]:
-        """The blocks of tickets [n], and where in ``ids`` those of each are."""
-        starts = np.array([block.start for block in self.blocks])
-        which = starts.searchsorted(ids, "right") - 1
-        for number in np.unique(which).tolist():
-            yield self.blocks[number], np.flatnonzero(which == number)
-
-    def close(self, place: Ids) -> None:
-        """Note that nothing more comes of tickets."""
-        self.state[place] = OVER
+    def close_all(self) -> None:
+        """Note that nothing more comes of any that is out."""
+        for block in self.blocks:
+            block.state[block.state == OUT] = OVER
 
     def collect(self, observe: Callable[[Batch, TensorDict], None]) -> None:
         """Give what has been told since the last time to a curriculum, and forget what is over."""
         for block in self.blocks if self.told else ():
-            here = slice(block.start - self.first, block.end - self.first)
-            which = np.flatnonzero(self.state[here] == TOLD)
-            if not len(which):
+            place = np.flatnonzero(block.state == TOLD)
+            if not len(place):
                 continue
-            whole = len(which) == block.batch.count
-            batch = block.batch if whole else block.batch[:, torch.from_numpy(which)]
-            observe(batch, self._outcome(which + here.start))
-            self.state[which + here.start] = OVER
+            whole = len(place) == block.batch.count
+            batch = block.batch if whole else block.batch[:, torch.from_numpy(place)]
+            observe(batch, _outcome(block, place))
+            block.state[place] = OVER
         self.told = False
-        self._forget()
+        self.blocks = [block for block in self.blocks if (block.state != OVER).any()]
 
-    def _outcome(self, place: Ids) -> TensorDict:
-        """What was told of tickets [n]: [K, n]."""
-        outcome = {}
-        for name, entry in self.results.items():
-            result = entry[:, place]
-            missing = np.isnan(result)
-            if name in ("episodes", "steps"):
-                outcome[name] = torch.from_numpy(np.where(missing, 1, result).astype(np.int64))
-            elif not missing.any():
-                outcome[name] = torch.from_numpy(result.astype(np.float32))
-        return TensorDict(outcome, outcome["return"].shape)
+    def _check_score(self, scored: bool) -> None:
+        if self.scored not in (None, scored):
+            how = "missing: other levels were told with one" if self.scored else "others had none"
+            raise ArgumentError(f"score: {how}; give it for all or for none")
+        self.scored = scored
 
-    def _forget(self) -> None:
-        """Forget the oldest blocks that are over."""
-        while self.blocks:
-            count = self.blocks[0].end - self.first
-            if (self.state[:count] != OVER).any():
-                return
-            self.first = self.blocks.pop(0).end
-            kept = self.next - self.first
-            self.state[:kept] = self.state[count : count + kept].copy()
-            self.state[kept:] = WAITS
-            for entry in self.results.values():
-                entry[:, :kept] = entry[:, count : count + kept].copy()
-                entry[:, kept:] = np.nan
+    def _refuse(self, ticket: int, state: int) -> NoReturn:
+        known = 0 <= ticket < self.next
+        reason = STATES[state] if known else "is no ticket of this teacher"
+        raise ArgumentError(f"ids={ticket}: {reason}")
 
     def state_dict(self) -> dict[str, Any]:
         """All of it, with the levels that are out."""
-        here = slice(0, self.next - self.first)
         return {
-            "first": self.first,
             "next": self.next,
             "told": self.told,
-            "state": torch.from_numpy(self.state[here].copy()),
-            "results": {
-                name: torch.from_numpy(entry[:, here].copy())
-                for name, entry in self.results.items()
-            },
+            "scored": self.scored,
             "blocks": [
                 {
                     "start": block.start,
-                    "count": block.batch.count,
                     "levels": packed(block.batch.levels),
                     "notes": packed(block.batch.notes),
+                    "state": torch.tensor(block.state),
+                    "results": {name: torch.tensor(r) for name, r in block.results.items()},
                 }
                 for block in self.blocks
             ],
         }
 
-    def load_state_dict(self, state: Mapping[str, Any], like: Levels, students: int) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], like: Levels) -> None:
         """Go on with it; ``like`` is a level of the kind."""
-        Tickets.__init__(self, students)
-        self.first = self.next = state["first"]
-        for block in state["blocks"]:
-            self.next = block["start"]  # what was between two of them is over
-            shape = (students, block["count"])
-            notes: Any = TensorDict.from_dict(dict(block["notes"]), batch_size=shape)
-            self.add(Batch(of_kind(like, block["levels"], shape), notes.clone()))
-        self.next = state["next"]
-        count = self.next - self.first
-        self.state[:count] = state["state"].numpy()
-        for name, entry in state["results"].items():
-            self.results[name][:, :count] = entry.numpy()
-        self.told = state["told"]
+        self.blocks = []
+        for kept in state["blocks"]:
+            shape = kept["results"]["return"].shape
+            notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=shape)
+            batch = Batch(of_kind(like, kept["levels"], shape), notes.clone())
+            block = Block(kept["start"], batch)
+            block.state[:] = kept["state"].numpy()
+            for name, result in kept["results"].items():
+                block.results[name][:] = result.numpy()
+            self.blocks.append(block)
+        self.next, self.told, self.scored = state["next"], state["told"], state["scored"]
 
 
-def as_array(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _outcome(block: Block, place: Ids) -> TensorDict:
+    """What was told of levels at places [n] of a block: [K, n]."""
+    outcome = {}
+    for name, entry in block.results.items():
+        result = entry[:, place]
+        missing = np.isnan(result)
+        if name in COUNTS:
+            outcome[name] = torch.from_numpy(np.where(missing, 1, result).astype(np.int64))
+        elif not missing.any():
+            outcome[name] = torch.from_numpy(result.astype(np.float32))
+    return TensorDict(outcome, outcome["return"].shape)
+
+
+def as_array(
+    name: str, value: Any, shape: tuple[int, ...], for_all: bool = False
+) -> NDArray[np.float64]:
     """Numbers of a shape as an array on the CPU, whatever they are given as.
+
+    Args:
+        name: of the argument.
+        value: the numbers; of one level without that dimension, too.
+        shape: [n] or [K, n].
+        for_all: whether one number may stand for all.
 
     Raises:
         ArgumentError: naming the argument, if it has another shape or is not finite.
@@ -213,6 +227,10 @@ def as_array(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float6
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"{name}={value!r:.60}: must be numbers") from error
+    if for_all and not array.ndim:
+        array = np.full(shape, array)
+    if shape[-1] == 1 and array.shape == shape[:-1]:
+        array = array[..., np.newaxis]
     if array.shape != shape:
         raise ArgumentError(
             f"{name}: has shape {list(array.shape)}, but must have {list(shape)}: one number for "

@@ -135,12 +135,13 @@ class LevelTransform(Transform):
 
     def _end(self, ended: Tensor) -> None:
         """Tell what came of episodes, bool [n]."""
-        if self._tells and bool(ended.any()):
+        which = ended.nonzero().squeeze(-1)  # waits for the device once, where each mask would
+        if self._tells and len(which):
             self._teacher.tell(
-                self._ids[ended],
-                self._returns[ended],
-                self._succeeded[ended] if self._knows else None,
-                steps=self._steps[ended],
+                self._ids[which],
+                self._returns[which],
+                self._succeeded[which] if self._knows else None,
+                steps=self._steps[which],
             )
         self._out = self._out & ~ended
 

@@ -11,6 +11,7 @@ import torch
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.curricula import Filtered, Modelled, SamplingCurriculum, Scorer, Student
+from proposer_rl.curricula.outcome_model import OutcomeModel
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
@@ -18,6 +19,7 @@ from proposer_rl.task import space_features
 from proposer_rl.tasks.mazes.task import MazeTask
 from proposer_rl.teaching import Items, Parameters, Teacher
 from tests.curricula.scripted import Scripted, reached, step
+from tests.curricula.test_contract import same
 from tests.tiny import TASK, composed, sledges, tiny_view_task
 
 ASKS_THE_MODEL_ALONE = [
@@ -94,6 +96,22 @@ def test_it_tells_how_right_it_was() -> None:
     assert levels.sum() == 8 * 32
     assert ((said - was).abs() * levels).sum() / levels.sum() < 0.1
     assert curriculum.log() == {}
+
+
+def test_whole_batches_are_taken_in_one_by_one() -> None:
+    """As by the model itself, also where the log is read in between."""
+    student = Scripted(torch.tensor([[0.0, 0.3, 0.7, 1.0]]))
+    curriculum, model = scripted_filter(student), OutcomeModel(labels="above_worst")
+    for update in range(5):
+        batch = curriculum.propose(student, 16, [Streams(0, "update", update)])
+        outcome = reached(torch.rand(1, 16, generator=torch.Generator().manual_seed(update)))
+        curriculum.observe(student, batch, outcome)
+        told = {name: outcome[name].double() for name in ("return", "success")}
+        model.add(space_features(student.space, batch.levels).double(), told)
+        if update % 2:
+            curriculum.log()
+    curriculum.log()
+    assert same(curriculum._model.state_dict(), model.state_dict())
 
 
 def test_it_takes_a_student_of_whom_nothing_is_known_but_what_it_did() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import runpy
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -63,6 +66,54 @@ def test_levels_may_be_options_of_a_reset() -> None:
     assert env.unwrapped.options == {"more": 1, **info["level"]}
 
 
+class Parts(LevelEnv):
+    """With numbers in arrays, a text and a truth value."""
+
+    def __init__(self) -> None:
+        self.model = SimpleNamespace(opt=SimpleNamespace(gravity=np.array([0.0, 0.0, -9.81])))
+        self.ground, self.windy, self.masses = "flat", False, {"torso": 1.0}
+
+
+def parts(**sets: str) -> Any:
+    ranges = {
+        "g": (-9.5, -9.4),
+        "ground": ["grass", "stairs"],
+        "windy": [True],
+        "mass": range(2, 5),
+    }
+    teacher = prl.Teacher("domain_randomization", prl.Parameters(ranges))
+    env = prl.TaughtEnv(Parts(), teacher, sets)
+    return env.unwrapped, env.reset()[1]["level"]
+
+
+def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
+    env, level = parts(g="model.opt.gravity.2", ground="ground", windy="windy", mass="masses.torso")
+    assert env.model.opt.gravity.tolist() == [0.0, 0.0, level["g"]]
+    assert (env.ground, env.windy, env.masses) == (level["ground"], True, {"torso": level["mass"]})
+
+
+@pytest.mark.parametrize(
+    ("sets", "message"),
+    [
+        ({"g": "model.opt.gravity"}, r"set.g='model.opt.gravity': .* shape \[3\]; name one of its"),
+        ({"g": "ground"}, "set.g='ground': ground is no number but a str"),
+        ({"ground": "masses.torso"}, "set.ground='masses.torso': 'dict' object has no attribute"),
+        ({"ground": "floor"}, "set.ground='floor': Parts has no attribute 'floor'"),
+    ],
+)
+def test_a_number_is_put_in_the_place_of_one(sets: dict[str, str], message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        parts(**sets)
+
+
+def test_the_length_of_cartpole_is_all_of_what_it_computes_from_it() -> None:
+    """As an environment that was built with that length; the example's levels are so."""
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "taught_sb3.py"))
+    env: Any = gymnasium.make("CartPole-v1").unwrapped
+    example["set_level"](env, {"gravity": 7.0, "length": 0.8})
+    assert (env.gravity, env.length, env.polemass_length) == (7.0, 0.8, env.masspole * 0.8)
+
+
 @pytest.mark.filterwarnings("ignore:This process")
 @pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
 def test_all_environments_of_a_vector_have_one_teacher(kind: Any) -> None:
@@ -76,7 +127,7 @@ def test_all_environments_of_a_vector_have_one_teacher(kind: Any) -> None:
     for _ in range(24):
         *_, info = env.step(env.action_space.sample())
     env.close()
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     check(curriculum.seen)
     assert len(curriculum.seen) > 8
 
@@ -122,7 +173,7 @@ def test_success_is_what_the_rule_says(rule: str) -> None:
         env.reset()
         while not env.step(0)[2]:
             pass
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     expected = {0: 0.0, 1: 1.0, 2: 1.0, 3: 0.0} if RULES[rule] is None else {}
     assert {n: s for n, (_, s) in curriculum.seen.items()} == {
         n: expected.get(n, RULES[rule]) for n in range(4)

@@ -105,7 +105,7 @@ def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
             else:
                 teacher.tell(torch.tensor(some), returns, [1.0] * len(some))
             told |= {n: (r, 1.0) for n, r in zip(numbers, returns, strict=True)}
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     assert spy.seen == told
 
 
@@ -114,7 +114,7 @@ def test_it_forgets_what_is_over() -> None:
     for _ in range(200):
         ids, _ = teacher.ask(40)
         teacher.tell(ids, torch.zeros(40), torch.zeros(40))
-    assert len(teacher._tickets.blocks) <= 4 and len(teacher._tickets.state) == 1024
+    assert len(teacher._tickets.blocks) <= 4
 
 
 FREE = {  # of what needs nothing of a learner, settings that are small
@@ -195,6 +195,16 @@ def test_all_that_need_nothing_are_here() -> None:
             continue
         free |= {name} if teacher.curriculum.needs == () else set()
     assert free - {"learning_progress"} == FREE.keys() - {"learning_progress"}
+
+
+def test_many_parameters_have_one_bin_each() -> None:
+    """8 ** 21 is more than int64 can count."""
+    ranges = {f"friction_{i}": (0.0, 1.0) for i in range(21)}
+    for bins in ({}, {"bins": {"friction_3": 16}}):
+        with pytest.raises(ArgumentError, match=r"bins=.*: too many comb.*; give bins=1"):
+            prl.Parameters(ranges, **bins)  # type: ignore[arg-type]
+    _, level = prl.Teacher("plr", prl.Parameters(ranges, bins=1)).ask()
+    assert level.keys() == ranges.keys()
 
 
 def test_every_update_has_draws_of_its_own() -> None:
@@ -303,7 +313,7 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         "rollout: has no level_id",
     ),
     "asked for less than none": (lambda t: t.ask(-1), "n=-1: must be a whole number"),
-    "proposed none": (lambda t: t.propose(0), "n=0: input should be greater"),
+    "proposed none": (lambda t: t.propose(0), "n=0: must be a whole number, at"),
 }
 
 
@@ -427,6 +437,20 @@ def test_functions_of_levels_are_all_that_others_need(name: str) -> None:
     if name.startswith("sfl"):
         walls = teacher.curriculum.kept["walls"].double().mean()
         assert 18 < float(walls) < 42  # p (1 - p) is largest in the middle
+
+
+@pytest.mark.parametrize("space", [SPACE, ITEMS])
+def test_functions_get_levels_where_the_loop_has_them(space: Any) -> None:
+    """Here the device is one that holds no numbers."""
+    seen = []
+
+    def performance(levels: Any) -> dict[str, Any]:
+        seen.append(levels.device.type)
+        return {"return": [0.5] * len(levels), "success": [0.5] * len(levels)}
+
+    recipe = prl.curricula.learning_progress(probes=1)
+    teacher = prl.Teacher(recipe, space, device="meta", performance=performance)
+    assert teacher.propose(4).device.type == "meta" and {*seen} == {"meta"}
 
 
 def test_filtering_works_on_spaces() -> None:

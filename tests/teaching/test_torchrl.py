@@ -14,6 +14,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
+from tests.host_reads import CountedReads
 from tests.teaching.counting import ITEMS, Counting, LevelsEnv, check, length, set_level
 
 LEVELS = 4
@@ -47,7 +48,7 @@ def test_an_episode_goes_to_the_level_that_it_began_on(afresh: bool, steps: int)
     curriculum = Counting("success")
     teacher = prl.Teacher(curriculum, ITEMS, block=3)
     rollouts = collected(taught(teacher), steps, 5, reset_at_each_iter=afresh)
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     check(curriculum.seen)
     ended = sum(int(rollout["next", "done"].sum()) for rollout in rollouts)
     assert len(curriculum.seen) == ended > 4
@@ -93,7 +94,7 @@ def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
     teacher = prl.Teacher(curriculum, ITEMS, block=3)
     transforms = prl.LevelTransform(teacher, set_level), StepCounter(2), RewardScaling(0.0, 0.1)
     rollouts = collected(TransformedEnv(LevelsEnv(), Compose(*transforms)), 4, 3)
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     assert len(curriculum.seen) >= 8
     for number, (total, _) in curriculum.seen.items():
         assert total == 2 * number
@@ -118,7 +119,7 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
     )
     rollouts = [rollout, *(each.clone() for each in collector)]
     collector.shutdown()
-    teacher.log()
+    teacher.propose(1)  # takes in what was told
     check(curriculum.seen)
     begun = [set(each["level_id"].unique().tolist()) for each in rollouts]
     assert len(curriculum.seen) > 6 and not begun[0] & begun[1]
@@ -153,10 +154,22 @@ def test_success_is_asked_for() -> None:
         teacher = prl.Teacher(curriculum, ITEMS)
         made = TransformedEnv(Silent(), prl.LevelTransform(teacher, set_level, **how))
         made.rollout(8, break_when_any_done=False)
-        teacher.log()
+        teacher.propose(1)  # takes in what was told
         return curriculum.seen
 
     with pytest.raises(ArgumentError, match="success: missing: this curriculum reads it, and"):
         env()
     assert {success for _, success in env(success="terminated").values()} == {1.0}
     assert {s for _, s in env(success=lambda after: ~after["terminated"]).values()} == {0.0}
+
+
+def test_the_end_of_episodes_waits_for_the_device_once() -> None:
+    teacher = prl.Teacher(Counting(), ITEMS)
+    env = taught(teacher)
+    env.reset()
+    ended = torch.tensor([True, False, True, False])
+    env.transform._knows = True
+    with CountedReads() as reads:
+        env.transform._end(ended)
+        env.transform._end(torch.zeros_like(ended))
+    assert reads.count == 2

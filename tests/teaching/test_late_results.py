@@ -1,0 +1,208 @@
+"""Results that come late, in parts, with logs in between, or never; and what holds them."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+import proposer_rl as prl
+from proposer_rl.curricula import Batch, Curriculum
+from proposer_rl.settings import ArgumentError
+from tests.curricula.test_contract import same
+from tests.teaching.counting import ITEMS, Counting
+
+SPACE = prl.Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5})
+
+
+def loaded(state: Any, **how: Any) -> Any:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True, **how)
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_an_episode_may_be_longer_than_rollouts(resumed: bool) -> None:
+    """It lasts ten steps; the rollouts in which it does not end are of it, too."""
+    curriculum = Counting("rollout")
+    teacher = prl.Teacher(curriculum, ITEMS)
+    ids, _ = teacher.ask(1)
+    for steps in (4, 4, 2):
+        done = torch.zeros(1, steps, 1, dtype=torch.bool)
+        done[0, -1] = steps == 2
+        after = {"reward": torch.ones(1, steps, 1), "done": done, "terminated": done}
+        level = ids.expand(1, steps).unsqueeze(-1)
+        teacher.observe(TensorDict({"level_id": level, "next": after}, [1, steps]))
+        if resumed:
+            state = loaded(teacher.state_dict())
+            teacher = prl.Teacher(curriculum, ITEMS)
+            curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
+            teacher.load_state_dict(state)
+    assert curriculum.seen[0][0] == 10
+
+
+def asked(every: int | None) -> tuple[list[Any], prl.Teacher]:
+    """Levels of episodes one by one, logs in between, and the teacher."""
+    teacher = prl.Teacher("model_transport", SPACE, block=64)
+    levels = []
+    for i in range(1217):
+        ticket, level = teacher.ask()
+        levels.append(level)
+        if i < 1216:
+            teacher.tell(ticket, float(level["force"] < 2 + i / 1000))
+        if every and i % every == 0:
+            teacher.log()
+    return levels, teacher
+
+
+def test_logs_change_nothing() -> None:
+    (levels, teacher), (logged, often) = asked(None), asked(4)
+    assert levels == logged
+    model, other = (one.curriculum._model.state_dict() for one in (teacher, often))
+    assert same(model, other)
+    assert sum(len(batch["return"][0]) for batch in model["batches"]) == 1216
+
+
+def test_all_that_comes_between_two_proposals_is_one_batch_of_the_model() -> None:
+    """Else a few late results would push out whole batches, of which it keeps some fifty."""
+    teacher = prl.Teacher("model_transport", SPACE, block=8)
+    ids = torch.cat([teacher.ask(8)[0] for _ in range(60)])
+    teacher.tell(ids[::8], torch.arange(60.0))
+    teacher.propose(1)
+    teacher.tell(ids[1::8], torch.arange(60.0))
+    teacher.propose(1)
+    batches = teacher.curriculum._model.state_dict()["batches"]
+    assert [batch["return"][0].tolist() for batch in batches] == [[*range(60)]] * 2
+
+
+def test_a_score_is_told_of_all_levels_or_of_none() -> None:
+    def teacher() -> prl.Teacher:
+        return prl.Teacher(prl.curricula.plr(capacity=16, fill=0.5), prl.Items(16), block=8)
+
+    first = teacher()
+    ids, _ = first.ask(8)
+    first.tell(ids[:7], [0.0] * 7, score=[5.0] * 7)
+    for tickets in (7, ids[7:]):
+        with pytest.raises(ArgumentError, match=r"score: missing: other levels were told with one"):
+            first.tell(tickets, 0.0)
+    resumed = teacher()
+    resumed.load_state_dict(loaded(first.state_dict()))
+    with pytest.raises(ArgumentError, match="score: missing"):
+        resumed.tell(7, 0.0)
+    first.tell(7, 0.0, score=5.0)  # what was refused counts nothing
+    first.propose(1)
+    assert first.log()["mean_score"] == [5.0]
+    second = teacher()
+    second.tell(second.ask()[0], 0.0)
+    with pytest.raises(ArgumentError, match="score: others had none; give it for all or for none"):
+        second.tell(second.ask()[0], 0.0, score=5.0)
+
+
+def test_tickets_that_are_never_told_keep_their_own_blocks_alone() -> None:
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS, block=16)
+    lost, _ = teacher.ask(4)
+    for _ in range(100):
+        ids, levels = teacher.ask(16)
+        teacher.tell(ids, levels.double())
+    blocks = teacher._tickets.blocks
+    assert len(blocks) <= 3 and blocks[0].start == 0
+    teacher.tell(lost[:2], [0.0, 1.0])  # one may still come back
+    resumed = prl.Teacher(curriculum, ITEMS, block=16)
+    curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
+    resumed.load_state_dict(loaded(teacher.state_dict()))
+    resumed.drop()
+    for ticket in (int(lost[3]), lost[3:]):
+        with pytest.raises(ArgumentError, match="ids=3: is over"):
+            resumed.tell(ticket, 0.0)
+    resumed.ask(32)
+    assert all(block.start > 0 for block in resumed._tickets.blocks)
+    assert {n: total for n, (total, _) in curriculum.seen.items()} == {
+        n: float(n) for n in range(1604) if n not in (2, 3)
+    }
+
+
+def test_batches_that_are_dropped_are_observed_no_more() -> None:
+    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher.propose(4)
+    teacher.drop()
+    with pytest.raises(ArgumentError, match="ids: missing: nothing is out"):
+        teacher.observe({"return": [0.0] * 4})
+    teacher.propose(2)
+    teacher.observe({"return": [0.0] * 2})
+
+
+class Elsewhere(torch.Tensor):
+    """On another device: NumPy has no access to it."""
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: Any = (), more: Any = None) -> Any:
+        if function is torch.Tensor.numpy:
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+        if function is torch.Tensor.cpu:
+            return args[0].as_subclass(torch.Tensor)
+        return super().__torch_function__(function, types, args, more or {})
+
+
+def elsewhere(state: Any) -> Any:
+    if isinstance(state, dict):
+        return {name: elsewhere(entry) for name, entry in state.items()}
+    if isinstance(state, list):
+        return [*map(elsewhere, state)]
+    return state.as_subclass(Elsewhere) if isinstance(state, torch.Tensor) else state
+
+
+def test_a_state_may_have_been_mapped_to_another_device() -> None:
+    """Against one that was not; what is pretended here is ``map_location="cuda"``."""
+    recipe = prl.curricula.plr(capacity=16, fill=0.5)
+    teacher = prl.Teacher(recipe, ITEMS, block=8)
+    for _ in range(4):
+        ids, levels = teacher.ask(6)
+        teacher.tell(ids[1:], levels[1:].double())
+    state = loaded(teacher.state_dict())
+    other = prl.Teacher(recipe, ITEMS, block=8)
+    other.load_state_dict(elsewhere(state))
+    assert same(teacher.state_dict(), other.state_dict())
+    assert all((teacher.ask(9)[i] == other.ask(9)[i]).all() for i in (0, 1))
+
+
+def test_numbers_may_be_of_any_kind() -> None:
+    """One level as a number or an element, counts of NumPy's, and one number for all tickets."""
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS, seed=np.int64(3), block=4)
+    ids, _ = teacher.ask(np.int64(8))
+    teacher.tell(ids[0], torch.tensor(0.5))
+    teacher.tell(np.int64(1), 1.5)
+    teacher.tell([2], 2.5)
+    teacher.tell(ids[3:6], [3.5, 4.5, 5.5], episodes=8, steps=torch.tensor(3))
+    teacher.drop(ids[6])
+    assert len(teacher.propose(np.int64(3))) == 3
+    assert [total for total, _ in curriculum.seen.values()] == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
+    with pytest.raises(ArgumentError, match=r"ids: must be whole numbers \[n\]"):
+        teacher.tell(torch.tensor(7.0), 0.0)
+    with pytest.raises(ArgumentError, match=r"seed=1\.5: must be a whole number"):
+        prl.Teacher(Counting(), ITEMS, seed=1.5)  # type: ignore[arg-type]
+
+
+def test_one_number_of_episodes_stands_for_all_tickets() -> None:
+    seen = []
+
+    class Spy(Curriculum):
+        def propose(self, student: Any, count: int, streams: Any) -> Batch:
+            levels = TensorDict({"item": torch.zeros(2, count, dtype=torch.int64)}, [2, count])
+            return Batch(levels, levels.clone())
+
+        def observe(self, student: Any, batch: Any, outcome: Any) -> None:
+            seen.append([outcome[name].tolist() for name in ("return", "episodes", "steps")])
+
+    teacher = prl.Teacher(Spy(), ITEMS, students=2)
+    ids, _ = teacher.ask(3)
+    teacher.tell(ids[:2], [[1.0, 2.0], [3.0, 4.0]], episodes=8)
+    teacher.tell(int(ids[2]), [5.0, 6.0], episodes=[7, 9])
+    teacher.propose(1)
+    assert seen == [[[[1, 2, 5], [3, 4, 6]], [[8, 8, 7], [8, 8, 9]], [[1] * 3] * 2]]
