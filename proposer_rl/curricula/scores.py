@@ -72,7 +72,7 @@ STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
     "one_step_td_error": lambda student, rollout, _: advantages(student, rollout, lmbda=0.0).abs(),
     "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double(),
 }
-"""Scores that are read off every single step of a rollout [K, P, T]: float64 [K, P, T].
+"""Scores of every single step of a rollout [K, P, T], float64 and of that shape.
 
 The last argument is R, the highest return ever seen on each level, [K, P].
 """
