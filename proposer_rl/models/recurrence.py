@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+import warnings
+from functools import cache
 from typing import Any
 
 import torch
@@ -69,6 +73,80 @@ class _Distinct(torch.autograd.Function):
         return (every, every.clone()), (None, None)
 
 
+def _forwards(
+    gates: Tensor,
+    kept: Tensor,
+    hidden: Tensor,
+    cell: Tensor,
+    weight: Tensor,
+    hiddens: Tensor,
+    cells: Tensor,
+    squashed: Tensor,
+) -> None:
+    """Writes what is there after each step, and in place of what gates are given what they are."""
+    width = hidden.shape[-1]
+    for step in range(len(gates)):
+        gate, keep = gates[step], kept[step]
+        gate.add_(torch.matmul((hidden * keep).to(weight.dtype), weight))
+        i, f, g, o = gate.chunk(4, -1)
+        gate[..., : 2 * width].sigmoid_()
+        g.tanh_()
+        o.sigmoid_()
+        f.mul_(keep)
+        cell = torch.mul(f, cell, out=cells[step]).addcmul_(i, g)
+        hidden = torch.mul(o, torch.tanh(cell, out=squashed[step]), out=hiddens[step])
+
+
+def _backwards(
+    of_hidden: Tensor | None,
+    of_cell: Tensor | None,
+    slopes: Tensor,
+    through: Tensor,
+    forget: Tensor,
+    kept: Tensor,
+    weight: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Multiplies the gates' slopes by the gradient of what they make.
+
+    Returns:
+        The gradients of hidden and cell before the first step.
+    """
+    to_hidden, to_cell = torch.zeros_like(through[0]), torch.zeros_like(through[0])
+    for step in range(len(slopes) - 1, -1, -1):
+        slope = slopes[step].unflatten(-1, (4, -1))
+        if of_hidden is not None:
+            to_hidden.add_(of_hidden[step])
+        if of_cell is not None:
+            to_cell.add_(of_cell[step])
+        to_cell.addcmul_(to_hidden, through[step])
+        slope[..., :3, :].mul_(to_cell.unsqueeze(-2))
+        slope[..., 3, :].mul_(to_hidden)
+        to_hidden = torch.matmul(slopes[step].to(weight.dtype), weight).to(kept.dtype)
+        to_hidden.mul_(kept[step])
+        to_cell.mul_(forget[step])
+    return to_hidden, to_cell
+
+
+def _compiled(steps: Any, on: Tensor) -> Any:
+    """The steps as TorchScript on CPUs, which spends less between the operations than Python."""
+    # Python 3.14 has no TorchScript; on a GPU the steps are recorded.
+    if not population.at_hand(on) or sys.version_info >= (3, 14):
+        return steps
+    with _scripting:
+        return _scripted(steps)
+
+
+_scripting = threading.Lock()  # replicas train in threads
+
+
+@cache
+def _scripted(steps: Any) -> Any:
+    with warnings.catch_warnings():
+        # What is recommended in its place unrolls all steps before it compiles them.
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
+        return torch.jit.script(steps)
+
+
 class _ThroughTime(torch.autograd.Function):
     """The steps one after another, in place; shapes as above, with [K] before N and R under vmap.
 
@@ -81,25 +159,12 @@ class _ThroughTime(torch.autograd.Function):
     def forward(
         inputs: Tensor, rows: Tensor, kept: Tensor, hidden: Tensor, cell: Tensor, weight: Tensor
     ) -> tuple[Tensor, ...]:
-        width, less = hidden.shape[-1], hidden.new_full((), -1.0)
-        # tanh(x) is 2 sigmoid(2 x) - 1, so that one call serves all gates: g is doubled beforehand.
-        twice = torch.ones(4 * width, dtype=weight.dtype, device=weight.device)
-        twice[2 * width : 3 * width] = 2
-        weight = (weight * twice.unsqueeze(-1)).mT.contiguous()
-        given = (inputs * twice).index_select(-2, rows.flatten()).to(hidden.dtype)
+        weight = weight.mT.contiguous()
+        given = inputs.index_select(-2, rows.flatten()).to(hidden.dtype)
         gates = given.unflatten(-2, rows.shape).movedim(-3, 0)
         hiddens, cells, squashed = hidden.new_empty(3, len(rows), *hidden.shape)
-        # A view of each step, made for all at once.
-        steps = (x.unbind() for x in (gates, kept, cells, squashed, hiddens))
-        for gate, keep, now, small, after in zip(*steps, strict=True):
-            gate.add_(torch.matmul((hidden * keep).to(weight.dtype), weight)).sigmoid_()
-            i, f, g, o = gate.chunk(4, -1)
-            torch.add(less, g, alpha=2, out=g)
-            f.mul_(keep)
-            cell = torch.mul(f, cell, out=now).addcmul_(i, g)
-            torch.mul(cell, 2, out=small).sigmoid_()
-            torch.add(less, small, alpha=2, out=small)
-            hidden = torch.mul(o, small, out=after)
+        steps = _compiled(_forwards, gates)
+        steps(gates, kept, hidden, cell, weight, hiddens, cells, squashed)
         return hiddens, cells, gates, squashed
 
     @staticmethod
@@ -112,30 +177,16 @@ class _ThroughTime(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_hidden: Tensor | None, of_cell: Tensor | None, *_: Any) -> Any:
         rows, kept, hidden, cell, weight, hiddens, cells, gates, squashed = ctx.saved_tensors
-        slopes, width = torch.empty_like(gates), hidden.shape[-1]
-        to_hidden, to_cell = torch.zeros_like(hidden), torch.zeros_like(cell)
-        previous = (cell, *cells.unbind()[:-1])
-        none = (None,) * len(rows)
-        outer = (none if x is None else x.unbind() for x in (of_hidden, of_cell))
-        steps = (x.unbind() for x in (gates, slopes, squashed, kept))
-        backwards = reversed(list(zip(*outer, *steps, previous, strict=True)))
-        for own_hidden, own_cell, gate, slope, small, keep, before in backwards:
-            (i, f, g, o), (si, sf, sg, so) = gate.chunk(4, -1), slope.chunk(4, -1)
-            if own_hidden is not None:
-                to_hidden.add_(own_hidden)
-            if own_cell is not None:
-                to_cell.add_(own_cell)
-            to_cell.add_(torch.ops.aten.tanh_backward(to_hidden * o, small))
-            torch.mul(to_cell, g, out=si)
-            torch.mul(to_cell, before, out=sf)
-            torch.mul(to_cell, i, out=sg)
-            torch.mul(to_hidden, small, out=so)
-            both = slope[..., : 2 * width]
-            sigmoid_slope_(both, gate[..., : 2 * width], grad_input=both)
-            tanh_slope_(sg, g, grad_input=sg)
-            sigmoid_slope_(so, o, grad_input=so)
-            to_hidden = torch.matmul(slope.to(weight.dtype), weight).to(hidden).mul_(keep)
-            to_cell.mul_(f)
+        slopes = torch.empty_like(gates)
+        (i, f, g, o), (of_i, of_f, of_g, of_o) = gates.chunk(4, -1), slopes.chunk(4, -1)
+        sigmoid_slope_(g, i, grad_input=of_i)
+        sigmoid_slope_(cell, f[0], grad_input=of_f[0])
+        sigmoid_slope_(cells[:-1], f[1:], grad_input=of_f[1:])
+        tanh_slope_(i, g, grad_input=of_g)
+        sigmoid_slope_(squashed, o, grad_input=of_o)
+        through = torch.ops.aten.tanh_backward(o, squashed)
+        steps = _compiled(_backwards, gates)
+        to_hidden, to_cell = steps(of_hidden, of_cell, slopes, through, f, kept, weight)
         before = torch.cat([hidden.unsqueeze(0), hiddens[:-1]]).mul_(kept)
         slopes, before = (x.movedim(0, -3).flatten(-3, -2) for x in (slopes, before))
         of_weight = torch.matmul(slopes.to(weight.dtype).mT, before.to(weight.dtype))

@@ -29,7 +29,7 @@ class Call(NamedTuple):
         parameters = dict(zip(self.names, member, strict=True))
         low, device = self.precision == "bf16", member[0].device.type
         with torch.autocast(device, torch.bfloat16) if low else nullcontext():
-            outputs = functional_call(self.network, parameters, tuple(inputs))
+            outputs = functional_call(self.network, parameters, tuple(inputs), tie_weights=False)
         if isinstance(outputs, Tensor):
             outputs = (outputs,)
         return tuple(output.float() for output in outputs)

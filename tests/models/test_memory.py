@@ -12,7 +12,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
+from proposer_rl.models import (
+    ActorCritic,
+    MemoryNetwork,
+    Population,
+    memory_actor_critic,
+    recurrence,
+)
 from proposer_rl.models.memory import MEMORY
 from proposer_rl.streams import Streams
 from tests.tiny import tiny_view_task
@@ -93,6 +99,24 @@ def test_through_time_is_step_by_step(how: dict[str, Any]) -> None:
         at_once, one_by_one = through_time(actor_critic, batch), step_by_step(actor_critic, batch)
     for key in actor_critic.out_keys:
         torch.testing.assert_close(at_once[key], one_by_one[key], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_compiled_steps_are_those_of_python(
+    precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trained_on() -> list[Tensor]:
+        actor_critic = agent(precision=precision)
+        out = through_time(actor_critic, steps())
+        (out["logits"].square().sum() + out["next", MEMORY[1]].sum()).backward()
+        slopes = [p.grad for p in actor_critic.parameters() if p.grad is not None]
+        return [out["logits"].detach(), *slopes]
+
+    compiled = [trained_on() for _ in range(3)]  # the first ones are profiled
+    monkeypatch.setattr(recurrence, "_compiled", lambda steps, on: steps)
+    for ours in compiled:
+        for one, other in zip(ours, trained_on(), strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
 def test_an_episode_knows_nothing_of_the_one_before() -> None:
