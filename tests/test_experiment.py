@@ -18,10 +18,13 @@ from proposer_rl.curricula import (
     Advance,
     Batch,
     Curriculum,
+    Filtered,
     Improvement,
     LearnedCurriculum,
     LearningProgressCurriculum,
     SamplingCurriculum,
+    Scorer,
+    SelectionCurriculum,
     Student,
     TaskStudent,
     UnfitStudentError,
@@ -210,12 +213,18 @@ def test_outcomes_are_told_without_the_scale_of_the_rewards(goes_on: bool, tmp_p
     assert found[1] == pytest.approx(found[0], rel=1e-5) and max(map(abs, found[0])) > 0.1
 
 
+@pytest.mark.parametrize("reads", ["outcomes", "plays of candidates", "plays before a filter"])
 def test_success_of_a_task_that_has_none_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reads: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TASK, "results", ("return",))
-    reader = LearningProgressCurriculum(TASK.space, source="episodes")
-    with pytest.raises(NoSuccessError, match="LearningProgressCurriculum: reads success"):
+    scorer = Scorer("learnability", "episodes")
+    reader: Curriculum = {
+        "outcomes": LearningProgressCurriculum(TASK.space, source="episodes"),
+        "plays of candidates": SelectionCurriculum(TASK.target, scorer, candidates=4, keep=2),
+        "plays before a filter": Filtered(SamplingCurriculum(TASK.target), scorer),
+    }[reads]
+    with pytest.raises(NoSuccessError, match=f"{type(reader).__name__}: reads success"):
         experiment(tmp_path, 0, curriculum=reader, headline="id_return", threshold=-0.1)
     assert [*tmp_path.iterdir()] == []
 

@@ -101,6 +101,7 @@ class Filtered(Combinator):
         if _mixes(curriculum):
             raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
         self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
+        self.reads = tuple(dict.fromkeys((*self.reads, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:

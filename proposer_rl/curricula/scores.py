@@ -151,6 +151,7 @@ class Scorer:
         needs: what scoring levels asks of a student, that nobody trains on.
         asks: what scoring those that were trained on asks of it.
         reads: entries of an outcome that this needs beside the return.
+        plays_for: of those, what playing on levels has to tell.
 
     Raises:
         ArgumentError: if there is no such score, or not from this source.
@@ -170,6 +171,7 @@ class Scorer:
         if self.from_episodes:
             self.asks = {"gradient_norm": ("policy_gradient_norms",)}.get(score, ())
             self.reads = READS.get(score, ())
+        self.plays_for = tuple(entry for entry in self.reads if entry != "rollout")
         self.needs = (*(("play",) if self.from_episodes else ()), *self.asks)
 
     def of_outcome(

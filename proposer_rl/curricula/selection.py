@@ -54,7 +54,7 @@ class SelectionCurriculum(Curriculum):
     ) -> None:
         if keep > candidates:
             raise ArgumentError(f"keep={keep}: must be at most candidates={candidates}")
-        self.needs = scorer.needs
+        self.needs, self.reads = scorer.needs, scorer.plays_for
         self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
         self._new_levels, self.scorer = new_levels, scorer
         self._template = new_levels.sample(1, torch.Generator())[0]
