@@ -157,6 +157,8 @@ class Scorer:
         ArgumentError: if there is no such score, or not from this source.
     """
 
+    plays_for: tuple[str, ...] = ()
+
     @checked
     def __init__(self, score: str, source: Source, rollouts: Count = 1) -> None:
         self._name, self.rollouts, self.from_episodes = score, rollouts, source == "episodes"
