@@ -92,9 +92,10 @@ def test_machines_come_and_go_and_the_numbers_stay(cluster: Cluster) -> None:
     task, curriculum = make(settings(cluster))
 
     def one_goes_another_comes() -> None:
+        with_a_worker = worker_machines(cluster)[0]  # of a set: after the other came, any of three
         cluster.add_node(num_cpus=1, **LIGHT)
         cluster.wait_for_nodes(timeout=600)
-        cluster.remove_node(worker_machines(cluster)[0])
+        cluster.remove_node(with_a_worker)
 
     try:
         with pytest.warns(RuntimeWarning, match="a worker was lost"):
