@@ -180,4 +180,4 @@ class SpecificationSpace(LevelDistribution):
         """Values along an axis, which goes from -1 to 1; 0 where it has a single value."""
         known = torch.tensor(self.axes[axis], dtype=torch.float32)
         middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        return (values - middle) / reach if reach > 0 else torch.zeros_like(values)
+        return (values - middle) / reach if reach > 0 else torch.zeros(values.shape)

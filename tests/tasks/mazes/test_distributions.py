@@ -52,6 +52,9 @@ def test_coordinates_run_from_minus_one_to_one_along_each_axis() -> None:
     assert SPACE.coordinates.tolist() == [[-1, -1], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 1]]
     single = SpecificationSpace([0.25], [2, 5], height=6, width=6)
     assert single.coordinates.tolist() == [[0, -1], [0, 1]]
+    single = SpecificationSpace([0.0, 0.25], [2], height=6, width=6)
+    assert single.coordinates.tolist() == [[-1, 0], [1, 0]]
+    assert single.nearest(single.specifications).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("number", [-1, 6])
