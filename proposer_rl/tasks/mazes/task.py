@@ -198,7 +198,7 @@ class MazeTask(GridTask):
 
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
-        if not levels.numel():
+        if not levels.batch_size.numel():
             shown = planes(for_copies(agent, levels))
             return shown.new_zeros(*shown.shape[:2], self.probe_planes, *shown.shape[-2:])
         copies, logits = _with_logits(agent, levels)

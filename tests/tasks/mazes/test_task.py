@@ -73,6 +73,13 @@ def test_another_network_takes_the_unets_place() -> None:
 
 
 @pytest.mark.parametrize("observe_agent", [False, True])
+def test_no_probes_are_a_probe_of_nothing(observe_agent: bool) -> None:
+    task = tiny_task(maze=replace(TASK.maze, observe_agent=observe_agent))
+    agent = task.learner([Streams(0), Streams(1)]).agent
+    assert task.probe(agent, task.evaluation_levels("id")[:0]).shape == (2, 0, 7, 5, 5)
+
+
+@pytest.mark.parametrize("observe_agent", [False, True])
 @pytest.mark.parametrize("reward", [performance_gain, task_difficulty])
 def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
     reward, observe_agent
