@@ -144,9 +144,7 @@ class SpecificationSpace(LevelDistribution):
 
         Of an axis with a single value the coordinate is 0.
         """
-        return torch.cartesian_prod(
-            *(self._scaled(torch.tensor(values), axis) for axis, values in self.axes.items())
-        )
+        return torch.cartesian_prod(*self._scaled(*self.axes.values()))
 
     def locate(self, levels: Level) -> Tensor:
         """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, 2] on the CPU.
@@ -154,14 +152,8 @@ class SpecificationSpace(LevelDistribution):
         A goal that cannot be reached counts as far away as there are cells.
         """
         length = shortest_path_length(levels)
-        values = [
-            levels.walls.float().mean((-2, -1)),
-            length.where(length >= 0, self.height * self.width).float(),
-        ]
-        scaled = [
-            self._scaled(value.cpu(), axis) for value, axis in zip(values, self.axes, strict=True)
-        ]
-        return torch.stack(scaled, -1)
+        moves = length.where(length >= 0, self.height * self.width)
+        return torch.stack(self._scaled(levels.walls.float().mean((-2, -1)).cpu(), moves.cpu()), -1)
 
     def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
         """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
@@ -169,15 +161,15 @@ class SpecificationSpace(LevelDistribution):
         Between equally near ones rounding decides. Pairs that the space does not have get the
         nearest that it has, also where they lie outside of it.
         """
-        wanted = zip(*specifications, strict=True)
-        scaled = [
-            self._scaled(torch.tensor(values), axis)
-            for axis, values in zip(self.axes, wanted, strict=True)
-        ]
+        scaled = self._scaled(*zip(*specifications, strict=True))
         return torch.cdist(torch.stack(scaled, -1), self.coordinates).argmin(-1)
 
-    def _scaled(self, values: Tensor, axis: str) -> Tensor:
-        """Values along an axis, which goes from -1 to 1; 0 where it has a single value."""
-        known = torch.tensor(self.axes[axis], dtype=torch.float32)
-        middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        return (values - middle) / reach if reach > 0 else torch.zeros(values.shape)
+    def _scaled(self, *lines: Sequence[float] | Tensor) -> list[Tensor]:
+        """Values along each axis, which goes from -1 to 1; 0 where it has a single value."""
+        scaled = []
+        for values, axis in zip(lines, self.axes.values(), strict=True):
+            known = torch.tensor(axis, dtype=torch.float32)
+            middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
+            place = torch.as_tensor(values, dtype=torch.float32)
+            scaled.append((place - middle) / reach if reach > 0 else torch.zeros_like(place))
+        return scaled
