@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import product
 
@@ -11,7 +12,6 @@ from torch import Tensor
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.generation import generate_levels
 from proposer_rl.tasks.view_mazes.generation import (
-    Draw,
     four_rooms,
     perfect_mazes,
     scattered_walls,
@@ -22,6 +22,7 @@ from proposer_rl.tasks.view_mazes.settings import (
     DistributionSettings,
     PerfectSettings,
     RoomsSettings,
+    ScatteredSettings,
     SpaceSettings,
 )
 
@@ -43,13 +44,30 @@ class ViewDistribution:
     def __init__(
         self, settings: DistributionSettings, height: int, width: int, device: torch.device
     ) -> None:
-        self._draw = _draw_of(settings, height, width)
-        self._device = device
+        if isinstance(settings, ScatteredSettings):
+            if settings.fewest > settings.most:
+                raise ValueError(f"fewest={settings.fewest} must be at most most={settings.most}")
+            _check_walls(settings.most, height, width)
+        self._settings, self._grid, self._device = settings, (height, width), device
         self.sample(1, torch.Generator().manual_seed(0))
 
     def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
         """Draw levels [count]; the generator is one of the CPU."""
         return self._draw(count, generator).to(self._device)
+
+    def _draw(self, count: int, generator: torch.Generator) -> ViewLevel:
+        settings = self._settings
+        if isinstance(settings, PerfectSettings):
+            return perfect_mazes(count, *self._grid, generator)
+        if isinstance(settings, RoomsSettings):
+            return four_rooms(count, *self._grid, generator)
+
+        def scattered(number: int) -> ViewLevel:
+            ends = (settings.fewest, settings.most + 1)
+            walls = torch.randint(*ends, (number,), generator=generator)
+            return scattered_walls(walls, *self._grid, generator)
+
+        return solvable(scattered, count) if settings.solvable else scattered(count)
 
 
 class ViewSpace:
@@ -84,7 +102,7 @@ class ViewSpace:
             if len(set(values)) < len(values):
                 raise ValueError(f"{name} must be distinct, got {list(values)}")
         _check_walls(max(settings.walls), height, width)
-        self._height, self._width, self._device = height, width, device
+        self._grid, self._device = (height, width), device
         self._values = torch.tensor(list(product(*self.axes.values())))  # int64 [N, D]
         self.size = len(self._values)
         middle = (self._values.amax(0) + self._values.amin(0)) / 2
@@ -108,24 +126,25 @@ class ViewSpace:
 
         A goal that cannot be reached counts as far away as there are cells.
         """
-        values = [levels.walls.flatten(-2).sum(-1)]
-        if "path length" in self.axes:
-            length = shortest_path_length(levels)
-            values.append(length.where(length >= 0, self._height * self._width))
-        return self._scaled(torch.stack(values, -1).cpu())
+        counts = self._counts(levels)
+        return self._scaled(counts.where(counts >= 0, math.prod(self._grid)))
 
     def shares(self, levels: ViewLevel) -> Tensor:
         """Shares of the bins that are nearest to levels [n], float32 [N]; unsolvable ones are none.
 
         Without lengths all of the levels count.
         """
-        counts = [levels.walls.flatten(1).sum(1).cpu()]
-        if "path length" in self.axes:
-            counts.append(shortest_path_length(levels).cpu())
-        values = torch.stack(counts, 1)
-        distance = torch.cdist(self._scaled(values), self.coordinates)
-        nearest = distance.argmin(1)[values[:, -1] >= 0]
+        counts = self._counts(levels)
+        distance = torch.cdist(self._scaled(counts), self.coordinates)
+        nearest = distance.argmin(1)[counts[:, -1] >= 0]
         return nearest.bincount(minlength=self.size) / len(nearest)
+
+    def _counts(self, levels: ViewLevel) -> Tensor:
+        """Walls, and where it is an axis the path's length (-1 for none): int64 [*B, D]."""
+        counts = [levels.walls.flatten(-2).sum(-1)]
+        if "path length" in self.axes:
+            counts.append(shortest_path_length(levels))
+        return torch.stack(counts, -1).cpu()
 
     def _scaled(self, values: Tensor) -> Tensor:
         return (values - self._middle) / self._reach
@@ -133,28 +152,10 @@ class ViewSpace:
     def _generate(self, values: Tensor, draw: torch.Generator) -> ViewLevel:
         walls = values[:, 0]
         if values.shape[1] == 1:
-            return scattered_walls(walls, self._height, self._width, draw)
-        fraction = walls.double() / (self._height * self._width)
-        levels = generate_levels(fraction, values[:, 1], self._height, self._width, generator=draw)
+            return scattered_walls(walls, *self._grid, draw)
+        fraction = walls.double() / math.prod(self._grid)
+        levels = generate_levels(fraction, values[:, 1], *self._grid, generator=draw)
         return directed(levels, torch.randint(len(AHEAD), (len(walls),), generator=draw))
-
-
-def _draw_of(settings: DistributionSettings, height: int, width: int) -> Draw:
-    """What draws levels of a kind."""
-    if isinstance(settings, PerfectSettings):
-        return lambda count, draw: perfect_mazes(count, height, width, draw)
-    if isinstance(settings, RoomsSettings):
-        return lambda count, draw: four_rooms(count, height, width, draw)
-    fewest, most = settings.fewest, settings.most
-    if fewest > most:
-        raise ValueError(f"fewest={fewest} must be at most most={most}")
-    _check_walls(most, height, width)
-
-    def scattered(count: int, draw: torch.Generator) -> ViewLevel:
-        walls = torch.randint(fewest, most + 1, (count,), generator=draw)
-        return scattered_walls(walls, height, width, draw)
-
-    return solvable(scattered) if settings.solvable else scattered
 
 
 def _check_walls(most: int, height: int, width: int) -> None:

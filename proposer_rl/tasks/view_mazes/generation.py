@@ -1,4 +1,7 @@
-"""How levels are drawn: walls anywhere, mazes without loops, four rooms."""
+"""How levels are drawn: walls anywhere, mazes without loops, four rooms.
+
+All levels ``[N]`` are on the CPU, with height x width cells; so is the generator ``draw``.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +14,14 @@ from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.levels import cell_position
 from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
 
-Draw = Callable[[int, torch.Generator], ViewLevel]
-
 MOST_DRAWS = 1000  # of a level whose goal is to be reachable
 
 
 def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
     """Levels with exact numbers of walls; their cells, start, goal and direction are uniform.
 
-    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's.
-
-    Args:
-        count: of the walls of each level, int64 ``[N]`` on the CPU, at most H * W - 2.
-        height: H.
-        width: W.
-        draw: Source of randomness, of the CPU.
-
-    Returns:
-        Levels ``[N]`` on the CPU.
+    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's. The
+    numbers are int64 ``[N]`` on the CPU, at most height * width - 2.
     """
     order = torch.rand(len(count), height * width, generator=draw).argsort(1)
     # The first two cells of a random order are start and goal, the next ones walls.
@@ -43,15 +36,6 @@ def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -
 
     The cells of even row and column are all free; the search opens the cells between them. Start,
     goal and direction are uniform.
-
-    Args:
-        number: N of levels.
-        height: H, odd.
-        width: W, odd.
-        draw: Source of randomness, of the CPU.
-
-    Returns:
-        Levels ``[N]`` on the CPU.
 
     Raises:
         ValueError: If a side is even.
@@ -92,15 +76,6 @@ def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> V
 
     Start, goal and direction are uniform.
 
-    Args:
-        number: N of levels.
-        height: H, at least 3.
-        width: W, at least 3.
-        draw: Source of randomness, of the CPU.
-
-    Returns:
-        Levels ``[N]`` on the CPU.
-
     Raises:
         ValueError: If a side is less than 3.
     """
@@ -120,19 +95,15 @@ def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> V
     return _placed(walls, draw)
 
 
-def solvable(draw_levels: Draw) -> Draw:
-    """Levels of a generator whose goal can be reached; others are drawn again."""
-
-    def drawn(number: int, draw: torch.Generator) -> ViewLevel:
-        levels = draw_levels(number, draw)
-        for _ in range(MOST_DRAWS):
-            bad = (shortest_path_length(levels) < 0).nonzero().squeeze(1)
-            if not len(bad):
-                return levels
-            levels[bad] = draw_levels(len(bad), draw)
-        raise ValueError(f"in {MOST_DRAWS} draws of a level its goal could not be reached")
-
-    return drawn
+def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
+    """Drawn levels whose goal can be reached; others are drawn again."""
+    levels = draw_levels(number)
+    for _ in range(MOST_DRAWS):
+        bad = (shortest_path_length(levels) < 0).nonzero().squeeze(1)
+        if not len(bad):
+            return levels
+        levels[bad] = draw_levels(len(bad))
+    raise ValueError(f"in {MOST_DRAWS} draws of a level its goal could not be reached")
 
 
 def _placed(walls: Tensor, draw: torch.Generator) -> ViewLevel:

@@ -208,7 +208,7 @@ def test_without_lengths_a_goal_may_be_out_of_reach() -> None:
         (lambda: ViewDistribution(ScatteredSettings(fewest=9, most=8), 5, 5, CPU), "fewest=9"),
         (lambda: ViewDistribution(ScatteredSettings(most=24), 5, 5, CPU), "at most 23 walls"),
         (
-            lambda: solvable(lambda n, _: ViewLevel.from_text([">#G"] * n))(2, generator()),
+            lambda: solvable(lambda n: ViewLevel.from_text([">#G"] * n), 2),
             "could not be reached",
         ),
         (lambda: ViewSpace(SpaceSettings(walls=[3, 3]), 5, 5, CPU), "walls must be distinct"),
