@@ -80,6 +80,8 @@ class Task(ABC):
         reward_scale: that rewards of training were multiplied with; returns are given without it.
         batched: as of :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
+        drop_finished: whether evaluations make environments of fewer levels as others are finished,
+            as of :func:`~proposer_rl.learning.episodes.mean_performance`.
         replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
             ``"rollouts"`` in an environment whose new levels come to where the old ones were, and
             of the methods ``"performance"``, ``"probe"`` and ``"measure"``.
@@ -99,6 +101,7 @@ class Task(ABC):
     reward_scale: float = 1.0
     batched: bool | None = None
     episodes_at_once: int | None = None
+    drop_finished: bool = False
     replayed: Sequence[str] = ()
 
     def __init__(
@@ -210,6 +213,7 @@ class Task(ABC):
             greedy=self.greedy,
             reward_scale=self.reward_scale,
             at_once=self.episodes_at_once,
+            drop_finished=self.drop_finished,
         )
         return performance if "success" in self.results else performance.exclude("success")
 

@@ -1,35 +1,15 @@
-"""How well Solvers with memory do on fixed levels: they play there."""
+"""Where Solvers with memory go on fixed levels: they play there."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.learning.episodes import mean_performance, play
+from proposer_rl.learning.episodes import play
 from proposer_rl.models import ActorCritic
 from proposer_rl.tasks.mazes.levels import cell_plane
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
-
-
-def played_performance(
-    agent: ActorCritic,
-    levels: ViewLevel,
-    max_steps: int,
-    episodes: int,
-    generator: torch.Generator,
-) -> TensorDict:
-    """Mean return and share of successes of K Solvers over episodes on levels [K, E]: [K, E]."""
-    return mean_performance(
-        agent,
-        lambda some: ViewMazeEnv(some, max_steps=max_steps),
-        levels,
-        generator,
-        max_steps=max_steps,
-        episodes=episodes,
-        drop_finished=True,
-    )
 
 
 @torch.no_grad()

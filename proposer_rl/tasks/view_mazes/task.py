@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from proposer_rl.learning.episodes import mean_performance
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
 from proposer_rl.streams import Streams
@@ -25,7 +25,7 @@ from proposer_rl.tasks.view_mazes.board import ViewBoard
 from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
 from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import played_performance, visits, walks
+from proposer_rl.tasks.view_mazes.evaluation import visits, walks
 from proposer_rl.tasks.view_mazes.level_files import SUFFIXES, read_view_levels
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
@@ -63,6 +63,7 @@ class ViewMazeTask(GridTask):
     probe_planes = 4  # walls, start, goal, and where the Solver goes
     steps_name = "fewest_actions"
     replayed = ("rollouts",)
+    drop_finished = True
     counting = ", turns included"
     text_key = "> v < ^ start and direction, G goal, • the Solver's episode"
 
@@ -124,13 +125,6 @@ class ViewMazeTask(GridTask):
         """K networks with memory."""
         return memory_actor_critic(population, OBSERVED, self._network.memory)
 
-    def performance(
-        self, agent: ActorCritic, levels: ViewLevel, generator: torch.Generator
-    ) -> TensorDictBase:
-        """Mean return and success of K Solvers over episodes on levels [E] or [K, E]."""
-        copies = for_copies(agent, levels)
-        return played_performance(agent, copies, self.max_steps, self.episodes, generator)
-
     def optimal_return(self, levels: ViewLevel) -> Tensor:
         """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
         return optimal_return(levels, self.maze.max_steps)
@@ -159,7 +153,15 @@ class ViewMazeTask(GridTask):
         """
         episodes, generator = self._named_episodes, self._draws.generator(next(iter(about)))
         copies = for_copies(agent, levels)
-        performance = played_performance(agent, copies, max_steps, episodes, generator).cpu()
+        performance = mean_performance(
+            agent,
+            partial(ViewMazeEnv, max_steps=max_steps),
+            copies,
+            generator,
+            max_steps=max_steps,
+            episodes=episodes,
+            drop_finished=self.drop_finished,
+        ).cpu()
         for i, (name, told) in enumerate(about.items()):
             for k in range(len(copies)):
                 reached = round(float(performance["success"][k, i]) * episodes)

@@ -14,9 +14,9 @@ from proposer_rl.models import ActorCritic, categorical
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.view_mazes.distance import optimal_return
 from proposer_rl.tasks.view_mazes.env import FORWARD, ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import played_performance, visits
+from proposer_rl.tasks.view_mazes.evaluation import visits
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
-from proposer_rl.tasks.view_mazes.settings import EvaluationSettings
+from proposer_rl.tasks.view_mazes.settings import EvaluationSettings, ViewMazeSettings
 from proposer_rl.tasks.view_mazes.task import ViewMazeTask
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.tiny import tiny_view_task
@@ -64,10 +64,15 @@ def scripted(act: Any) -> ActorCritic:
     return cast(ActorCritic, Scripted(act))
 
 
-def performance(agent: ActorCritic, levels: ViewLevel, *arguments: Any) -> TensorDict:
-    """Of levels [E], or [K, E]."""
-    each = levels.expand(agent.copies, levels.batch_size[-1])
-    return played_performance(agent, each, *arguments)
+def performance(
+    agent: ActorCritic, levels: ViewLevel, limit: int, episodes: int, draws: torch.Generator
+) -> TensorDictBase:
+    """Of levels [E], or [K, E], of any size."""
+    task = tiny_view_task(
+        maze=ViewMazeSettings(height=5, width=5, max_steps=limit),
+        evaluation=EvaluationSettings(distributions=["id"], levels=4, episodes=episodes),
+    )
+    return task.performance(agent, levels, draws)
 
 
 def always(action: int) -> ActorCritic:
