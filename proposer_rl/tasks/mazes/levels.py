@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from tensordict import TensorClass
@@ -39,7 +39,7 @@ class Level(TensorClass):
     goal: Tensor
 
     @classmethod
-    def from_text(cls, text: str | Sequence[str]) -> Level:
+    def from_text(cls, text: str | Sequence[str]) -> Self:
         """Reads levels drawn with one character per cell.
 
         Args:
@@ -65,11 +65,30 @@ class Level(TensorClass):
             #.G
         """
         if isinstance(text, str):
-            return _parse(text)
-        levels = [_parse(drawing) for drawing in text]
+            return cls._parse(text)
+        levels = [cls._parse(drawing) for drawing in text]
         if len({level.walls.shape for level in levels}) != 1:
             raise ValueError("from_text needs one or more drawings, all of the same size")
-        return torch.stack(levels)  # type: ignore[arg-type, return-value]
+        return torch.stack(levels)  # type: ignore[return-value]
+
+    @classmethod
+    def _parse(cls, drawing: str) -> Any:
+        """The level of one drawing."""
+        rows = drawn_rows(drawing)
+        flat = "".join(rows)
+        if not rows or any(len(row) != len(rows[0]) for row in rows):
+            raise ValueError(f"a level is a rectangle of characters, got\n{drawing}")
+        if set(flat) - {WALL, FREE, START, GOAL}:
+            raise ValueError(f"a level holds only '#', '.', 'S' and 'G', got\n{drawing}")
+        if flat.count(START) != 1 or flat.count(GOAL) != 1:
+            raise ValueError(f"a level has exactly one 'S' and one 'G', got\n{drawing}")
+        width = len(rows[0])
+        return Level(
+            walls=torch.tensor([[mark == WALL for mark in row] for row in rows]),
+            start=torch.tensor(divmod(flat.index(START), width)),
+            goal=torch.tensor(divmod(flat.index(GOAL), width)),
+            batch_size=[],
+        )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Level:
         return self.clone()
@@ -158,21 +177,3 @@ def _refuse(bad: Tensor, fault: str) -> None:
 def drawn_rows(drawing: str) -> list[str]:
     """The rows of a drawing, without blank lines and what stands before or after a row."""
     return [row for row in map(str.strip, drawing.splitlines()) if row]
-
-
-def _parse(drawing: str) -> Level:
-    rows = drawn_rows(drawing)
-    flat = "".join(rows)
-    if not rows or any(len(row) != len(rows[0]) for row in rows):
-        raise ValueError(f"a level is a rectangle of characters, got\n{drawing}")
-    if set(flat) - {WALL, FREE, START, GOAL}:
-        raise ValueError(f"a level holds only '#', '.', 'S' and 'G', got\n{drawing}")
-    if flat.count(START) != 1 or flat.count(GOAL) != 1:
-        raise ValueError(f"a level has exactly one 'S' and one 'G', got\n{drawing}")
-    width = len(rows[0])
-    return Level(
-        walls=torch.tensor([[mark == WALL for mark in row] for row in rows]),
-        start=torch.tensor(divmod(flat.index(START), width)),
-        goal=torch.tensor(divmod(flat.index(GOAL), width)),
-        batch_size=[],
-    )

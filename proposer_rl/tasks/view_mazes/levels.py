@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,6 +19,9 @@ AHEAD = ((0, 1), (1, 0), (0, -1), (-1, 0))
 class ViewLevel(Level):
     """Mazes whose agent begins in a direction, of any batch shape ``[*B]``.
 
+    In a drawing the start is one of ``>``, ``v``, ``<`` and ``^``, the direction in which the agent
+    looks; with an ``S`` it looks to the right.
+
     Attributes:
         direction: int64 ``[*B]``, 0 right, 1 down, 2 left, 3 up.
     """
@@ -27,18 +29,15 @@ class ViewLevel(Level):
     direction: Tensor
 
     @classmethod
-    def from_text(cls, text: str | Sequence[str]) -> ViewLevel:
-        """Reads levels drawn with one character per cell.
+    def _parse(cls, drawing: str) -> ViewLevel:
+        marks = [mark for mark in drawing if mark in AGENTS]
+        for mark in AGENTS:
+            drawing = drawing.replace(mark, START)
+        direction = AGENTS.index(marks[0]) if marks else 0
+        return directed(Level.from_text(drawing), torch.tensor(direction))
 
-        Args:
-            text: As for :meth:`Level.from_text`; the start is one of ``>``, ``v``, ``<`` and ``^``,
-                the direction in which the agent looks. With an ``S`` it looks to the right.
-
-        Returns:
-            A level of batch shape ``[]``, or ``[n]`` for a sequence of n drawings.
-
-        Raises:
-            ValueError: As :meth:`Level.from_text`.
+    def to_text(self) -> Any:
+        """Draws the levels with one character per cell; the inverse of :meth:`from_text`.
 
         Example:
             >>> level = ViewLevel.from_text('''
@@ -51,16 +50,8 @@ class ViewLevel(Level):
             v.#
             #.G
         """
-        drawings = [text] if isinstance(text, str) else list(text)
-        plain, directions = zip(*map(_split, drawings), strict=True) if drawings else ((), ())
-        level = Level.from_text(plain[0] if isinstance(text, str) else plain)
-        return directed(level, torch.tensor(directions).reshape(level.batch_size))
-
-    def to_text(self) -> Any:
-        """Draws the levels with one character per cell; the inverse of :meth:`from_text`."""
-        if self.batch_dims:
-            return [level.to_text() for level in self.unbind(0)]
-        return super().to_text().replace(START, AGENTS[int(self.direction)])
+        text = super().to_text()
+        return text if self.batch_dims else text.replace(START, AGENTS[int(self.direction)])
 
 
 def directed(level: Level, direction: Tensor) -> ViewLevel:
@@ -72,11 +63,3 @@ def directed(level: Level, direction: Tensor) -> ViewLevel:
         direction=direction,
         batch_size=level.batch_size,
     )
-
-
-def _split(drawing: str) -> tuple[str, int]:
-    """A drawing whose start is an ``S``, and the direction that stood there."""
-    marks = [mark for mark in drawing if mark in AGENTS]
-    for mark in AGENTS:
-        drawing = drawing.replace(mark, START)
-    return drawing, AGENTS.index(marks[0]) if marks else 0
