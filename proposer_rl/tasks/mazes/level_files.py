@@ -54,7 +54,7 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
         StorageError: If it cannot be read.
     """
     path = Path(path)
-    _check_suffix(path, (*SUFFIXES, RECORD))
+    check_suffix(path, (*SUFFIXES, RECORD))
     content = read_bounded(path, LARGEST_FILE)
     try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
@@ -79,7 +79,7 @@ def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> N
         StorageError: If the disk cannot take it.
     """
     path = Path(path)
-    _check_suffix(path, SUFFIXES)
+    check_suffix(path, SUFFIXES)
     text = levels_to_json(levels) if path.suffix == ".json" else levels_to_text(levels)
     write_atomically(path, text.encode())
 
@@ -283,6 +283,7 @@ def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
     return length
 
 
-def _check_suffix(path: Path, known: Sequence[str]) -> None:
+def check_suffix(path: Path, known: Sequence[str]) -> None:
+    """Refuse a file whose name says that it holds something else."""
     if path.suffix not in known:
         raise ValueError(f"{path}: must end in one of {', '.join(known)}")

@@ -19,6 +19,7 @@ from proposer_rl.tasks.mazes.level_files import (
     RECORD,
     check_count,
     check_size,
+    check_suffix,
     named_levels,
     read_levels,
 )
@@ -55,12 +56,10 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
         StorageError: If it cannot be read.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"{path}: must end in one of {', '.join(SUFFIXES)}")
+    check_suffix(path, SUFFIXES)
     content = read_bounded(path, LARGEST_FILE)
-    encoded = path.suffix == ".npy"
-    if path.suffix == ".json":
-        encoded = content.lstrip().startswith(b"[")
+    a_list = path.suffix == ".json" and content.lstrip().startswith(b"[")
+    encoded = a_list or path.suffix == ".npy"
     if not encoded and path.suffix != ".py":
         return cast(dict[str, ViewLevel], read_levels(path, ViewLevel))
     try:
