@@ -50,7 +50,7 @@ def shortest_path_length(level: Level) -> Tensor:
 
 def cells_first(grid: Tensor) -> Tensor:
     """Lays ``[*B, H, W]`` out as a contiguous ``[H, W, N]``, N the number of mazes."""
-    return grid.flatten(0, -3).permute(1, 2, 0).contiguous() if grid.ndim > 2 else grid.unsqueeze(2)
+    return grid.reshape(-1, *grid.shape[-2:]).permute(1, 2, 0).contiguous()
 
 
 def schedule(depth: Tensor) -> list[tuple[int, int]]:

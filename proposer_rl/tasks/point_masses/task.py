@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Annotated
 
 import numpy as np
@@ -73,8 +73,7 @@ class PointMassTask(Task):
         context: ComputeContext,
     ) -> None:
         self._network = network
-        given = {field.name: getattr(parameters, field.name) for field in fields(parameters)}
-        space, target = spaces(given, seeded=False, device=context.device)
+        space, target = spaces(vars(parameters), seeded=False, device=context.device)
         for name in ("width", "friction"):
             for bins in (space.bins[name], target.bins[name]):
                 if bins.low[0] < 0:
