@@ -93,6 +93,13 @@ class LevelDistribution:
         index = torch.randint(self.size, shape, generator=generator, device=place)
         return self.generate(index, generator)
 
+    def __str__(self) -> str:
+        pairs = "; ".join(
+            f"{fraction:g} obstacles, path of {length}"
+            for fraction, length in self.specifications[:4]
+        )
+        return f"{pairs}; {self.mechanism}"
+
 
 class SpecificationSpace(LevelDistribution):
     """The M x N pairs of M obstacle fractions and N path lengths, numbered row by row.

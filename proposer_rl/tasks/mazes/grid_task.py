@@ -64,6 +64,7 @@ class GridTask(Task):
     probe_planes: ClassVar[int]
     steps_name: ClassVar[str]
     counting: ClassVar[str] = ""
+    edit = staticmethod(edit_levels)
     board: Board
 
     def __init__(
@@ -113,10 +114,6 @@ class GridTask(Task):
         )
         self.default_levels = "shapes"
 
-    def edit(self, levels: Level, count: int, generators: Sequence[torch.Generator]) -> Level:
-        """Levels [K, n] after random edits; replica k's from generator k."""
-        return edit_levels(levels, count, generators)
-
     def probe_encoder(self, features: int) -> MapEncoder:
         """A convolutional network that reads probes."""
         return MapEncoder(self.probe_planes, self._encoder_channels, features)
@@ -150,7 +147,9 @@ class GridTask(Task):
     def about(self) -> dict[str, str]:
         """Texts about the task, by their labels."""
         height, width = self.grid
-        kinds = "; ".join(f"{name.upper()} ({self.describe(name)})" for name in self.evaluated_on)
+        kinds = "; ".join(
+            f"{name.upper()} ({self.distributions[name]})" for name in self.evaluated_on
+        )
         return {
             "Mazes": f"{height}×{width}, at most {self.maze.max_steps} steps{self.counting}",
             "Measured on": f"{kinds}; {self._levels} fixed levels each"
@@ -164,10 +163,6 @@ class GridTask(Task):
     @abstractmethod
     def make_space(self, settings: Any) -> Any:
         """The Proposer's bins."""
-
-    @abstractmethod
-    def describe(self, name: str) -> str:
-        """A distribution's settings in words."""
 
     @abstractmethod
     def results_on(

@@ -91,12 +91,9 @@ class MazeTask(GridTask):
     ) -> None:
         if make_network is None:
             check_network(maze, network)
-        if context.precision == "auto":
-            own = make_network is not None
-            precision = (
-                "fp32" if own else faster_precision(network.channels, torch.device(context.device))
-            )
-            context = context._replace(precision=precision)
+            if context.precision == "auto":
+                precision = faster_precision(network.channels, torch.device(context.device))
+                context = context._replace(precision=precision)
         self._network = network
         self._make_network = make_network
         self.exact_performance = evaluation.evaluator == "exact"
@@ -268,15 +265,6 @@ class MazeTask(GridTask):
                 moves = f"greedy {len(path) - 1}" if results["greedy_success"] else "greedy fails"
                 note = f"shortest {told[self.steps_name]}, {moves}"
                 yield LevelResult(name, k, told, results, note, partial(_picture, levels[i], path))
-
-    def describe(self, name: str) -> str:
-        """A distribution's specifications and mechanism in words."""
-        distribution = self.distributions[name]
-        pairs = "; ".join(
-            f"{fraction:g} obstacles, path of {length}"
-            for fraction, length in distribution.specifications[:4]
-        )
-        return f"{pairs}; {distribution.mechanism}"
 
 
 def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:

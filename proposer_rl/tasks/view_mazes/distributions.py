@@ -69,6 +69,13 @@ class ViewDistribution:
 
         return solvable(scattered, count) if settings.solvable else scattered(count)
 
+    def __str__(self) -> str:
+        kind = self._settings
+        if not isinstance(kind, ScatteredSettings):
+            return kind.kind.replace("_", " ")
+        solvable = ", solvable" if kind.solvable else ""
+        return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
+
 
 class ViewSpace:
     """Bins of levels: every number of walls, or each of these with every length of the path.

@@ -32,7 +32,6 @@ from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
 from proposer_rl.tasks.view_mazes.settings import (
     DistributionSettings,
     EvaluationSettings,
-    ScatteredSettings,
     SpaceSettings,
     ViewMazeSettings,
     ViewNetworkSettings,
@@ -176,14 +175,6 @@ class ViewMazeTask(GridTask):
                 note = f"{reached} of {episodes} episodes, {fewest}"
                 picture = partial(self._picture, agent, k, levels[i], max_steps)
                 yield LevelResult(name, k, told, results, note, picture)
-
-    def describe(self, name: str) -> str:
-        """A distribution's settings in words."""
-        kind = self._kinds[name]
-        if not isinstance(kind, ScatteredSettings):
-            return str(kind.kind).replace("_", " ")
-        solvable = ", solvable" if kind.solvable else ""
-        return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
 
     def _picture(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int
