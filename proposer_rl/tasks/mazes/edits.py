@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_position
-from proposer_rl.tasks.mazes.mechanisms import Draws
 
 L = TypeVar("L", bound=Level)
 
@@ -59,13 +58,14 @@ def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) ->
         raise ValueError(
             f"{copies} generators are needed for levels of {copies} replicas, got {len(generators)}"
         )
-    group = torch.arange(copies).repeat_interleave(number)
-    draws = Draws(generators, group, torch.device("cpu"))
     flat = levels.reshape(-1)  # [C]
     for _ in range(count):
-        operator, place = draws.randint(3), draws.rand(1)  # [1, C]
-        device = levels.walls.device
-        flat = _edit(flat, operator.squeeze(0).to(device), place.squeeze(0).to(device))
+        drawn = [
+            (torch.randint(3, (number,), generator=draw), torch.rand(number, generator=draw))
+            for draw in generators
+        ]
+        operator, place = (torch.cat(each) for each in zip(*drawn, strict=True))
+        flat = _edit(flat, operator.to(levels.walls.device), place.to(levels.walls.device))
     return flat.reshape(copies, number).clone()
 
 
