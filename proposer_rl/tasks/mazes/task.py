@@ -120,7 +120,6 @@ class MazeTask(GridTask):
                 )
         self._rules = (maze.max_steps, maze.step_penalty)
         self._sampled = ExactEvaluator(*self._rules)
-        self._greedy = ExactEvaluator(*self._rules, greedy=True)
         self._evaluator: ExactEvaluator | RolloutEvaluator = (
             self._sampled
             if self.exact_performance
@@ -211,13 +210,18 @@ class MazeTask(GridTask):
         """
         means: dict[str, Tensor] = {}
         for name, levels in self.evaluated_on.items():
-            copies, logits = _with_logits(agent, levels)
-            sampled, greedy = self._sampled(copies, logits), self._greedy(copies, logits)
-            for prefix, performance in ((name, sampled), (f"{name}_greedy", greedy)):
-                for kind in ("return", "success"):
-                    means[f"{prefix}_{kind}"] = performance[kind].mean(1)
-            means[f"{name}_success_worst10"] = worst_mean(sampled["success"], WORST)
+            performance = self._exactly(*_with_logits(agent, levels), self.maze.max_steps)
+            for kind, values in performance.items():
+                means[f"{name}_{kind}"] = values.mean(1)
+            means[f"{name}_success_worst10"] = worst_mean(performance["success"], WORST)
         return TensorDict(means, [agent.copies])
+
+    def _exactly(self, levels: Level, logits: Tensor, max_steps: int) -> dict[str, Tensor]:
+        """What the sampled policy reaches, and as ``greedy_...`` the greedy one, each [K, n]."""
+        penalty = self.maze.step_penalty
+        sampled = ExactEvaluator(max_steps, penalty)(levels, logits)
+        greedy = ExactEvaluator(max_steps, penalty, greedy=True)(levels, logits)
+        return {**sampled, **{f"greedy_{kind}": values for kind, values in greedy.items()}}
 
     def evaluate(self, agent: ActorCritic) -> dict[str, TensorDictBase]:
         """The sampled policy's exact performance on every evaluation level."""
@@ -249,13 +253,7 @@ class MazeTask(GridTask):
         most probable actions, ``greedy_success`` (1 or 0) and ``greedy_return``.
         """
         copies, logits = _with_logits(agent, levels)
-        performance = {
-            f"{prefix}{key}": value
-            for prefix, greedy in (("", False), ("greedy_", True))
-            for key, value in ExactEvaluator(max_steps, self.maze.step_penalty, greedy)(
-                copies, logits
-            ).items()
-        }
+        performance = self._exactly(copies, logits, max_steps)
         paths = policy_path(copies, logits, max_steps)  # [K, n, max_steps + 1, 2]
         for k in range(len(copies)):
             for i, (name, told) in enumerate(about.items()):
