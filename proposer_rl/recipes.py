@@ -17,14 +17,11 @@ import yaml
 
 PACKAGE = Path(__file__).resolve().parent
 # In a wheel the configuration lies in the package, in a checkout beside it.
-CONFIG_FOLDER = next(
-    (folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir()),
-    PACKAGE / "conf",
-)
+CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
 CONSTANTS = {"null", "true", "false", "nan", "inf"}
 MISSING = "???"  # in a file: to be given
-KEYS = {"task": "task", "method": "curriculum", "filter": "filter"}
+KEYS = {"task": "task", "method": "curriculum"}
 """Where the settings of a group's files stand in the configuration."""
 
 
@@ -98,7 +95,7 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     if name.startswith("__") or name not in available(group):
         known = ", ".join(available(group))
         raise AttributeError(f"there is no {name!r}; there are: {known}")
-    settings = file_settings(group, name)
+    settings = file_content(f"{group}/{name}")[KEYS[group]]
     del settings["_target_"]
     parameters = [
         inspect.Parameter(
@@ -118,8 +115,9 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
                 raise _refusal(f"{key}: missing")
         return Recipe(group, name, given)
 
+    about = next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))
     make.__name__ = make.__qualname__ = name
-    make.__doc__ = f"{_about(group, name)}\n\nThe settings are those of conf/{group}/{name}.yaml."
+    make.__doc__ = f"{about}\n\nThe settings are those of conf/{group}/{name}.yaml."
     make.__signature__ = inspect.Signature(parameters, return_annotation=Recipe)  # type: ignore[attr-defined]
     return make
 
@@ -158,24 +156,25 @@ def _key(key: Any) -> str:
     return key
 
 
-def file_settings(group: str, name: str) -> dict[str, Any]:
-    """The settings in a file and in those that it builds on, the file's own last."""
-    content = yaml_file(f"{group}/{name}")
-    settings: dict[str, Any] = {}
-    for default in content.get("defaults", ()):
-        if isinstance(default, str) and default in available(group):
-            settings |= file_settings(group, default)
-    return settings | (content.get(KEYS[group]) or {})
+def file_content(name: str) -> dict[str, Any]:
+    """What stands in a file such as ``method/plr`` and in those that it builds on, its own last."""
+    content, group = yaml_file(name), name.partition("/")[0]
+    parts = []
+    for default in content.pop("defaults", ()):
+        if isinstance(default, str) and default != "_self_":
+            base = default.removesuffix("@_global_").removeprefix("/")
+            parts.append(file_content(base if "/" in base else f"{group}/{base}"))
+    found: dict[str, Any] = {}
+    for part in (*parts, content):
+        for key, value in part.items():
+            found[key] = (found.get(key) or {}) | value if isinstance(value, dict) else value
+    return found
 
 
 def yaml_file(name: str) -> dict[str, Any]:
     """What stands in a file of the configuration, named from its folder on, without ``.yaml``."""
     content = yaml.safe_load((CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
     return content or {}
-
-
-def _about(group: str, name: str) -> str:
-    return next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))
 
 
 def comments(file: Path) -> Iterator[str]:

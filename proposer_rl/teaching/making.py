@@ -6,18 +6,16 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, filtered, modelled
-from proposer_rl.recipes import Recipe, available, file_settings, recipe_function, yaml_file
+from proposer_rl.recipes import Recipe, available, file_content, recipe_function, yaml_file
 from proposer_rl.settings import ArgumentError, arguments
 
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # to another setting, as the files have them
-MODEL = "/source/model@_global_"  # likewise, a filter's file
-FILTER = re.compile(r"/filter/(\w+)@_global_")  # that a method's file asks for
 
 
 def make_curriculum(
@@ -37,38 +35,36 @@ def make_curriculum(
     Raises:
         ArgumentError: naming the setting, or what the space lacks.
     """
+    asked: Mapping[str, Any] = {}
     if isinstance(curriculum, str):
         curriculum = recipe_function("method", curriculum)()
     if isinstance(curriculum, Recipe):
-        filter = _default_filter(curriculum) if filter is None else filter
-        curriculum = _made(curriculum, space, seeds)
+        if curriculum.target is None:
+            asked = file_content(f"method/{curriculum.name}")
+        curriculum = _made(curriculum, asked.get("curriculum", {}), space, seeds)
     if isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(curriculum).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
-    on_model = False
     if isinstance(filter, str):
         if filter not in available("filter"):
             raise ArgumentError(f"filter={filter!r}: must be one of {available('filter')}")
-        on_model = MODEL in yaml_file(f"filter/{filter}").get("defaults", ())
-        filter = file_settings("filter", filter) or None
-    if filter is not None:
-        curriculum = filtered(curriculum, **filter)
-    return modelled(curriculum, space) if on_model else curriculum
+        asked = file_content(f"filter/{filter}")
+    elif filter is not None:
+        asked = {"filter": filter}
+    if asked.get("filter") is not None:
+        curriculum = filtered(curriculum, **asked["filter"])
+    return modelled(curriculum, space, **asked["model"]) if "model" in asked else curriculum
 
 
-def _made(recipe: Recipe, space: Any, seeds: Sequence[int]) -> Curriculum:
+def _made(recipe: Recipe, named: Mapping[str, Any], space: Any, seeds: Sequence[int]) -> Curriculum:
     """The curriculum, by its file's settings and the recipe's."""
-    values: dict[str, Any] = {"_target_": recipe.target}
-    if recipe.target is None:
-        train = yaml_file("train")
-        named = file_settings("method", recipe.name).items()
-        # What a file makes of a class of its own is the default of the function, too.
-        plain = {name: value for name, value in named if not isinstance(value, Mapping)}
-        values = {name: _resolved(value, train) for name, value in plain.items()}
-    module, _, function = values.pop("_target_").rpartition(".")
-    make: Callable[..., Any] = getattr(import_module(module), function)
+    train = yaml_file("train")
+    # What a file makes of a class of its own is the default of the function, too.
+    plain = {name: value for name, value in named.items() if not isinstance(value, Mapping)}
+    values = {name: _resolved(value, train) for name, value in plain.items()}
+    make: Callable[..., Any] = resolve_name(values.pop("_target_", recipe.target))
     given = {**values, **recipe.settings}
     read = arguments(make, given, [*inspect.signature(make).parameters][:1])
     try:
@@ -89,12 +85,3 @@ def _resolved(value: Any, settings: Mapping[str, Any]) -> Any:
     if reference is None:
         return value
     return reduce(lambda place, name: place[name], reference[1].split("."), settings)
-
-
-def _default_filter(recipe: Recipe) -> str | None:
-    """The name of the filter that a method's file asks for."""
-    if recipe.target is not None:
-        return None
-    defaults = yaml_file(f"method/{recipe.name}").get("defaults", ())
-    names = (FILTER.fullmatch(default) for default in defaults)
-    return next((name[1] for name in names if name), None)
