@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Batch, Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved
@@ -136,7 +137,7 @@ class Teacher:
             block = self._next(_whole("n", n, 1))
             block.hand_out(block.start, block.end)
             self._whole.append(block.start)
-            return self._levels(block, slice(None))
+            return self._levels(block)
 
     def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
         """The next level and its ticket.
@@ -155,14 +156,14 @@ class Teacher:
             ids: list[Tensor] = []
             levels: list[Any] = []
             while left or not ids:
-                if self._block is None or (left and self._at == self._block.end):
-                    self._refill(max(self.block, left))
-                block, start = self._block, self._at
-                assert block is not None
+                block, start = self._current(left), self._at
                 self._at = end = min(start + left, block.end)
                 block.hand_out(start, end)
                 ids.append(torch.arange(start, end, device=self.device))
-                levels.append(self._levels(block, slice(start - block.start, end - block.start)))
+                if self._moved is None:
+                    self._moved = self._levels(block)
+                which = slice(start - block.start, end - block.start)
+                levels.append(self._moved[which] if self._alone else self._moved[:, which])
                 left -= end - start
             if len(ids) == 1:
                 return ids[0], levels[0]
@@ -245,7 +246,7 @@ class Teacher:
                 return
             tickets = self._proposed() if ids is None else self._ids(ids)
             if "rollout" in outcome.keys():
-                self._observe_rollout(tickets, self._of_students(outcome["rollout"]))
+                self._observe_rollout(tickets, outcome["rollout"])
             else:
                 if "rollout" in self.reads:
                     raise ArgumentError("outcome: has no rollout, which this curriculum reads")
@@ -281,7 +282,7 @@ class Teacher:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is."""
         with self._here():
-            state = _on_cpu(state)
+            state = tree_map_only(Tensor, Tensor.cpu, state)
             source: Any = self.space.space
             like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
@@ -316,12 +317,7 @@ class Teacher:
         return self._lock
 
     def _one(self) -> tuple[int, Any]:
-        block = self._block
-        if block is None or self._at == block.end:
-            self._refill(self.block)
-            block = self._block
-            assert block is not None
-        ticket = self._at
+        block, ticket = self._current(1), self._at
         self._at += 1
         block.state[ticket - block.start] = OUT
         if not self._rows:
@@ -329,9 +325,13 @@ class Teacher:
             self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
         return ticket, self._rows[ticket - block.start]
 
-    def _refill(self, count: int) -> None:
-        block = self._next(count)
-        self._use(block, block.start)
+    def _current(self, left: int) -> Block:
+        """The block that the next of some tickets is of; a new one where the last is used up."""
+        block = self._block
+        if block is None or (left and self._at == block.end):
+            block = self._next(max(self.block, left))
+            self._use(block, block.start)
+        return block
 
     def _use(self, block: Block | None, at: int) -> None:
         """Hand out tickets of a block from one on."""
@@ -346,15 +346,10 @@ class Teacher:
         self._proposals += 1
         return self._tickets.add(batch)
 
-    def _levels(self, block: Block, which: slice) -> Any:
-        """Some levels of a block, as the loop gets them."""
-        if block is not self._block or self._moved is None:
-            levels = moved(block.batch.levels, self.device)
-            given = self._given(levels[0] if self._alone else levels)
-            if block is not self._block:
-                return given[which] if self._alone else given[:, which]
-            self._moved = given
-        return self._moved[which] if self._alone else self._moved[:, which]
+    def _levels(self, block: Block) -> Any:
+        """The levels of a block, as the loop gets them."""
+        levels = moved(block.batch.levels, self.device)
+        return self._given(levels[0] if self._alone else levels[:])
 
     def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))
@@ -367,7 +362,9 @@ class Teacher:
         self._tickets.tell(self._tickets.find(ids), arrays)
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
-        """Observe a rollout [K, n, T], each row of which is of one ticket."""
+        """Observe a rollout [K, n, T], or [n, T] of one student: each row is of one ticket."""
+        if self._alone and rollout.ndim < 3:
+            rollout = rollout.unsqueeze(0)
         if tuple(rollout.batch_size[:2]) != (self.students, len(ids)):
             raise ArgumentError(
                 f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
@@ -391,9 +388,6 @@ class Teacher:
             rows = torch.from_numpy(which).to(outcome["return"].device)
             self._observe(block.batch[:, torch.from_numpy(place)], outcome[:, rows])
         self._tickets.close(parts)
-
-    def _of_students(self, rollout: TensorDictBase) -> TensorDictBase:
-        return rollout if not self._alone or rollout.ndim > 2 else rollout.unsqueeze(0)
 
     def _observe(self, batch: Batch, outcome: TensorDict) -> None:
         self.curriculum.observe(self.student, batch, outcome)
@@ -434,14 +428,6 @@ def _whole(name: str, value: SupportsIndex, least: int | None = None) -> int:
     if least is not None and number < least:
         raise ArgumentError(f"{name}={number}: must be a whole number, at least {least}")
     return number
-
-
-def _on_cpu(state: Any) -> Any:
-    if isinstance(state, Mapping):
-        return {name: _on_cpu(entry) for name, entry in state.items()}
-    if isinstance(state, list | tuple):
-        return type(state)(map(_on_cpu, state))
-    return state.cpu() if isinstance(state, Tensor) else state
 
 
 def _number(name: str, value: Any) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, NoReturn
 
@@ -27,7 +26,6 @@ RESULTS = ("return", "success", "score", "episodes", "steps")
 COUNTS = ("episodes", "steps")
 
 
-@dataclass
 class Block:
     """A batch [K, n] of the curriculum's, its first ticket, and what has become of its levels.
 
@@ -37,17 +35,11 @@ class Block:
         results: by name, [K, n]; NaN where nothing was told.
     """
 
-    start: int
-    batch: Batch
-    end: int = field(init=False)
-    state: NDArray[np.uint8] = field(init=False)
-    results: dict[str, NDArray[np.float64]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        shape = tuple(self.batch.levels.shape[:2])
-        self.end = self.start + shape[1]
-        self.state = np.full(shape[1], WAITS, np.uint8)
-        self.results = {name: np.full(shape, np.nan) for name in RESULTS}
+    def __init__(self, start: int, batch: Batch) -> None:
+        copies, count = batch.levels.shape[:2]
+        self.start, self.end, self.batch = start, start + count, batch
+        self.state = np.full(count, WAITS, np.uint8)
+        self.results = {name: np.full((copies, count), np.nan) for name in RESULTS}
 
     def hand_out(self, start: int, end: int) -> None:
         """Note that tickets are out."""
