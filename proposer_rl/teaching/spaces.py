@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +20,7 @@ from proposer_rl.tasks.parameters import Bins, ParameterSpace, intervals, points
 
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
+T = TypeVar("T")
 
 
 class LevelSpace:
@@ -111,14 +112,11 @@ class Parameters(LevelSpace, ParameterSpace):
                 f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
                 "bins=1, which suffices for curricula that need none"
             ) from error
-        given = {"target": target} if target is not None else {}
-        self.distributions = {
-            "all": self,
-            **{
-                name: ParameterSpace(self._part(name, part), seeded)
-                for name, part in {**given, **(named or {})}.items()
-            },
+        further = {
+            name: ParameterSpace(self._part(name, part), seeded)
+            for name, part in _distributions(target, named).items()
         }
+        self.distributions = {"all": self, **further}
 
     @property
     def target_shares(self) -> Tensor:
@@ -198,12 +196,11 @@ class Items(LevelSpace):
             raise ArgumentError(f"features={list(lines.shape)}: must have a row for each item")
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
-        given = {**({} if target is None else {"target": target}), **(named or {})}
-        for key, places in given.items():
+        parts = {}
+        for name, places in _distributions(target, named).items():
             if not places or min(places) < 0 or max(places) >= count:
-                raise ArgumentError(f"{key}={places}: must be places from 0 to {count - 1}")
-        self._places = {name: torch.tensor(list(places)) for name, places in given.items()}
-        parts = {name: _SomeItems(places) for name, places in self._places.items()}
+                raise ArgumentError(f"{name}={places}: must be places from 0 to {count - 1}")
+            parts[name] = _SomeItems(torch.tensor(list(places)))
         self.distributions = {"all": self, **parts}
 
     @property
@@ -265,7 +262,7 @@ class LevelGenerator(LevelSpace):
         edit: Callable[[Any, int, torch.Generator], Any] | None = None,
         named: Mapping[str, Callable[[int, torch.Generator], Any]] | None = None,
     ) -> None:
-        drawn = {**({} if target is None else {"target": target}), **(named or {})}
+        drawn = _distributions(target, named)
         parts = {name: _Drawn(name, function) for name, function in drawn.items()}
         self.distributions = {"all": _Drawn("draw", draw), **parts}
         if edit is not None:
@@ -317,6 +314,11 @@ def _wrapped(levels: Any) -> Levels:
     return TensorDict({DRAWN: levels}, levels.shape[:1]) if isinstance(levels, Tensor) else levels
 
 
+def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
+    """What is said of distributions beside the space itself, by their names."""
+    return {**({} if target is None else {"target": target}), **(named or {})}
+
+
 def _labels(values: Any) -> list[Any] | None:
     """The values of a list some of which are not numbers; None for any other."""
     if isinstance(values, list) and any(not _is_number(value) for value in values):
@@ -330,11 +332,11 @@ def _is_number(value: Any) -> bool:
 
 def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
     """The bins of a range."""
+    if not isinstance(count, int) or count < 1:
+        raise ArgumentError(f"bins={count}: must be at least 1")
+    if labels is not None:
+        return points(list(range(len(labels))))
     try:
-        if not isinstance(count, int) or count < 1:
-            raise ArgumentError(f"bins={count}: must be at least 1")
-        if labels is not None:
-            return points(list(range(len(labels))))
         if isinstance(values, range) and values.step == 1 and len(values) > count:
             edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
             low = edges[:-1].ceil().long()
@@ -343,8 +345,6 @@ def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
             return intervals(float(values[0]), float(values[1]), count)
         if isinstance(values, list | range) and len(values):
             return points(list(values))
-    except ArgumentError:
-        raise
     except ValueError as error:
         raise ArgumentError(f"{key}={values!r}: {error}") from error
     raise ArgumentError(f"{key}={values!r}: must be (low, high), a range or a list")
