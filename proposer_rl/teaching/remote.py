@@ -60,11 +60,7 @@ class TeacherClient:
 
 
 class TeacherServer:
-    """Answers clients from threads of this process.
-
-    Args:
-        teacher: that is asked and told.
-    """
+    """Answers clients of a teacher from threads of this process."""
 
     def __init__(self, teacher: Any) -> None:
         self._teacher, self._key = teacher, os.urandom(32)

@@ -107,7 +107,7 @@ class LevelTransform(Transform):
         key = env.reset_keys[0]
         mask = None if tensordict is None else tensordict.get(key, None)
         if mask is None or self._levels is None:
-            self._start(count, device, mask is None)
+            self._start(count, device)
             which = torch.arange(count, device=device)
         else:
             # What has not ended here ended by a transform behind this one.
@@ -124,7 +124,7 @@ class LevelTransform(Transform):
         played = self._levels.unflatten(0, batch) if batch else self._levels[0]
         self._set_level(env, played.clone())
 
-    def _start(self, count: int, device: torch.device, whole: bool) -> None:
+    def _start(self, count: int, device: torch.device) -> None:
         if self._levels is not None and bool(self._out.any()):
             self._teacher.drop(self._ids[self._out])
         self._ids = torch.full((count,), NONE, device=device)
