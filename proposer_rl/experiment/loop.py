@@ -117,11 +117,6 @@ class Experiment:
         return self._seconds_before + time.monotonic() - self._started
 
     @property
-    def frames(self) -> int:
-        """Environment steps of one Solver's own training."""
-        return self.updates * self.task.batch_size * self.learner.settings.horizon
-
-    @property
     def costs(self) -> dict[str, float]:
         """What each Solver has cost so far.
 
@@ -130,7 +125,7 @@ class Experiment:
         for; ``seconds`` of the process.
         """
         return {
-            "frames": self.frames,
+            "frames": self.updates * self.task.batch_size * self.learner.settings.horizon,
             "curriculum_frames": self.student.frames,
             "evaluations": self.student.evaluations,
             "seconds": round(self.seconds, 3),
