@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Batch, Curriculum, Student, outcome_of, require
-from proposer_rl.curricula.batches import CPU, moved
+from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.recipes import Recipe
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -24,7 +24,7 @@ from proposer_rl.task import Task
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
-from proposer_rl.teaching.segments import Segments
+from proposer_rl.teaching.segments import ended
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tickets import COUNTS, OUT, RESULTS, Block, Tickets, as_array
 
@@ -117,7 +117,7 @@ class Teacher:
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._use(None, 0)
-        self._segments = Segments()
+        self._kept: TensorDictBase | None = None  # of episodes that have not ended, [n, L]
         self._lock, self._process = RLock(), os.getpid()
         self._server: TeacherServer | None = None
 
@@ -239,10 +239,10 @@ class Teacher:
         """
         with self._here():
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
-                tickets, whole = self._segments.ended(outcome)
+                tickets, whole, left = ended(outcome, self._kept)
                 if len(tickets):
                     self._observe_rollout(tickets, whole)
-                self._segments.keep()
+                self._kept = left
                 return
             tickets = self._proposed() if ids is None else self._ids(ids)
             if "rollout" in outcome.keys():
@@ -269,6 +269,7 @@ class Teacher:
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed loop needs, tickets that are out included."""
         with self._here():
+            kept = self._kept
             return {
                 "curriculum": self.curriculum.state_dict(),
                 "tickets": self._tickets.state_dict(),
@@ -276,7 +277,9 @@ class Teacher:
                 "proposed": list(self._whole),
                 "block": None if self._block is None else self._block.start,
                 "at": self._at,
-                "rollout": self._segments.state_dict(),
+                "rollout": {}
+                if kept is None
+                else {"shape": list(kept.batch_size), "kept": packed(kept)},
             }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -291,7 +294,9 @@ class Teacher:
             self._whole = list(state["proposed"])
             blocks = {block.start: block for block in self._tickets.blocks}
             self._use(blocks.get(state["block"]), self._at)
-            self._segments.load_state_dict(state["rollout"])
+            self._kept = None
+            if kept := state["rollout"]:
+                self._kept = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
 
     def client(self) -> TeacherClient:
         """This teacher for another process, such as a worker of a collector.

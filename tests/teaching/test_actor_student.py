@@ -13,7 +13,7 @@ from torch.distributions import Categorical
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 import proposer_rl as prl
-from proposer_rl.teaching.segments import Segments
+from proposer_rl.teaching.segments import ended
 
 SPACE = prl.Parameters({"arm": [0, 1]}, target={"arm": 1})
 
@@ -112,7 +112,7 @@ def test_what_lies_behind_an_episode_counts_nowhere() -> None:
     entries = {"observation": seen[:, :-1], "next": after, "level_id": numbers}
     entries["action"] = torch.randint(2, (2, 6), generator=draws)
     rollout = TensorDict(entries, [2, 6], names=[None, "time"])
-    ids, together = Segments().ended(rollout)
+    ids, together, _ = ended(rollout)
     cuts = {1: rollout[:1, :2], 2: rollout[:1, 2:], 3: rollout[1:, :4], 4: rollout[1:, 4:]}
     alone = [cuts[number].unsqueeze(0) for number in ids.tolist()]
     assert prl.outcome_of(together)["steps"].tolist() == [[e.batch_size[-1] for e in alone]]
