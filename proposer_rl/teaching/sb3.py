@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from numbers import Real
-from typing import Any
 
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
+from torch.utils._pytree import tree_leaves
 
 from proposer_rl.teaching.teacher import Teacher
 
@@ -27,17 +26,10 @@ class TeacherCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         for name, value in self._teacher.log().items():
-            numbers = list(_numbers(value))
+            leaves = tree_leaves(value, is_leaf=lambda entry: not isinstance(entry, list))
+            numbers = [float(entry) for entry in leaves if isinstance(entry, Real)]
             if numbers:
                 self.logger.record(f"teacher/{name}", float(torch.tensor(numbers).mean()))
 
     def _on_step(self) -> bool:
         return True
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, Real):
-        yield float(value)
-    elif isinstance(value, list):
-        for entry in value:
-            yield from _numbers(entry)
