@@ -75,16 +75,12 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         proposer_rl.settings.ArgumentError: temperature=0: input should be greater than 0
     """
     signature = inspect.signature(function)
-    variadic = [
-        p.name for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
-    ]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         _check_names(function, kwargs, (), missing=False)
         bound = signature.bind(*args, **kwargs)
-        given = {name: value for name, value in bound.arguments.items() if name not in variadic}
-        bound.arguments.update(_checked_values(function, given))
+        bound.arguments.update(_checked_values(function, bound.arguments))
         return function(*bound.args, **bound.kwargs)
 
     return call
@@ -175,8 +171,9 @@ def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> 
 def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None]:
     typed = function.__init__ if inspect.isclass(function) else function
     hints = get_type_hints(typed, include_extras=True)
-    hints.pop("return", None)
-    return {name: _adapter(hint) for name, hint in hints.items()}
+    parameters = inspect.signature(function).parameters.values()
+    one_by_one = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return {name: _adapter(hints[name]) for name in one_by_one if name in hints}
 
 
 def _adapter(hint: Any) -> TypeAdapter[Any] | None:
