@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypeVar
 
 import torch
-
-T = TypeVar("T")
 
 
 class Streams:
@@ -68,19 +65,3 @@ class Streams:
         address = repr((self._seed, *self._scope, *key)).encode()
         # 63 bits: the range that torch accepts on every device.
         return int.from_bytes(hashlib.blake2b(address, digest_size=8).digest(), "little") >> 1
-
-
-def each_from(streams: Sequence[Streams], make: Callable[[], T]) -> Callable[[], T]:
-    """Makes one network after another, the k-th with weights from the k-th of the streams.
-
-    Args:
-        streams: of as many networks as will be made.
-        make: makes one, drawing from torch's default generator.
-    """
-    remaining = iter(streams)
-
-    def made() -> T:
-        with next(remaining).as_default("weights"):
-            return make()
-
-    return made

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from proposer_rl.streams import Streams, each_from
+from proposer_rl.streams import Streams
+from tests.tiny import TASK
 
 
 def numbers(generator: torch.Generator) -> list[float]:
@@ -45,10 +46,9 @@ def test_the_generators_of_gpus_are_left_alone(monkeypatch) -> None:
 
 
 def test_each_network_has_the_weights_of_its_own_stream() -> None:
-    def make() -> torch.Tensor:
-        return torch.rand(3)
-
-    one_by_one = each_from([Streams(1), Streams(2)], make)
-    found = [one_by_one(), one_by_one()]
-    for seed, weights in zip((1, 2), found, strict=True):
-        assert weights.tolist() == numbers(Streams(seed).generator("weights"))
+    together = TASK.learner([Streams(1), Streams(2)]).agent
+    for copy, seed in enumerate((1, 2)):
+        alone = TASK.learner([Streams(seed)]).agent
+        for both, one in zip(together.parameters(), alone.parameters(), strict=True):
+            assert torch.equal(both[copy], one[0])
+    assert not torch.equal(*next(together.parameters()))

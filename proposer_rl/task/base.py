@@ -34,7 +34,7 @@ from proposer_rl.models import (
     normal,
 )
 from proposer_rl.runs.pictures import pixels, png, written
-from proposer_rl.streams import Streams, each_from
+from proposer_rl.streams import Streams
 from proposer_rl.task.contract import ComputeContext, Distribution, LevelResult, Levels, Space
 from proposer_rl.task.features import space_features
 
@@ -170,8 +170,13 @@ class Task(ABC):
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
         """PPO of K fresh Solvers, one for each of the streams, in their environment [K, P]."""
-        copies, make = len(streams), each_from(streams, self.network)
-        population = Population(make, copies, self.precision, self.cores, self.batched)
+        copies, remaining = len(streams), iter(streams)
+
+        def network() -> nn.Module:
+            with next(remaining).as_default("weights"):
+                return self.network()
+
+        population = Population(network, copies, self.precision, self.cores, self.batched)
         # A placeholder of the right shape; every update sets its own levels.
         level = next(iter(self.evaluated_on.values()))[:1]
         env = self.environment(level.expand(copies, self.batch_size))
