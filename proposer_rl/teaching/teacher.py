@@ -403,15 +403,15 @@ class Teacher:
 
     def _proposed(self) -> NDArray[np.int64]:
         """The tickets of the one batch that is out."""
-        if len(self._whole) != 1:
-            out = f"{len(self._whole)} batches are out" if self._whole else "nothing is out"
+        whole = [block for block in self._tickets.blocks if block.start in self._whole]
+        out = [block for block in whole if (block.state == OUT).any()]
+        if len(out) != 1:
+            how = f"{len(out)} batches are out" if out else "nothing is out"
             raise ArgumentError(
-                f"ids: missing: {out}; observe belongs to the last propose, and several at once "
+                f"ids: missing: {how}; observe belongs to the last propose, and several at once "
                 "need ask(n) and its tickets"
             )
-        (start,) = self._whole
-        block = next(block for block in self._tickets.blocks if block.start == start)
-        return np.arange(block.start, block.end)
+        return np.arange(out[0].start, out[0].end)
 
     def _ids(self, ids: Any) -> NDArray[np.int64]:
         """Tickets as an array [n] on the CPU."""

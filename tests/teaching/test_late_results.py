@@ -137,6 +137,20 @@ def test_batches_that_are_dropped_are_observed_no_more() -> None:
     teacher.observe({"return": [0.0] * 2})
 
 
+def test_batches_whose_tickets_are_over_are_not_waited_for() -> None:
+    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher.propose(4)
+    teacher.tell(range(4), [0.0] * 4)
+    teacher.ask()  # takes in what was told, so that the batch is forgotten
+    with pytest.raises(ArgumentError, match="ids: missing: nothing is out"):
+        teacher.observe({"return": [0.0] * 4})
+    first = 4 + teacher.block
+    teacher.propose(3)
+    teacher.drop(range(first, first + 3))
+    teacher.propose(2)
+    teacher.observe({"return": [0.0] * 2})
+
+
 class Elsewhere(torch.Tensor):
     """On another device: NumPy has no access to it."""
 
