@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -96,8 +97,7 @@ class ActorStudent(Student):
         advantage = self._advantage(rollout)
         parameters = dict(self._actor.named_parameters())
         with torch.enable_grad():
-            gained = over_steps(advantage * self._log_prob(rollout), rollout)
-            gained = gained * weights.to(advantage)
+            gained = self._gained(rollout, advantage) * weights.to(advantage)
             gradients = torch.autograd.grad(gained.sum(), list(parameters.values()))
         return {  # of one student
             name: (gradient / self._scale(parameter)).unsqueeze(0)
@@ -105,11 +105,7 @@ class ActorStudent(Student):
         }
 
     def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
-        advantage = self._advantage(rollout)
-
-        def gained() -> Tensor:
-            return over_steps(advantage * self._log_prob(rollout), rollout)
-
+        gained = partial(self._gained, rollout, self._advantage(rollout))
         step = self._optimizer.param_groups[0]["lr"]
         own = {name: entry[0] for name, entry in direction.items()}
         slope = alignment(self._actor, own, step, gained)
@@ -123,10 +119,11 @@ class ActorStudent(Student):
                 rollout["next", VALUE] = self._critic(rollout["next"].copy())[VALUE]
         return advantages(self, rollout).float()
 
-    def _log_prob(self, rollout: TensorDictBase) -> Tensor:
-        """Log pi(a_t | s_t), [1, n, T]."""
+    def _gained(self, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
+        """Means over the steps of A_t log pi(a_t | s_t), [1, n]."""
         log_prob = self._actor.get_dist(rollout.copy()).log_prob(rollout["action"])
-        return log_prob.reshape(*rollout.batch_size, -1).sum(-1)
+        log_prob = log_prob.reshape(*rollout.batch_size, -1).sum(-1)
+        return over_steps(advantage * log_prob, rollout)
 
     def _scale(self, parameter: Tensor) -> Tensor:
         """What Adam divides a gradient by; 1 where there is no second moment."""
