@@ -79,12 +79,7 @@ def application(session: Session, token: str) -> Starlette:
 
 
 class Guard:
-    """Lets through what comes from this server's own page, and says how browsers treat answers.
-
-    Args:
-        app: what is guarded.
-        token: that the address must begin with.
-    """
+    """Lets through what comes from this server's own page, and says how browsers treat answers."""
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self._app, self._token = app, token.encode()

@@ -24,17 +24,7 @@ def make_curriculum(
     filter: Mapping[str, Any] | str | None,
     seeds: Sequence[int],
 ) -> Curriculum:
-    """The curriculum on the levels of a space.
-
-    Args:
-        curriculum: a recipe, its name, or a curriculum.
-        space: a :class:`~proposer_rl.teaching.spaces.LevelSpace` or a task.
-        filter: as of :func:`proposer_rl.train`; a curriculum by name may have one by default.
-        seeds: of the students.
-
-    Raises:
-        ArgumentError: naming the setting, or what the space lacks.
-    """
+    """The curriculum on the levels of a space or task; by name with the filter of its file."""
     asked: Mapping[str, Any] = {}
     if isinstance(curriculum, str):
         curriculum = recipe_function("method", curriculum)()
