@@ -107,12 +107,9 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     ]
 
     def make(**given: Any) -> Recipe:
-        unknown = [key for key in given if key not in settings]
-        if unknown:
-            raise _refusal(f"{unknown[0]}: unknown; there are: {', '.join(settings)}")
-        for key, value in settings.items():
-            if value == MISSING and key not in given:
-                raise _refusal(f"{key}: missing")
+        from proposer_rl.settings import check_names  # which help does without
+
+        check_names(make, given)
         return Recipe(group, name, given)
 
     about = next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))

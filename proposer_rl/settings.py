@@ -78,7 +78,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        _check_names(function, kwargs, (), missing=False)
+        check_names(function, kwargs, missing=False)
         bound = signature.bind(*args, **kwargs)
         bound.arguments.update(_checked_values(function, bound.arguments))
         return function(*bound.args, **bound.kwargs)
@@ -134,16 +134,17 @@ def arguments(
         ...
         proposer_rl.settings.ArgumentError: rat: unknown; there are: rate, source
     """
-    _check_names(function, values, given)
+    check_names(function, values, given)
     return _checked_values(function, values)
 
 
-def _check_names(
+def check_names(
     function: Callable[..., Any],
     values: Mapping[str, Any],
-    given: Collection[str],
+    given: Collection[str] = (),
     missing: bool = True,
 ) -> None:
+    """Refuse unknown names, and if asked those that are missing; see :func:`arguments`."""
     parameters = inspect.signature(function).parameters.values()
     named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     known = [p.name for p in named if p.name not in ("self", *given)]

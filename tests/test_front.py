@@ -189,6 +189,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def test_settings_of_recipes_are_checked_where_they_are_given() -> None:
     with pytest.raises(prl.ArgumentError, match="temprature: unknown; there are: score, source"):
         prl.curricula.plr(temprature=1)
+    with pytest.raises(prl.ArgumentError, match=r"^temperature: unknown; there are none$"):
+        prl.curricula.target(temperature=1)
     with pytest.raises(prl.ArgumentError, match="env_id: missing"):
         recipe_function("task", "gymnasium")(max_steps=3)
     with pytest.raises(prl.ArgumentError, match=r"'a\.b': a name must begin with a letter"):
