@@ -102,7 +102,7 @@ class Teacher:
         self._seeds = [_whole("seed", seed) + copy for copy in range(students)]
         self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
-        given = getattr(space, "given", _same)
+        given = getattr(space, "given", lambda levels: levels)
         self.student = student or Student(
             **{
                 name: adapted(name, one, given, self.device) if self._alone else one
@@ -135,7 +135,7 @@ class Teacher:
         """Levels [n] ([K, n] of several students) to be observed together."""
         with self._here():
             block = self._next(_whole("n", n, 1))
-            block.hand_out(block.start, block.end)
+            block.state[:] = OUT
             self._whole.append(block.start)
             return self._levels(block)
 
@@ -158,11 +158,11 @@ class Teacher:
             while left or not ids:
                 block, start = self._current(left), self._at
                 self._at = end = min(start + left, block.end)
-                block.hand_out(start, end)
+                which = slice(start - block.start, end - block.start)
+                block.state[which] = OUT
                 ids.append(torch.arange(start, end, device=self.device))
                 if self._moved is None:
                     self._moved = self._levels(block)
-                which = slice(start - block.start, end - block.start)
                 levels.append(self._moved[which] if self._alone else self._moved[:, which])
                 left -= end - start
             if len(ids) == 1:
@@ -352,7 +352,7 @@ class Teacher:
         return self._tickets.add(batch)
 
     def _levels(self, block: Block) -> Any:
-        """The levels of a block, as the loop gets them."""
+        """The levels of a block, as the loop gets them, in a container of its own."""
         levels = moved(block.batch.levels, self.device)
         return self._given(levels[0] if self._alone else levels[:])
 
@@ -455,7 +455,3 @@ def _check_share(success: NDArray[np.float64]) -> None:
 
 def _argument(name: str) -> str:
     return "return_" if name == "return" else name
-
-
-def _same(levels: Any) -> Any:
-    return levels

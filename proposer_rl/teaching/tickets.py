@@ -41,10 +41,6 @@ class Block:
         self.state = np.full(count, WAITS, np.uint8)
         self.results = {name: np.full((copies, count), np.nan) for name in RESULTS}
 
-    def hand_out(self, start: int, end: int) -> None:
-        """Note that tickets are out."""
-        self.state[start - self.start : end - self.start] = OUT
-
 
 Parts = list[tuple[Block, Ids, Ids]]
 """Blocks that some tickets are of; which of them, and at which places of the block these are."""
