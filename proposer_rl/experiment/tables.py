@@ -18,19 +18,13 @@ RECORDED_LEVELS = 8
 
 
 class RunTables:
-    """The tables of K Solvers that are trained side by side.
-
-    Args:
-        task: which says how levels are recorded.
-        seeds: K of them.
-        folder: that the tables are in.
-        log: is told the rows of the first copy; None for nobody.
-    """
+    """The tables of K Solvers that are trained side by side."""
 
     def __init__(
         self, task: Task, seeds: Sequence[int], folder: RunFolder, log: Log | None
     ) -> None:
-        self._task, self._seeds, self._folder, self._log = task, seeds, folder, log
+        self._task, self._seeds, self._folder = task, seeds, folder
+        self._log = log or (lambda table, values, updates: None)
 
     def add_metrics(
         self, updates: int, measured: TensorDictBase, costs: Mapping[str, float]
@@ -51,16 +45,16 @@ class RunTables:
         self, updates: int, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase
     ) -> None:
         """How an update went, [K], and samples of its levels, [K, P], for every copy."""
-        told = self._task.training_metrics(levels, rollout), metrics
-        for (seed, values), (_, training) in zip(*map(self._per_copy, told), strict=True):
-            self._append("training.csv", updates, seed, {**values, **training})
+        trained_on = self._task.training_metrics(levels, rollout)
+        for seed, values in self._per_copy(trained_on, metrics):
+            self._append("training.csv", updates, seed, values)
         some = slice(RECORDED_LEVELS)
         for copy, seed in enumerate(self._seeds):
             sample = self._task.record(levels[copy, some], rollout[copy, some])
             row = {"updates": updates, "seed": seed, "levels": sample}
             self._folder.append("curriculum.jsonl", row)
             if copy == 0:
-                self._tell("curriculum", row, updates)
+                self._log("curriculum", row, updates)
 
     def add_cycle(
         self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
@@ -72,17 +66,14 @@ class RunTables:
             told["levels"] = {text: self._task.record(some, None) for text, some in shown}
         spent = {name: costs[name] for name in ("curriculum_frames", "evaluations")}
         self._folder.append("cycles.jsonl", {"cycle": cycle, "updates": updates, **spent, **told})
-        self._tell("cycles", told, updates)
+        self._log("cycles", told, updates)
 
     def _append(self, table: str, updates: int, seed: int, values: Mapping[str, float]) -> None:
         self._folder.append(table, {"seed": seed, "updates": updates, **values})
         if seed == self._seeds[0]:
-            self._tell(Path(table).stem, values, updates)
+            self._log(Path(table).stem, values, updates)
 
-    def _tell(self, table: str, row: Mapping[str, Any], updates: int) -> None:
-        if self._log is not None:
-            self._log(table, row, updates)
-
-    def _per_copy(self, values: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
+    def _per_copy(self, *told: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
         for copy, seed in enumerate(self._seeds):
-            yield seed, {str(key): float(value) for key, value in values[copy].items()}
+            entries = (entry for values in told for entry in values[copy].items())
+            yield seed, {str(key): float(value) for key, value in entries}
