@@ -277,7 +277,7 @@ class Experiment:
         mean = sum(self._headline) / len(self._headline)
         return f"{self.schedule.headline} {mean:.3f}"
 
-    def _pause(self, due: bool = False) -> None:
+    def _pause(self, due: bool) -> None:
         """A safe point: save if it is due or the time has come, stop if a signal asked for it."""
         limit = self.schedule.checkpoint_seconds
         late = limit is not None and time.monotonic() - self._saved >= limit

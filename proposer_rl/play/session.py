@@ -19,7 +19,7 @@ from proposer_rl.play.requests import (
     Examine,
     OfCurriculum,
     OfFile,
-    OfSet,
+    Source,
     Write,
 )
 from proposer_rl.report.records import SampleRecord, checked
@@ -33,19 +33,13 @@ MOST_LEVELS = 200  # of a file
 KEPT = 4  # checkpoints in memory
 
 Load = Callable[[Path], tuple[int, PPO]]
+"""The updates made at a checkpoint, and PPO of the Solvers in it."""
 
 
 class Session:
     """A run that is shown; nothing in its folder is changed.
 
     One thread at a time computes; the others wait.
-
-    Args:
-        folder: the run's.
-        title: what the run is, in a few words.
-        task: the run's.
-        seeds: of its Solvers, in their order.
-        load: the updates made at a checkpoint, and PPO of the Solvers in it.
     """
 
     def __init__(
@@ -92,11 +86,11 @@ class Session:
         board = self._require_board()
         level = board.read(question.rows)
         with self._lock, torch.no_grad():
-            updates, learner = self._learner(question.checkpoint, question.solver)
+            updates, learner = self._learner(question)
             result = board.examine(learner.agent, question.solver, level, question.max_steps)
         return {"updates": updates, **result}
 
-    def levels(self, question: Drawn | OfSet | OfCurriculum | OfFile) -> dict[str, Any]:
+    def levels(self, question: Source) -> dict[str, Any]:
         """Levels to choose from: pictures, with drawings where the task has a board.
 
         Raises:
@@ -136,20 +130,20 @@ class Session:
         recorded = read_jsonl(file) if file.is_file() else []
         return checked(list[SampleRecord], recorded, file.name)
 
-    def _learner(self, checkpoint: int, solver: int) -> tuple[int, PPO]:
+    def _learner(self, question: Examine | Drawn) -> tuple[int, PPO]:
         files = self._checkpoints()
-        if checkpoint not in files:
-            raise ValueError(f"no checkpoint {checkpoint}; available: {list(files)}")
-        if solver >= len(self._seeds):
-            raise ValueError(f"no Solver {solver}; there are {len(self._seeds)}")
-        file = files[checkpoint]
+        if question.checkpoint not in files:
+            raise ValueError(f"no checkpoint {question.checkpoint}; available: {list(files)}")
+        if question.solver >= len(self._seeds):
+            raise ValueError(f"no Solver {question.solver}; there are {len(self._seeds)}")
+        file = files[question.checkpoint]
         return self._load(file, file.stat().st_mtime_ns)
 
     def _drawn(self, question: Drawn) -> dict[str, Any]:
         """Draws of a distribution, what the Solver does there, and the episode that it played."""
         if question.name not in self._task.distributions:
             raise ValueError(f"there is no distribution {question.name!r}")
-        updates, learner = self._learner(question.checkpoint, question.solver)
+        updates, learner = self._learner(question)
         copies, batch = learner.env.batch_size
         streams = Streams(question.seed, "play", question.name)
         distribution = self._task.evaluation_distribution(question.name)

@@ -15,11 +15,6 @@ class TeacherClient:
 
     In which order processes come is for them to say, so that runs with several of them do not
     repeat each other.
-
-    Args:
-        address, key: of the thread that answers.
-        students: as of the teacher.
-        reads: the same.
     """
 
     def __init__(self, address: Any, key: bytes, students: int, reads: tuple[str, ...]) -> None:
