@@ -94,6 +94,7 @@ class LevelTransform(Transform):
         self._returns += after["reward"].reshape(-1)
         self._steps += 1
         success = self._success(after)
+        self._knows = success is not None
         if success is not None:
             self._succeeded = success.reshape(-1).clone()  # it is written to
         self._end(after["done"].reshape(-1) & self._out)
@@ -146,12 +147,11 @@ class LevelTransform(Transform):
         self._out = self._out & ~ended
 
     def _success(self, after: TensorDictBase) -> Tensor | None:
-        rule, self._knows = self._rule, True
+        rule = self._rule
         if rule is not None:
             return rule(after) if callable(rule) else after[rule]
         if "success" in after.keys():
             return after["success"]
-        self._knows = False
         if "success" in self._teacher.reads:
             raise ArgumentError(
                 "success: missing: this curriculum reads it, and the environment has no such "
