@@ -46,9 +46,7 @@ class Streams:
 
         Numbers are drawn there for every device: generators of other devices draw others.
         """
-        generator = torch.Generator()
-        generator.manual_seed(self._seed_of(*key))
-        return generator
+        return torch.Generator().manual_seed(self._seed_of(*key))
 
     @contextmanager
     def as_default(self, *key: str | int) -> Iterator[None]:
