@@ -92,7 +92,7 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     Raises:
         AttributeError: if there is no such file, with those that there are.
     """
-    if name.startswith("__") or name not in available(group):
+    if name not in available(group):
         known = ", ".join(available(group))
         raise AttributeError(f"there is no {name!r}; there are: {known}")
     settings = file_content(f"{group}/{name}")[KEYS[group]]

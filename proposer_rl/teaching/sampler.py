@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -46,7 +46,7 @@ class TeacherSampler(Sampler[int]):
             raise ArgumentError("teacher: must have a space of Items")
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
-        self._out: dict[int, deque[int]] = defaultdict(deque)  # tickets of each item
+        self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
 
     def __len__(self) -> int:
         return self._length * self._repeat * self._rounds
@@ -97,7 +97,7 @@ class TeacherSampler(Sampler[int]):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with it."""
         self._out.clear()
-        self._out.update({item: deque(tickets) for item, tickets in state["out"].items()})
+        self._out.update({item: list(tickets) for item, tickets in state["out"].items()})
 
     def _told(self, items: Sequence[int]) -> list[tuple[int, int]]:
         """The item and the ticket of each group of items [n]."""
