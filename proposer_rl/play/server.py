@@ -27,8 +27,7 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from proposer_rl.play.requests import LARGEST_BODY, Examine, Source, Write
-from proposer_rl.play.session import Session
+from proposer_rl.play.session import LARGEST_BODY, Examine, Session, Source, Write
 from proposer_rl.report.records import checked, printable
 
 HOSTS = ["127.0.0.1", "localhost"]

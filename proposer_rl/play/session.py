@@ -1,4 +1,4 @@
-"""One run as the page shows it: its levels, and its Solvers on levels."""
+"""One run as the page shows it, and what it may ask for: checked before anything is done."""
 
 from __future__ import annotations
 
@@ -6,22 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import BaseModel, ConfigDict, Field
 
 from proposer_rl.learning import PPO
 from proposer_rl.play.board import Board, PlayableTask
-from proposer_rl.play.requests import (
-    LARGEST_SIDE,
-    MOST_STEPS,
-    Drawn,
-    Examine,
-    OfCurriculum,
-    OfFile,
-    Source,
-    Write,
-)
 from proposer_rl.report.records import SampleRecord, checked
 from proposer_rl.runs.checkpoint import checkpoint_files
 from proposer_rl.runs.folder import read_jsonl
@@ -31,9 +22,81 @@ from proposer_rl.task import Levels, Task
 SHOWN = 12  # levels of a draw
 MOST_LEVELS = 200  # of a file
 KEPT = 4  # checkpoints in memory
+LARGEST_SIDE = 64  # cells of a drawing
+MOST_STEPS = 5000  # of an episode
+LARGEST_BODY = 2**18  # bytes of a request
+LARGEST_SEED = 2**31 - 1
 
 Load = Callable[[Path], tuple[int, PPO]]
 """The updates made at a checkpoint, and PPO of the Solvers in it."""
+
+Number = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+Name = Annotated[str, Field(max_length=80)]
+Row = Annotated[str, Field(min_length=1, max_length=LARGEST_SIDE)]
+Rows = Annotated[list[Row], Field(min_length=1, max_length=LARGEST_SIDE)]
+
+
+class Question(BaseModel):
+    """JSON with these keys and no others, each of its own type."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Examine(Question):
+    """What does a Solver do on this drawing?
+
+    Attributes:
+        checkpoint: its number, one of those that the run has.
+        solver: the Solver's number among those that were trained side by side.
+        rows: the drawing.
+        max_steps: step limit; None for the task's choice.
+    """
+
+    checkpoint: Number
+    solver: Number
+    rows: Rows
+    max_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = None
+
+
+class Drawn(Question):
+    """Levels drawn from a distribution, and how a Solver does there."""
+
+    source: Literal["distribution"]
+    name: Name
+    seed: Number
+    checkpoint: Number
+    solver: Number
+
+
+class OfSet(Question):
+    """The levels of a shipped set."""
+
+    source: Literal["set"]
+    name: Name
+
+
+class OfCurriculum(Question):
+    """Levels that were trained on: a row of the run's ``curriculum.jsonl``."""
+
+    source: Literal["curriculum"]
+    row: Number
+
+
+class OfFile(Question):
+    """The levels in the text of a file."""
+
+    source: Literal["file"]
+    text: Annotated[str, Field(max_length=LARGEST_BODY)]
+
+
+class Write(Question):
+    """The text of a file with this drawing."""
+
+    name: Name
+    rows: Rows
+
+
+Source = Annotated[Drawn | OfSet | OfCurriculum | OfFile, Field(discriminator="source")]
 
 
 class Session:

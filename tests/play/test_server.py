@@ -21,8 +21,8 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.evaluate import evaluate, load
 from proposer_rl.cli.stored import stored_run
-from proposer_rl.play.requests import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.play.server import STATIC
+from proposer_rl.play.session import LARGEST_BODY, LARGEST_SIDE
 from proposer_rl.runs.folder import read_jsonl
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.level_files import levels_to_text, read_levels, shipped_levels

@@ -12,7 +12,7 @@ import torch
 from proposer_rl.api import Run
 from proposer_rl.cli.evaluate import evaluate, load
 from proposer_rl.cli.play import open_session
-from proposer_rl.play.requests import Drawn
+from proposer_rl.play.session import Drawn
 from tests.tasks.gymnasium.toys import TINY
 
 pytestmark = pytest.mark.usefixtures("own_folder")
