@@ -61,16 +61,11 @@ class ProposerError(ArgumentError):
     """A setting of the Proposer is not allowed here; the line begins with its name."""
 
 
-class Workers(NamedTuple):
-    """Other processes in which replicas of the Solver are trained.
+Workers = tuple[WorkerSettings, Callable[[str], Task]]
+"""Other processes in which replicas of the Solver are trained, and what makes the task there.
 
-    Attributes:
-        settings: how many there are, and where.
-        make_task: makes the task in one of them, given its device; can be pickled.
-    """
-
-    settings: WorkerSettings
-    make_task: Callable[[str], Task]
+Given its device; it can be pickled.
+"""
 
 
 class Components(NamedTuple):

@@ -205,7 +205,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
         precision=task.precision, cores=cores, graphs=compute.graphs, compile=compute.compile
     )
     make = partial(_made, task_maker(config.task), config.solver, context)
-    return Workers(settings, make)
+    return settings, make
 
 
 def _device(name: str, key: str = "device") -> torch.device:

@@ -12,7 +12,7 @@ from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.meta.rewards import Reward, performance_gain
 from proposer_rl.meta.workers import WorkerSettings
-from proposer_rl.methods import Components, Workers, proposer
+from proposer_rl.methods import Components, proposer
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from tests.tiny import composed
@@ -43,7 +43,7 @@ def make(
         return maker(solver=solver, context=ComputeContext(torch.device(device)))
 
     task = make_task(settings)
-    found = None if elsewhere is None else Workers(elsewhere, make_in_worker)
+    found = None if elsewhere is None else (elsewhere, make_in_worker)
     parts = Components(task, settings.proposer, seeds=[0], workers=found)
     return task, proposer(parts, reward)
 
