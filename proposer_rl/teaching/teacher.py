@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from operator import index
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
@@ -15,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from proposer_rl.curricula import Batch, Curriculum, Student, outcome_of, require
+from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.recipes import Recipe
 from proposer_rl.settings import ArgumentError, Count, checked
@@ -345,7 +346,7 @@ class Teacher:
 
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
-        self._tickets.collect(self._observe)
+        self._tickets.collect(partial(self.curriculum.observe, self.student))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
         self._proposals += 1
@@ -391,11 +392,9 @@ class Teacher:
             as_array(name, outcome[name], tuple(outcome.batch_size))
         for block, which, place in parts:
             rows = torch.from_numpy(which).to(outcome["return"].device)
-            self._observe(block.batch[:, torch.from_numpy(place)], outcome[:, rows])
+            batch = block.batch[:, torch.from_numpy(place)]
+            self.curriculum.observe(self.student, batch, outcome[:, rows])
         self._tickets.close(parts)
-
-    def _observe(self, batch: Batch, outcome: TensorDict) -> None:
-        self.curriculum.observe(self.student, batch, outcome)
 
     def _require_success(self, known: bool, how: str) -> None:
         if "success" in self.reads and not known:
