@@ -20,7 +20,6 @@ from proposer_rl.report.comparisons import (
     ALIKE,
     TOO_FEW,
     Decision,
-    between,
     decisions,
     difference,
     learnt,
@@ -104,7 +103,7 @@ def _beats(
 ) -> Evidence:
     """Does the first of two methods beat the second, and at what cost in frames?"""
     one, other = (group.label for group in groups)
-    decision = decided.get((one, other)) or decided[other, one]
+    decision = decided[one, other]
     verdict: Verdict = "too few seeds" if decision.verdict == TOO_FEW else "undecided"
     if decision.winner:
         verdict = "supported" if decision.winner == one else "contradicted"
@@ -341,7 +340,7 @@ def _beats_all(study: Study, needs: Needs) -> Evidence | None:
         return None
     others = [none, *free]
     found = decisions(study)
-    pairs = [between(found, one, other) for other in others]
+    pairs = [(other, found[one.label, other.label]) for other in others]
     text = "; ".join(_against(study, one, *pair) for pair in pairs)
     text = f"{primary(study).name}, difference to {text}; {_frames(one, others)}"
     if any(decision.winner not in (None, one.label) for _, decision in pairs):
@@ -356,12 +355,12 @@ def _level_or_better(study: Study) -> Evidence | None:
     one, hand = study.group(OURS), study.group(HAND)
     if one is None or hand is None or not is_rate(study.headline):
         return None
-    _, decision = pair = between(decisions(study), one, hand)
+    decision = decisions(study)[one.label, hand.label]
     low = difference(primary(study), one, hand).interval(1 - 2 * ERROR).low
     text = (
-        f"{primary(study).name}, difference to {_against(study, one, *pair)}; level is taken as no "
-        f"more than {ALIKE} below, by a one-sided test at 5 % (bound {write(float(low), 3)}); "
-        f"{_frames(one, [hand])}"
+        f"{primary(study).name}, difference to {_against(study, one, hand, decision)}; level is "
+        f"taken as no more than {ALIKE} below, by a one-sided test at 5 % (bound "
+        f"{write(float(low), 3)}); {_frames(one, [hand])}"
     )
     if decision.verdict == TOO_FEW:
         return "too few seeds", text

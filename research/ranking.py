@@ -11,7 +11,6 @@ import numpy as np
 from proposer_rl.report.comparisons import (
     Decision,
     Outcome,
-    between,
     decisions,
     learnt,
     primary,
@@ -146,7 +145,7 @@ def choose(
     level = [
         other.label
         for other in others
-        if any(between(each, best, other)[1].winner != best.label for each in found)
+        if any(each[best.label, other.label].winner != best.label for each in found)
     ]
     doubt = ""
     if len(means[best.label]) < FEWEST:

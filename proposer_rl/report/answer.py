@@ -10,7 +10,6 @@ from proposer_rl.report.comparisons import (
     NOT_LEARNT,
     TOO_FEW,
     Decision,
-    between,
     decisions,
     primary,
 )
@@ -41,9 +40,10 @@ def answer(study: Study) -> tuple[str, str]:
     first = (
         f"Of {len(ranked)} methods, {best.label} has the highest {outcome.name} and over seeds "
         f"(median over seeds: {median}); "
-        f"{_shown(best, [between(found, best, other) for other in others])}."
+        f"{_shown(best, {other.label: found[best.label, other.label] for other in others})}."
     )
-    return first, _against(baseline, [group for group in ranked if group is not baseline], found)
+    rest = [group.label for group in ranked if group is not baseline]
+    return first, _against(baseline, {label: found[baseline.label, label] for label in rest})
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
@@ -60,35 +60,32 @@ def meaning(group: Group, meanings: Meanings) -> str:
     return f"{text} ({group.setting})" if group.setting else text
 
 
-def _shown(best: Group, pairs: Sequence[tuple[Group, Decision]]) -> str:
-    """Whether the best is significantly better, and than how many."""
-    beaten = [decision.winner == best.label for _, decision in pairs]
-    if all(decision.verdict == TOO_FEW for _, decision in pairs):
+def _shown(best: Group, found: Mapping[str, Decision]) -> str:
+    """Whether the best is significantly better, and than how many of the others."""
+    beaten = [decision.winner == best.label for decision in found.values()]
+    if all(decision.verdict == TOO_FEW for decision in found.values()):
         return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
     if all(beaten):
-        return f"it is significantly better than {'all others' if len(pairs) > 1 else 'the other'}"
-    if any(decision.verdict == NOT_LEARNT for _, decision in pairs):
+        return f"it is significantly better than {'all others' if len(found) > 1 else 'the other'}"
+    if any(decision.verdict == NOT_LEARNT for decision in found.values()):
         return "but it is not shown to have learnt"
     if not any(beaten):
         return "but there is no significant difference to any of the others"
-    left = [group.label for group, decision in pairs if decision.winner != best.label]
+    left = [label for label, decision in found.items() if decision.winner != best.label]
     return (
-        f"it is significantly better than {sum(beaten)} of the {len(pairs)} others, with no "
+        f"it is significantly better than {sum(beaten)} of the {len(found)} others, with no "
         f"significant difference to {_listed(left)}"
     )
 
 
-def _against(
-    baseline: Group, others: Sequence[Group], found: Mapping[tuple[str, str], Decision]
-) -> str:
+def _against(baseline: Group, found: Mapping[str, Decision]) -> str:
     """How the others stand to the baseline."""
-    pairs = [between(found, baseline, other) for other in others]
-    if all(decision.verdict == TOO_FEW for _, decision in pairs):
+    if all(decision.verdict == TOO_FEW for decision in found.values()):
         return f"Too few seeds for a comparison with the baseline, {baseline.label}."
-    better = [group.label for group, decision in pairs if decision.winner == group.label]
-    worse = [group.label for group, decision in pairs if decision.winner == baseline.label]
-    unlearnt = sum(decision.verdict == NOT_LEARNT for _, decision in pairs)
-    rest = len(pairs) - len(better) - len(worse) - unlearnt
+    better = [label for label, decision in found.items() if decision.winner == label]
+    worse = [label for label, decision in found.items() if decision.winner == baseline.label]
+    unlearnt = sum(decision.verdict == NOT_LEARNT for decision in found.values())
+    rest = len(found) - len(better) - len(worse) - unlearnt
     first = f"{_listed(better) or 'No method'} {_is(better)}"
     parts = [f"{first} significantly better than the baseline, {baseline.label}"]
     parts += [f"{_listed(worse)} {_is(worse)} significantly worse"] if worse else []

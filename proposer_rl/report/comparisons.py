@@ -129,7 +129,7 @@ def learnt(group: Group, name: str, updates: float) -> bool:
 
 
 def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, str], Decision]:
-    """Of every pair of groups which is better by an outcome, by their labels.
+    """Of every pair of groups which is better by an outcome, by their labels in either order.
 
     The tests of all pairs are corrected together, by Holm's method.
 
@@ -143,10 +143,11 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
     found = [_difference(known[one.label], known[other.label]) for one, other in pairs]
     corrected = statistics.holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
-    return {
-        (one.label, other.label): _decide(study, (one, other), known, estimate, p, count)
-        for (one, other), estimate, p in zip(pairs, found, corrected, strict=True)
-    }
+    decided = {}
+    for (one, other), estimate, p in zip(pairs, found, corrected, strict=True):
+        decision = _decide(study, (one, other), known, estimate, p, count)
+        decided[one.label, other.label] = decided[other.label, one.label] = decision
+    return decided
 
 
 def _decide(
@@ -175,10 +176,3 @@ def _decide(
     if not learnt(winner, study.headline, study.horizon):
         return Decision(None, NOT_LEARNT, p, f"{text}, but {winner.label} hardly learnt")
     return Decision(winner.label, f"{winner.label} is better", p, text)
-
-
-def between(
-    found: Mapping[tuple[str, str], Decision], one: Group, other: Group
-) -> tuple[Group, Decision]:
-    """The other of two groups, and what was decided between them."""
-    return other, found.get((one.label, other.label)) or found[other.label, one.label]

@@ -11,7 +11,6 @@ import numpy as np
 
 from proposer_rl.report.comparisons import (
     at_the_end,
-    between,
     decisions,
     difference,
     outcomes,
@@ -74,7 +73,7 @@ def against_baseline(study: Study) -> Table:
     rows: list[dict[str, Cell]] = []
     for group in study.compared:
         if group.label != baseline.label:
-            _, decision = between(decided, baseline, group)
+            decision = decided[baseline.label, group.label]
             rows.append(
                 {
                     "method": group.label,
