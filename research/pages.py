@@ -19,7 +19,7 @@ from proposer_rl.report.reading import OutputError
 from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Study
-from proposer_rl.report.style import Drawing, in_few_colours, render_png
+from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
 from proposer_rl.report.tidy import STUDY
 from proposer_rl.runs.folder import write_atomically
@@ -241,7 +241,8 @@ def _list(found: Sequence[tuple[str, Evidence | None]]) -> str:
 
 def _picture(drawing: Drawing, files: dict[str, bytes]) -> str:
     path = f"{FIGURES}/{drawing.name}.png"
-    files[path] = in_few_colours(render_png(drawing))
+    (png,) = render(drawing, "png")
+    files[path] = in_few_colours(png)
     return f"![{escape_markdown(drawing.title)}]({path})"
 
 

@@ -27,7 +27,7 @@ from proposer_rl.report.reading import OutputError, find_runs, read_run
 from proposer_rl.report.records import anywhere, encoded, printable
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies
-from proposer_rl.report.style import in_few_colours, render_png
+from proposer_rl.report.style import in_few_colours, render
 from proposer_rl.report.tidy import NAMES, STUDY, tables, to_csv
 from proposer_rl.runs.folder import write_atomically
 
@@ -115,8 +115,8 @@ def write_page(folder: Path) -> None:
         (folder / "figures").mkdir(exist_ok=True)
         drawings = [each for each in (learning_curves(study), heat_maps(study)) if each]
         for drawing in drawings:
-            picture = in_few_colours(render_png(drawing))
-            write_atomically(folder / f"{prefix}{drawing.name}.png", picture)
+            (png,) = render(drawing, "png")
+            write_atomically(folder / f"{prefix}{drawing.name}.png", in_few_colours(png))
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
     command = report_command("bin/report", [folder], None, None)

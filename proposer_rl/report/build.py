@@ -147,10 +147,10 @@ def _section(
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
-            drawn = render(drawing)
+            svg, png = render(drawing, "svg", "png")
             if draw in STILL:
-                figures.append(page.figure(drawing, drawn.png))
-            files |= {f"{path}.svg": drawn.svg, f"{path}.png": drawn.png}
+                figures.append(page.figure(drawing, png))
+            files |= {f"{path}.svg": svg, f"{path}.png": png}
         bar.update()
     data = charts(study)
     return {

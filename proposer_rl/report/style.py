@@ -140,24 +140,11 @@ def finish(
     axes.set_ylim(0 if zero else low - margin, high + margin)
 
 
-class Drawn(NamedTuple):
-    """A figure with all of its panels and its legend, as two files."""
-
-    svg: bytes
-    png: bytes
-
-
-def render(drawing: Drawing) -> Drawn:
-    """Draw a figure, once: to lay it out takes longer than all else."""
+def render(drawing: Drawing, *suffixes: str) -> list[bytes]:
+    """A figure as files, ``svg`` or ``png``, drawn once: the layout takes longer than all else."""
     with rc_context(SETTINGS):
         figure = _laid_out(drawing)
-        return Drawn(_render(figure, "svg"), _render(figure, "png"))
-
-
-def render_png(drawing: Drawing) -> bytes:
-    """Draw a figure of which nobody wants vectors."""
-    with rc_context(SETTINGS):
-        return _render(_laid_out(drawing), "png")
+        return [_render(figure, suffix) for suffix in suffixes]
 
 
 def in_few_colours(png: bytes) -> bytes:

@@ -184,7 +184,7 @@ def test_cycles_of_no_seed_that_is_there_are_no_stages(tmp_path: Path) -> None:
 def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:
     (study,), _ = read_studies(sorted(runs.iterdir()), None)
     drawing = learning_curves(study)
-    image = page.figure(drawing, render(drawing).png)
+    image = page.figure(drawing, *render(drawing, "png"))
     content = base64.b64decode(image["address"].removeprefix("data:image/png;base64,"))
     with Image.open(io.BytesIO(content)) as file:
         found = np.asarray(file.convert("RGB")).astype(int)
