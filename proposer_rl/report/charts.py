@@ -81,17 +81,17 @@ def _measure(study: Study, measure: Measure) -> Json:
 def _levels(study: Study) -> list[Json]:
     """What the methods reach on every single level at the end, mean over seeds."""
     every = {
-        name: [measures.level_means(study, group, name) for group in study.groups]
+        name: [study.scores(group, name) for group in study.groups]
         for name in measures.of_levels(study)
     }
     return [
         {
             "name": axis_text(name),
             "rate": is_rate(name),
-            "methods": [None if one is None else plain(one) for one in means],
+            "methods": [None if one is None else plain(one.mean(0)) for one in scores],
         }
-        for name, means in every.items()
-        if sum(one is not None for one in means) > 1
+        for name, scores in every.items()
+        if sum(one is not None for one in scores) > 1
     ]
 
 

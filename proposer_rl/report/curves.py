@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from textwrap import fill
 
@@ -24,7 +23,10 @@ MOST_PANELS = 12
 def learning_curves(study: Study) -> Drawing:
     """The paper's Figure 2: success on every distribution, and updates to the threshold."""
     every = measures.measured(study)
-    panels = [_panel(study, every[name]) for name in study.measurements[:MOST_PANELS]]
+    panels = [
+        partial(_draw_curves, study=study, measure=every[name])
+        for name in study.measurements[:MOST_PANELS]
+    ]
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
@@ -56,7 +58,7 @@ def cost_curves(study: Study) -> Drawing:
         f"The same {words(study.headline)} against updates and against its whole cost",
         "Frames: the Solver's own plus those that the curriculum spent, on replicas or on scoring. "
         + seconds,
-        [_panel(study, measure, axis) for axis in measure.axes],
+        [partial(_draw_curves, study=study, measure=measure, axis=axis) for axis in measure.axes],
         3,
         study.legend,
     )
@@ -68,7 +70,7 @@ def difficulty(study: Study) -> Drawing | None:
     for measure in measures.trained(study):
         series = measure.axes[UPDATES]
         if having := {group.label for group in study.groups if series(group) is not None}:
-            drawn.append(_panel(study, measure))
+            drawn.append(partial(_draw_curves, study=study, measure=measure))
             shown |= having
     if not drawn:
         return None
@@ -99,12 +101,7 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
     return median
 
 
-def _panel(study: Study, measure: Measure, axis: str = "") -> Callable[[FigureBase], None]:
-    axis = axis or next(iter(measure.axes))
-    return partial(_draw_curves, study=study, measure=measure, axis=axis)
-
-
-def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str) -> None:
+def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str = UPDATES) -> None:
     axes = axes_of(figure)
     found = [(group.look, measure.axes[axis](group)) for group in study.groups]
     means = [draw_series(axes, series, look) for look, series in found if series is not None]

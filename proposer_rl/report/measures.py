@@ -225,12 +225,6 @@ def of_levels(study: Study) -> list[str]:
     return [n for n in study.measurements if any(study.scores(g, n) is not None for g in groups)]
 
 
-def level_means(study: Study, group: Group, name: str) -> Column | None:
-    """What a group reaches on every level, mean over seeds, [levels]; None without records."""
-    scores = study.scores(group, name)
-    return None if scores is None else scores.mean(0)
-
-
 def recorded_gain(group: Group) -> str | None:
     """Which gain of the replicas a group has on record; None without one."""
     cycles = [cycle for run in group.logs for cycle in run.cycles]
