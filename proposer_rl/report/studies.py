@@ -169,29 +169,21 @@ def read_studies(
     if not runs:
         raise UnreadableRun(first)
     runs, doubles = _without_doubles(runs)
-    sorted_runs = defaultdict(list)
+    alike: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
-        sorted_runs[_key(_setting(run))].append(run)
+        alike[_key(_setting(run))].append(run)
+    grouped = [(members[0], _groups(members)) for members in alike.values()]
+    every = looks(group.label for _, groups in grouped for group in groups)
     studies = [
         Study(
-            _title(members[0]),
-            _groups(members),
-            _threshold(members[0]) if threshold is None else threshold,
+            _title(example),
+            tuple(replace(group, look=every[group.label]) for group in groups),
+            float(example.config["schedule"]["threshold"]) if threshold is None else threshold,
             baseline,
         )
-        for members in sorted_runs.values()
-    ]
-    labels = sorted({group.label for study in studies for group in study.groups})
-    every = looks(labels)
-    studies = [
-        replace(study, groups=tuple(replace(g, look=every[g.label]) for g in study.groups))
-        for study in studies
+        for example, groups in grouped
     ]
     return sorted(studies, key=lambda study: -len(study.runs)), notes + doubles
-
-
-def _threshold(run: Run) -> float:
-    return float(run.config["schedule"]["threshold"])
 
 
 def _setting(run: Run) -> dict[str, Any]:
@@ -283,10 +275,11 @@ def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]
     """
     if len(alike) == 1:
         return [(plain, "")]
-    words = [_overrides(members[0]) for members in alike]
-    if None not in words and len({frozenset(own or ()) for own in words}) == len(alike):
-        common = frozenset.intersection(*(frozenset(own or ()) for own in words))
-        settings = [", ".join(w for w in own or () if w not in common) for own in words]
+    known = (_overrides(members[0]) for members in alike)
+    words = [own for own in known if own is not None]
+    if len(set(map(frozenset, words))) == len(alike):
+        common = frozenset.intersection(*map(frozenset, words))
+        settings = [", ".join(word for word in own if word not in common) for own in words]
         texts = [f"{plain}, {setting}" if setting else plain for setting in settings]
     else:
         settings = _differing([dict(_leaves(_variant(members[0]))) for members in alike])
