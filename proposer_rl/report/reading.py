@@ -104,7 +104,6 @@ def read_run(folder: Path) -> list[Run]:
 
 
 def _read_folder(folder: Path) -> list[Run]:
-    summary = _read_json(folder, "summary.json") or {}
     pictures = folder / "curriculum.jsonl"
     # Of many seeds and evaluations they are too many; all else of the run can be shown.
     large = pictures.is_file() and pictures.stat().st_size > LARGEST_FILE
@@ -113,13 +112,12 @@ def _read_folder(folder: Path) -> list[Run]:
     return _runs(
         folder,
         _read_json(folder, "config.json"),
-        {**(_read_json(folder, "run.json") or {}), **summary},
+        (_read_json(folder, "run.json") or {}) | (_read_json(folder, "summary.json") or {}),
         pd.DataFrame(read_csv(_checked(folder, "metrics.csv"))),
         pd.DataFrame(_optional(folder, "training.csv", read_csv)),
         _optional(folder, "cycles.jsonl", read_jsonl),
         checked(list[LevelResults], reached, "levels.jsonl"),
         checked(list[SampleRecord], recorded, "curriculum.jsonl"),
-        summary.get("updates"),
     )
 
 
@@ -148,7 +146,6 @@ def _read_study(folder: Path) -> list[Run]:
             recorded,
             _level_results(levels),
             (),
-            facts.get("updates"),
         )
     return runs
 
@@ -186,9 +183,8 @@ def _runs(
     cycles: Sequence[Any],
     levels: Sequence[LevelResults],
     samples: Sequence[SampleRecord],
-    ended: Any,
 ) -> list[Run]:
-    """A run for each seed, of all that is on record; ``ended`` is its length if it is finished."""
+    """A run for each seed, of all that is on record; only of finished runs facts have updates."""
     config = _check_config(config)
     task = checked(TaskFacts, facts["task"], "run.json: task")
     if not len(metrics):
@@ -216,8 +212,8 @@ def _runs(
             sheets=_last_sheets(cycles, sheets, seed),
         )
         _check_metrics(run)
-        reached = _levels(levels, seed, run.updates)
-        runs.append(replace(run, finished=ended == run.updates, levels=reached))
+        finished = facts.get("updates") == run.updates
+        runs.append(replace(run, finished=finished, levels=_levels(levels, seed, run.updates)))
     return runs
 
 
