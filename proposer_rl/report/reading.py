@@ -246,7 +246,8 @@ def _check_config(config: dict[str, Any] | None) -> dict[str, Any]:
     for name in ("scale", "ablation"):
         checked(Name, config.get(name, "none"), f"config.json: {name}")
     checked(Name, config["schedule"]["headline"], "config.json: schedule.headline")
-    if math.isnan(number(config["schedule"]["threshold"])):
+    threshold = config["schedule"]["threshold"]
+    if isinstance(threshold, list) or math.isnan(number(threshold)):
         raise ValueError("config.json: schedule.threshold is no number")
     return config
 

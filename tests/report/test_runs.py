@@ -128,6 +128,7 @@ def in_cycle(value: object):
         ("config.json", set_key("method", value="x" * 1000), "method: String should have at most"),
         ("config.json", set_key("method", value="a\nb"), "method: Value error, must be printable"),
         ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),
+        ("config.json", set_key("schedule", "threshold", value=[0.8]), "threshold is no number"),
         ("metrics.csv", lambda text: text.replace("0.5", "nan"), "id_success is not always a"),
         ("metrics.csv", lambda text: text.replace("0.5", "half"), "is not a number"),
         ("metrics.csv", lambda text: text.replace("id_success", "x"), "no column 'id_success'"),
