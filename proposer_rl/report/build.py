@@ -10,13 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import (
-    curves,
-    outcomes,
-    page,
-    pictures,
-    tidy,
-)
+from proposer_rl.report import curves, outcomes, page, pictures, tidy
 from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
@@ -42,7 +36,6 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
 
 # These are no charts, so that the page has them as pictures.
 STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
-
 
 # What is to be said of means over the worst share of the levels, by whether they are exact.
 SELECTION = {
@@ -93,7 +86,8 @@ def write_report(
     studies, notes = read_checked(folders, threshold, baseline)
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
-    prefixes: list[str] = []
+    title = "Curricula: what the runs show"
+    parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
     with tqdm(
         total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
     ) as bar:
@@ -101,13 +95,10 @@ def write_report(
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
             if f"{TABLES}/{prefix}runs.csv" in files:  # of one title, but measured otherwise
                 prefix += f"{len(sections) + 1}_"
-            prefixes.append(f"{FIGURES}/{prefix}")
             sections.append(_section(study, prefix, files, bar, meanings or {}))
-    title = "Curricula: what the runs show"
+            parts.append(page.section(study, f"{FIGURES}/{prefix}"))
     command = page.report_command("bin/report", folders, threshold, baseline)
     html = page.render(title=title, command=command, sections=sections, notes=notes)
-    parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
-    parts += [page.section(each, prefix) for each, prefix in zip(studies, prefixes, strict=True)]
     files["report.md"] = encoded(page.document(parts, command, notes))
     for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
         if path.is_dir() and not path.is_symlink():

@@ -20,7 +20,7 @@ from proposer_rl.report.answer import Meanings, answer, meaning
 from proposer_rl.report.outcomes import against_baseline, group_table
 from proposer_rl.report.records import anywhere, level_text, words
 from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.studies import Study
 from proposer_rl.report.style import DPI, Drawing, in_few_colours
 from proposer_rl.report.tables import escape_markdown
 
@@ -128,7 +128,18 @@ def incomplete(study: Study) -> list[str]:
 
 def commands(study: Study) -> list[str]:
     """What each group was started with; seeds that differ in nothing else in one command."""
-    return [command for group in study.groups for command in _commands(group)]
+    found = []
+    for group in study.groups:
+        seeds: dict[str, list[int]] = {}
+        for run in group.runs:
+            seeds.setdefault(_command(run), []).append(run.seed)
+        found += [
+            f"{command} seed={','.join(map(str, with_them))}"
+            if command
+            else f"# {group.label}: the command was not recorded"
+            for command, with_them in seeds.items()
+        ]
+    return found
 
 
 def configs(study: Study) -> list[tuple[str, str]]:
@@ -157,23 +168,11 @@ def report_command(
     return anywhere(f"{program} {shlex.join([*map(str, folders), *asked, *more])}")
 
 
-def _commands(group: Group) -> list[str]:
-    seeds: dict[str, list[int]] = {}
-    for run in group.runs:
-        seeds.setdefault(_command(run) or "", []).append(run.seed)
-    return [
-        f"{command} seed={','.join(map(str, with_them))}"
-        if command
-        else f"# {group.label}: the command was not recorded"
-        for command, with_them in seeds.items()
-    ]
-
-
-def _command(run: Run) -> str | None:
-    """What started a run, but for its seed; None where that is not known in full."""
+def _command(run: Run) -> str:
+    """What started a run, but for its seed; empty where that is not known in full."""
     overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
     if not isinstance(overrides, list) or not isinstance(arguments, dict):
-        return None
+        return ""
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
     own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
     words = [word for word in overrides if not (isinstance(word, str) and word.startswith(own))]
@@ -181,10 +180,10 @@ def _command(run: Run) -> str | None:
         isinstance(word, str) and word.isprintable() and len(word) <= LONGEST_WORD
         for word in (*words, paths or "", config or "")
     ):
-        return None
+        return ""
     # A task or curriculum of one's own that prl.train was given is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
-        return None
+        return ""
     before = [f"PYTHONPATH={shlex.quote(anywhere(paths))}"] if paths else []
     options = ["--config-dir", config, "-m"] if config else ["-m"]
     quoted = [shlex.quote(anywhere(word)) for word in [*options, *words]]

@@ -69,7 +69,7 @@ def read_progress(folder: Path) -> Progress:
 
 def find_progress(folder: Path) -> list[Progress]:
     """The states of all runs in a folder, or of the folder itself."""
-    found = [read_progress(path) for path, _ in begun(folder)]
+    found = [read_progress(path) for path in begun(folder)]
     if not found:
         raise UnreadableRun(f"{folder}: no run in it, finished or begun")
     return found

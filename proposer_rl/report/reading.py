@@ -69,15 +69,13 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     return sorted({path.resolve(): path for path in found}.values())
 
 
-def begun(folder: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Folders of runs in a folder, or itself, with names of their files; studies are left out.
-
-    Links are not followed, hidden folders not looked into.
-    """
-    return ((path, files) for path, files in _walk(folder) if STUDY not in files)
+def begun(folder: Path) -> list[Path]:
+    """Folders of runs in a folder, or itself; studies are left out."""
+    return [path for path, files in _walk(folder) if STUDY not in files]
 
 
 def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
+    """Folders with the names of their files; links are not followed, hidden ones left out."""
     if not folder.is_dir():
         raise UnreadableRun(f"{folder}: there is no such folder")
     for seen, (root, names, files) in enumerate(os.walk(folder)):
