@@ -34,11 +34,6 @@ GROUPS = {
 NEEDS, NOTHING = "Needs: ", "nothing."
 
 
-def asks_for_help(arguments: Sequence[str]) -> bool:
-    """Whether the command is to say what it does, instead of doing it."""
-    return "--help" in arguments or "-h" in arguments
-
-
 def help_text(arguments: Sequence[str]) -> str:
     """Usage, what each group has, also in a folder given with ``--config-dir``, and examples."""
     folders = [CONFIG_FOLDER, *own_folders(arguments)]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from proposer_rl.cli.arguments import number, settings_file
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import ConfigError, command
 from proposer_rl.extras import install_command
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from proposer_rl.cli.errors import ConfigError
-
     missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
     if missing:
         raise ConfigError(

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import sys
 
-from proposer_rl.cli.help import asks_for_help, help_text
+from proposer_rl.cli.help import help_text
 
 
 def main() -> None:
     """Entry point of the command."""
-    if asks_for_help(sys.argv[1:]):
+    if {"--help", "-h"} & set(sys.argv[1:]):
         try:
             print(help_text(sys.argv[1:]), flush=True)
         except BrokenPipeError:  # who reads has seen enough, as with `| head`

@@ -15,7 +15,7 @@ from proposer_rl.report.measures import TRAINED, UPDATES, Measure, Series
 from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST, HELD, median_of
 from proposer_rl.report.studies import Study
-from proposer_rl.report.style import Drawing, Look, axes_of, finish, style
+from proposer_rl.report.style import Drawing, Look, finish, style
 
 MOST_PANELS = 12
 
@@ -102,14 +102,14 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
 
 
 def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str = UPDATES) -> None:
-    axes = axes_of(figure)
+    axes = figure.subplots()
     found = [(group.look, measure.axes[axis](group)) for group in study.groups]
     means = [draw_series(axes, series, look) for look, series in found if series is not None]
     finish(axes, axis, measure.name, means, rate=measure.rate, zero=measure.kind == TRAINED)
 
 
 def _draw_bars(figure: FigureBase, study: Study) -> None:
-    axes = axes_of(figure)
+    axes = figure.subplots()
     horizon, outcome = study.horizon, waiting_outcome(study)
     needed = [(outcome.median(group), group) for group in study.compared]
     found = [(interval, group) for interval, group in needed if interval is not None]

@@ -24,7 +24,6 @@ from proposer_rl.report.style import (
     SKY,
     VERMILLION,
     Drawing,
-    axes_of,
     finish,
 )
 from proposer_rl.runs.folder import is_rate
@@ -113,7 +112,7 @@ def draw_run(folder: Path, title: str) -> Path:
         figure = Figure(figsize=(8.5, 3.2 + height), layout="constrained")
         parts = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.2, height])
         top, bottom = parts[:, 0]
-        _draw_measurements(axes_of(top), runs)
+        _draw_measurements(top.subplots(), runs)
         top.suptitle(title)
         if runs[0].samples:
             _draw_stages(bottom, runs[0].samples, runs[0].task.key)
@@ -190,7 +189,7 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
     with rc_context(SETTINGS):
         drawn = share_map(shares)
         figure = Figure(figsize=SINGLE, layout="constrained")
-        _draw_maps(figure, [axes_of(figure)], [drawn], run, drawn.max())
+        _draw_maps(figure, [figure.subplots()], [drawn], run, drawn.max())
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -117,12 +117,6 @@ def style(look: Look, points: int = 2) -> dict[str, Any]:
     }
 
 
-def axes_of(figure: FigureBase) -> Axes:
-    """The one pair of axes of a panel."""
-    axes: Axes = figure.subplots()
-    return axes
-
-
 def finish(
     axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
 ) -> None:

@@ -16,7 +16,6 @@ from proposer_rl.report.style import (
     METHODS,
     Drawing,
     Look,
-    axes_of,
     looks,
     render,
     style,
@@ -71,7 +70,7 @@ def test_looks_are_apart_by_colour_as_long_as_there_are_colours(labels: set[str]
 
 def test_a_figure_is_the_same_file_every_time() -> None:
     def draw(figure) -> None:
-        axes_of(figure).plot([0, 1], [1, 0], **style(Look("#332288", "--", "s")))
+        figure.subplots().plot([0, 1], [1, 0], **style(Look("#332288", "--", "s")))
 
     drawing = Drawing("d", "D", "", [draw], legend={"plr": Look("#332288", "--", "s")})
     one, two = (render(drawing, "svg", "png") for _ in range(2))
