@@ -15,7 +15,6 @@ from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import (
     CheckpointError,
-    State,
     checkpoint_files,
     load_checkpoint,
     load_latest,
@@ -48,13 +47,9 @@ class StoredRun(NamedTuple):
 
     def stage(self, file: Path | None = None) -> Stage:
         """The Solvers in one of the files; None for the newest that is intact."""
-        if file is not None:
-            return self._stage(*load_checkpoint(file))
-        latest = load_latest(self.files[-1].parent)
-        assert latest is not None, "there is a checkpoint"
-        return self._stage(*latest)
-
-    def _stage(self, step: int, state: State) -> Stage:
+        found = load_latest(self.files[-1].parent) if file is None else load_checkpoint(file)
+        assert found is not None, "there is a checkpoint"
+        step, state = found
         learner = self.task.learner([Streams(seed) for seed in self.config.seeds])
         try:
             learner.restore(TensorDict(state["solver"], [len(self.config.seeds)]))

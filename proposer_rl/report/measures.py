@@ -79,9 +79,8 @@ def every(study: Study) -> list[Measure]:
 
 def measured(study: Study) -> dict[str, Measure]:
     """What was measured of the Solver against updates and every cost, by its column."""
+    known = dict.fromkeys(name for run in study.runs for name in run.metrics if name not in COST)
     first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]
-    every = dict.fromkeys([*first, *(name for run in study.runs for name in run.metrics)])
-    known = {name for run in study.runs for name in run.metrics} - set(COST)
     return {
         name: Measure(
             MEASURED,
@@ -92,7 +91,7 @@ def measured(study: Study) -> dict[str, Measure]:
             },
             is_rate(name),
         )
-        for name in [name for name in every if name in known][:MOST]
+        for name in [name for name in dict.fromkeys([*first, *known]) if name in known][:MOST]
     }
 
 
