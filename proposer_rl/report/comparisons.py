@@ -89,10 +89,10 @@ def waiting_outcome(study: Study) -> Outcome:
     )
 
 
-def at_the_end(study: Study, name: str, title: str = "") -> Outcome:
+def at_the_end(study: Study, name: str) -> Outcome:
     """A measurement at the horizon."""
     value = partial(Run.at, measurement=name, updates=study.horizon)
-    return Outcome(title or f"{words(name)} after {study.horizon} updates", value)
+    return Outcome(f"{words(name)} after {study.horizon} updates", value)
 
 
 def outcomes(study: Study) -> list[Outcome]:

@@ -108,8 +108,7 @@ def group_table(study: Study) -> Table:
             **_over_levels(study, group),
         }
         if any(worst in run.metrics for run in study.runs):
-            title = f"{words(headline)}, worst 10 %"
-            row[title] = at_the_end(study, worst, title).median(whole)
+            row[f"{words(headline)}, worst 10 %"] = at_the_end(study, worst).median(whole)
         cost: dict[str, Callable[[Run], float]] = {
             "frames (M)": lambda run: run.last("frames") / MILLION,
             "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
