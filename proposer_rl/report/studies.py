@@ -305,16 +305,12 @@ def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
     """Of each configuration the values that are not the same in all."""
     keys = sorted({key for leaf in leaves for key in leaf})
     differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
-    names = _short_names(differing)
+    # Dotted keys by their last part, where no other ends in the same.
+    last = Counter(key.rpartition(".")[2] for key in differing)
+    names = {k: part if last[part := k.rpartition(".")[2]] == 1 else k for k in differing}
     return [
         ", ".join(f"{names[key]}={leaf.get(key, 'absent')}" for key in differing) for leaf in leaves
     ]
-
-
-def _short_names(keys: Sequence[str]) -> dict[str, str]:
-    """Dotted keys by their last part, where no other ends in the same."""
-    last = Counter(key.rpartition(".")[2] for key in keys)
-    return {key: part if last[part := key.rpartition(".")[2]] == 1 else key for key in keys}
 
 
 def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
