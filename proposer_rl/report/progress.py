@@ -33,7 +33,8 @@ class Progress:
         runs: its seeds; empty if it has not measured anything yet, or failed before.
         failure: why it failed, in one line; empty if it did not.
         age: seconds since something was written.
-        activity: what it was doing then, and how long the rest takes; empty if it does not say.
+        activity: what it was doing then, and how long the rest takes; empty if it does not say or
+            has failed.
     """
 
     folder: Path
@@ -61,7 +62,7 @@ def read_progress(folder: Path) -> Progress:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
             failure = printable(str(error).removeprefix(f"{folder}: "))
-    activity = _doing(folder)
+    activity = "" if failure else _doing(folder)
     if activity and runs:
         activity = ", ".join(filter(None, [activity, _left(runs[0])]))
     return Progress(folder, runs, failure, _age(folder), activity)

@@ -39,7 +39,7 @@ WIDEST_MAP = 20
 def screen(progress: Progress) -> RenderableType:
     """One run: how far it is, its curves, its last cycle, and what it trains on."""
     head = Text.assemble((progress.state, COLOURS[progress.state]), f", {_age(progress)}")
-    if progress.activity and not progress.failure:
+    if progress.activity:
         head.append(f": {progress.activity}")
     if not progress.runs:
         return Panel(Group(head, Text(progress.failure)), title=_name(progress), title_align="left")
@@ -78,7 +78,7 @@ def overview(found: Sequence[Progress]) -> RenderableType:
     going = [
         Text(f"{name}: {progress.activity}")
         for name, progress in zip(names, found, strict=True)
-        if progress.activity and not progress.failure
+        if progress.activity
     ]
     states = [progress.state for progress in found]
     counts = ", ".join(f"{states.count(state)} {state}" for state in COLOURS if state in states)
