@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
+from proposer_rl.cli.errors import UNFORESEEN, exit_code, one_line
 from proposer_rl.report.progress import find_progress
 from proposer_rl.report.reading import FAILURE
 from proposer_rl.report.terminal import overview
@@ -103,7 +104,7 @@ def forget_failure(folder: Path) -> None:
     (folder / FAILURE).unlink(missing_ok=True)
 
 
-def record_failure(folder: Path, error: Exception, message: str, exit_code: int) -> float:
+def record_failure(folder: Path, error: Exception) -> float:
     """Record in a run's folder that it failed, and say so.
 
     Of a run that another process is working on nothing is recorded: the folder is not ours.
@@ -111,10 +112,11 @@ def record_failure(folder: Path, error: Exception, message: str, exit_code: int)
     Returns:
         NaN, for the run's value.
     """
+    message, code = one_line(error, folder), exit_code(error)
     if not isinstance(error, InUseError):
-        content = {"message": message, "kind": type(error).__name__, "exit_code": exit_code}
+        content = {"message": message, "kind": type(error).__name__, "exit_code": code}
         write_atomically(folder / FAILURE, (json.dumps(content, indent=2) + "\n").encode())
-    if exit_code == 1:
+    if code == UNFORESEEN:
         traceback.print_exception(error)
     print(f"error: {message}", file=sys.stderr)
     return math.nan

@@ -84,7 +84,7 @@ def _main(hydra_config: DictConfig) -> float:
             return train(read_config(hydra_config), path, signals)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return record_failure(path, error, one_line(error, path), exit_code(error))
+            return record_failure(path, error)
         if exit_code(error) != UNFORESEEN:
             remove_traces()
             refuse(error, path)
