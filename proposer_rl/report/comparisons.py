@@ -35,14 +35,14 @@ class Outcome(NamedTuple):
     value: Callable[[Run], float]
     sign: int = 1
 
-    def known(self, group: Group) -> list[tuple[int, float]]:
-        """Seed and value of each of a group's runs that has one."""
-        found = [(run.seed, self.value(run)) for run in group.runs]
-        return [(seed, value) for seed, value in found if not math.isnan(value)]
+    def known(self, group: Group) -> dict[int, float]:
+        """The value of each of a group's runs that has one, by its seed."""
+        found = {run.seed: self.value(run) for run in group.runs}
+        return {seed: value for seed, value in found.items() if not math.isnan(value)}
 
     def values(self, group: Group) -> list[float]:
         """The known values of a group's runs."""
-        return [value for _, value in self.known(group)]
+        return list(self.known(group).values())
 
     def median(self, group: Group) -> Interval | None:
         """Their median with its interval; None without any."""
@@ -105,16 +105,14 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
     """How two groups differ by an outcome.
 
     Runs of the same seed begin with the same weights and draw the same numbers: where both groups
-    have the same seeds, each once, they are compared in pairs.
+    have the same seeds, they are compared in pairs.
     """
     return _difference(outcome.known(one), outcome.known(other))
 
 
-def _difference(*known: list[tuple[int, float]]) -> Estimate:
-    seeds, others = ([seed for seed, _ in pairs] for pairs in known)
-    paired = seeds == others and len(set(seeds)) == len(seeds)
-    a, b = ([value for _, value in pairs] for pairs in known)
-    return statistics.difference_of(a, b, paired)
+def _difference(one: Mapping[int, float], other: Mapping[int, float]) -> Estimate:
+    paired = list(one) == list(other)
+    return statistics.difference_of([*one.values()], [*other.values()], paired)
 
 
 def learnt(group: Group, name: str, updates: float) -> bool:
@@ -153,12 +151,12 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
 def _decide(
     study: Study,
     pair: tuple[Group, Group],
-    known: Mapping[str, list[tuple[int, float]]],
+    known: Mapping[str, Mapping[int, float]],
     estimate: Estimate,
     p: float,
     count: int,
 ) -> Decision:
-    values = [[value for _, value in known[group.label]] for group in pair]
+    values = [list(known[group.label].values()) for group in pair]
     runs = [len(own) for own in values]
     if min(runs) < statistics.FEWEST:
         text = f"{runs[0]} and {runs[1]} seeds, and it takes {statistics.FEWEST} of each"
