@@ -49,25 +49,14 @@ class Table:
 
     def to_csv(self) -> str:
         """The numbers behind the cells; an interval takes three columns."""
-        spread = {
-            name: any(isinstance(row[name], Interval) for row in self.rows) for name in self.columns
-        }
-        header = [
-            name + part
-            for name in spread
-            for part in (("", ", low", ", high") if spread[name] else ("",))
-        ]
-        rows = [
-            [
-                value
-                for name, cell in row.items()
-                for value in (
-                    cell if isinstance(cell, Interval) else [cell, *([None] * 2 * spread[name])]
-                )
-            ]
-            for row in self.rows
-        ]
-        return to_csv(header, rows)
+        columns: dict[str, list[Any]] = {}
+        for name in self.columns:
+            cells = [row[name] for row in self.rows]
+            columns[name] = [c.estimate if isinstance(c, Interval) else c for c in cells]
+            if any(isinstance(cell, Interval) for cell in cells):
+                for end in ("low", "high"):
+                    columns[f"{name}, {end}"] = [getattr(cell, end, None) for cell in cells]
+        return to_csv(list(columns), list(zip(*columns.values(), strict=True)))
 
 
 def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
