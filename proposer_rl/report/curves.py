@@ -13,7 +13,7 @@ from proposer_rl.report import measures
 from proposer_rl.report.comparisons import waiting_outcome
 from proposer_rl.report.measures import TRAINED, UPDATES, Measure, Series
 from proposer_rl.report.records import words
-from proposer_rl.report.statistics import FEWEST, HELD, median_of
+from proposer_rl.report.statistics import FEWEST, HELD, median_interval, median_of
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, Look, finish, style
 
@@ -111,10 +111,9 @@ def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str =
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = figure.subplots()
     horizon, outcome = study.horizon, waiting_outcome(study)
-    needed = [(outcome.median(group), group) for group in study.compared]
-    found = [(interval, group) for interval, group in needed if interval is not None]
+    # Every run that is compared has waited, if only until the horizon.
+    found = [(median_interval(outcome.values(group)), group) for group in study.compared]
     found.sort(key=lambda each: -each[0].estimate)
-    groups = [group for _, group in found]
     for place, (interval, group) in enumerate(found):
         waiting = [run.reached(study.headline, study.threshold) for run in group.runs]
         colour = group.look.colour
@@ -131,7 +130,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
             va="center",
             fontsize=8,
         )
-    axes.set_yticks(range(len(groups)), [fill(group.label, 32) for group in groups], fontsize=8)
+    axes.set_yticks(range(len(found)), [fill(group.label, 32) for _, group in found], fontsize=8)
     axes.set_xlim(0, horizon * 1.42)
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
