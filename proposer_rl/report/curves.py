@@ -66,22 +66,18 @@ def cost_curves(study: Study) -> Drawing:
 
 def difficulty(study: Study) -> Drawing | None:
     """What the Solver trained on; None where no run has statistics of it."""
-    drawn, shown = [], set()
-    for measure in measures.trained(study):
-        series = measure.axes[UPDATES]
-        if having := {group.label for group in study.groups if series(group) is not None}:
-            drawn.append(partial(_draw_curves, study=study, measure=measure))
-            shown |= having
-    if not drawn:
+    every = measures.trained(study)
+    shown = [g for g in study.groups if any(each.axes[UPDATES](g) is not None for each in every)]
+    if not shown:
         return None
     return Drawing(
         "difficulty",
         "What the Solver trained on",
         "Statistics of the task over the batch of each evaluated update: means, or where a name "
         "says so standard deviations (sd). Lines and bands as above.",
-        drawn,
+        [partial(_draw_curves, study=study, measure=measure) for measure in every],
         3,
-        {label: look for label, look in study.legend.items() if label in shown},
+        {group.label: group.look for group in shown},
     )
 
 

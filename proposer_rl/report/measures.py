@@ -124,8 +124,7 @@ def gains(study: Study) -> list[Measure]:
 
 def own_numbers(study: Study) -> list[Measure]:
     """Whatever numbers the curricula recorded in cycles that are not drawn elsewhere."""
-    groups = [group for group in study.groups if group.logs]
-    cycles = [cycle for group in groups for run in group.logs for cycle in run.cycles]
+    cycles = [cycle for group in study.groups for run in group.logs for cycle in run.cycles]
     found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
     names = {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}
     texts = {name: text for name, text in OWN.items() if name in names}
@@ -133,7 +132,7 @@ def own_numbers(study: Study) -> list[Measure]:
     own = [
         _of_cycles(text, partial(_value, name=name)) for name, text in list(texts.items())[:MOST]
     ]
-    if any(map(recorded_gain, groups)):
+    if any(map(recorded_gain, study.groups)):
         ratio = partial(of_gains, names=GAINS, reduce=_ratio)
         own.append(_of_cycles("total gain: mean / sd of replicas", ratio))
     return own
