@@ -112,12 +112,12 @@ class Study:
     @cached_property
     def compared(self) -> list[Group]:
         """Groups with those of their runs that are as long as the horizon, up to it."""
-        long = [[run for run in group.runs if run.updates >= self.horizon] for group in self.groups]
-        return [
-            replace(group, runs=tuple(run.until(self.horizon) for run in runs))
-            for group, runs in zip(self.groups, long, strict=True)
-            if runs
-        ]
+        found = []
+        for group in self.groups:
+            long = [run for run in group.runs if run.updates >= self.horizon]
+            if long:
+                found.append(replace(group, runs=tuple(run.until(self.horizon) for run in long)))
+        return found
 
     @property
     def legend(self) -> dict[str, Look]:
@@ -127,8 +127,7 @@ class Study:
     @property
     def baseline(self) -> Group:
         """What the others are measured against: the chosen one, the usual one, or the first."""
-        found = (self.group(label) for label in (self.chosen, USUAL_BASELINE) if label)
-        return next((group for group in found if group is not None), self.compared[0])
+        return self.group(self.chosen or "") or self.group(USUAL_BASELINE) or self.compared[0]
 
     def scores(self, group: Group, name: str) -> Column | None:
         """What a group's runs of full length reach on each level, [runs, levels]; else None."""
