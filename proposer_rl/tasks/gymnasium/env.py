@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,10 +21,11 @@ from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.processes import ProcessVectorEnv
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step
-from proposer_rl.tasks.gymnasium.spaces import NUMBERS, Seen, boxes_of
+from proposer_rl.tasks.gymnasium.spaces import NUMBERS
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
+FLAGS = ("success", "is_init")  # entries that no Solver sees
 
 
 class GymnasiumEnv(EnvBase):
@@ -133,18 +134,18 @@ class GymnasiumEnv(EnvBase):
     def _make_specs(self) -> None:
         batch = self.batch_size
         acts = self._vector.single_action_space
-        boxes = boxes_of(cast(Seen, self._vector.single_observation_space))
-        flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        seen = self._vector.single_observation_space
+        boxes = seen.spaces if isinstance(seen, spaces.Dict) else {NUMBERS: seen}
         observed = {
             name: Unbounded(
-                (*batch, *box.shape),
+                (*batch, *(box.shape or ())),
                 dtype=torch.uint8 if box.dtype == np.uint8 else torch.float32,
             )
             for name, box in boxes.items()
         }
-        self.observation_spec = Composite(
-            **observed, success=flag, is_init=flag.clone(), shape=batch
-        ).to(self.device)
+        flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        flags = {name: flag.clone() for name in FLAGS}
+        self.observation_spec = Composite({**observed, **flags}, shape=batch).to(self.device)
         if isinstance(acts, spaces.Discrete):
             self.action_spec = Categorical(int(acts.n), shape=batch)
         elif isinstance(acts, spaces.MultiDiscrete):

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
-from gymnasium import spaces
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.modules import MLP
 
 from proposer_rl.models import MemoryNetwork, orthogonal_
 from proposer_rl.models.stacked import StackedLinear
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
-from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, channels_first
+from proposer_rl.tasks.gymnasium.spaces import channels_first
 
 SMALL_MAP = 8  # pixels along its shorter side at most: no more is halved
 LARGE_MAP = 36  # pixels along it, from which on the strides are those for screens
@@ -31,19 +30,21 @@ class SolverNetwork(nn.Module):
     """Policy and critic: two MLPs of numbers, and of images after convolutions that they share.
 
     Args:
-        seen: boxes of what is seen: numbers [D] or images of three axes.
-        acts: one of n actions, several of n each, or D numbers, whose policy is normal, with a
-            scale that is learnt and does not depend on what is seen.
+        seen: specs of what is seen, without a batch: numbers [D] or images of three axes.
+        acts: spec of one of n actions, of several of n each, or of D numbers, whose policy is
+            normal, with a scale that is learnt and does not depend on what is seen.
         settings: widths, and the observations' scale.
     """
 
-    def __init__(self, seen: Seen, acts: Acts, settings: NetworkSettings) -> None:
+    def __init__(
+        self, seen: Sequence[TensorSpec], acts: TensorSpec, settings: NetworkSettings
+    ) -> None:
         super().__init__()
         self.encoder = Encoder(seen, settings)
-        features = self.encoder.features
-        self.policy = _mlp(features, outputs(acts), settings.hidden, POLICY_GAIN)
+        features, actions = self.encoder.features, Actions(acts)
+        self.policy = _mlp(features, actions.numbers, settings.hidden, POLICY_GAIN)
         self.critic = _mlp(features, 1, settings.hidden, 1.0)
-        self.actions = Actions(acts)
+        self.actions = actions
         self.stackable = not self.encoder.convolutions
 
     def forward(self, *observed: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,43 +53,36 @@ class SolverNetwork(nn.Module):
         return self.actions(self.policy(features)), self.critic(features)
 
 
-def memory_network(seen: Seen, acts: Acts, settings: NetworkSettings) -> MemoryNetwork:
+def memory_network(
+    seen: Sequence[TensorSpec], acts: TensorSpec, settings: NetworkSettings
+) -> MemoryNetwork:
     """The same with memory: numbers and images, then an LSTM, then one hidden layer each."""
     assert settings.memory is not None
-    encoder = Encoder(seen, settings)
+    encoder, actions = Encoder(seen, settings), Actions(acts)
     network = MemoryNetwork(
         encoder,
         encoder.features,
-        outputs(acts),
+        actions.numbers,
         memory=settings.memory,
         head=settings.hidden[-1],
     )
-    network.policy.append(Actions(acts))
+    network.policy.append(actions)
     return network
 
 
 class Encoder(nn.Module):
-    """Features of what is seen: numbers as they are, images through convolutions.
+    """F ``features`` of what is seen: numbers as they are, images through convolutions."""
 
-    Args:
-        seen: as of :class:`SolverNetwork`.
-        settings: widths, and the observations' scale.
-
-    Attributes:
-        features: number F of features.
-    """
-
-    def __init__(self, seen: Seen, settings: NetworkSettings) -> None:
+    def __init__(self, seen: Sequence[TensorSpec], settings: NetworkSettings) -> None:
         super().__init__()
-        boxes = boxes_of(seen).values()
         self._scales = [
-            settings.scale or (1 / 255 if box.dtype == np.uint8 else 1.0) for box in boxes
+            settings.scale or (1 / 255 if spec.dtype == torch.uint8 else 1.0) for spec in seen
         ]
         self.convolutions = nn.ModuleList()
         self._first: list[bool | None] = []  # whether an image's channels are; None of numbers
         self.features = 0
-        for box in boxes:
-            shape = box.shape
+        for spec in seen:
+            shape = spec.shape
             first = None
             if len(shape) == 3:
                 first = settings.image == "CHW" if settings.image else channels_first(shape)
@@ -96,7 +90,7 @@ class Encoder(nn.Module):
                 layers = _convolutions(channels, min(height, width), settings.channels)
                 orthogonal_(layers)
                 self.convolutions.append(layers)
-                shape = tuple(layers(torch.zeros(1, channels, height, width)).shape[1:])
+                shape = layers(torch.zeros(1, channels, height, width)).shape[1:]
             self._first.append(first)
             self.features += shape[0]
 
@@ -119,41 +113,34 @@ class Actions(nn.Module):
     Of one of n actions [*B, n]; of D choices among at most n each [*B, D, n]; of D numbers their
     locations and log-scales [*B, D, 2].
 
-    Args:
-        acts: the actions.
+    Attributes:
+        numbers: how many a policy has to give, O.
     """
 
-    def __init__(self, acts: Acts) -> None:
+    def __init__(self, acts: TensorSpec) -> None:
         super().__init__()
-        self._choices = options(acts)
-        self._one = isinstance(acts, spaces.Discrete)
-        if self._choices is None:
-            self.log_scale = nn.Parameter(torch.full((outputs(acts),), FIRST_LOG_SCALE))
+        self._choices: list[int] | None = None
+        self.log_scale: nn.Parameter | None = None
+        if isinstance(acts, MultiCategorical):  # which is a Categorical, too
+            self._choices = acts.nvec.tolist()
+            self.numbers = sum(self._choices)
+        elif isinstance(acts, Categorical):
+            self.numbers = int(acts.n)
+        else:
+            self.numbers = acts.shape.numel()
+            self.log_scale = nn.Parameter(torch.full((self.numbers,), FIRST_LOG_SCALE))
 
     def forward(self, numbers: Tensor) -> Tensor:
         """Logits of numbers."""
-        if self._choices is None:
+        if self.log_scale is not None:
             between = [1] * (numbers.ndim - self.log_scale.ndim)
             scale = self.log_scale.unflatten(-1, (*between, -1))  # [K, D] of stacked replicas
             return torch.stack([numbers, scale.expand_as(numbers)], -1)
-        if self._one:
+        if self._choices is None:
             return numbers
         most = max(self._choices)
         parts = numbers.split(self._choices, -1)
         return torch.stack([F.pad(p, (0, most - p.shape[-1]), value=NEVER) for p in parts], -2)
-
-
-def options(acts: Acts) -> list[int] | None:
-    """How many actions there are to choose from, of each choice; None of continuous ones."""
-    if isinstance(acts, spaces.Discrete):
-        return [int(acts.n)]
-    return acts.nvec.tolist() if isinstance(acts, spaces.MultiDiscrete) else None
-
-
-def outputs(acts: Acts) -> int:
-    """Numbers that a policy has to give."""
-    choices = options(acts)
-    return int(np.prod(acts.shape or ())) if choices is None else sum(choices)
 
 
 def _convolutions(channels: int, side: int, widths: Sequence[int] | None) -> nn.Sequential:

@@ -8,22 +8,17 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
-from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec
 
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
 
-Seen = spaces.Box | spaces.Dict
-Acts = spaces.Discrete | spaces.MultiDiscrete | spaces.Box
 Array = NDArray[Any]
 Change = tuple[Callable[[Any], Any], spaces.Space[Any]]
 
 UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
 IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
-FLAGS = ("success", "is_init")  # entries that no Solver sees
 NUMBERS = "observation"  # the entry of all numbers, or of the only image
 
 
@@ -104,29 +99,6 @@ def _space_of(images: Mapping[str, spaces.Box], rest: spaces.Dict) -> spaces.Spa
     if rest.spaces:
         new[NUMBERS] = spaces.flatten_space(rest)
     return spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
-
-
-def boxes_of(seen: Seen) -> dict[str, spaces.Box]:
-    """The boxes of plain observations, by their entries' names."""
-    if isinstance(seen, spaces.Box):
-        return {NUMBERS: seen}
-    return {name: cast(spaces.Box, box) for name, box in seen.spaces.items()}
-
-
-def spaces_of(seen: Composite, acts: TensorSpec) -> tuple[Seen, Acts]:
-    """Plain spaces of TorchRL's specs without a batch, which transforms may have changed."""
-    boxes: dict[str, spaces.Space[Any]] = {}
-    for name, spec in seen.items():
-        if name in FLAGS:
-            continue
-        bytes_ = spec.dtype == torch.uint8
-        low, high, kind = (0, 255, np.uint8) if bytes_ else (-np.inf, np.inf, np.float32)
-        boxes[str(name)] = spaces.Box(low, high, tuple(spec.shape), kind)
-    if isinstance(acts, MultiCategorical):  # which is a Categorical, too
-        return spaces.Dict(boxes), spaces.MultiDiscrete(acts.nvec.cpu().numpy())
-    if isinstance(acts, Categorical):
-        return spaces.Dict(boxes), spaces.Discrete(int(acts.n))
-    return spaces.Dict(boxes), spaces.Box(-np.inf, np.inf, tuple(acts.shape))
 
 
 def is_image(space: spaces.Space[Any]) -> bool:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
 from proposer_rl.extras import install_command
@@ -26,7 +27,7 @@ from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task, distribution_of
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization, plays
+from proposer_rl.tasks.gymnasium.env import FLAGS, GymnasiumEnv, Vectorization, plays
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork, memory_network
 from proposer_rl.tasks.gymnasium.pictures import KEY, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment, told
@@ -37,7 +38,6 @@ from proposer_rl.tasks.gymnasium.settings import (
     SuccessSettings,
     WrapperSettings,
 )
-from proposer_rl.tasks.gymnasium.spaces import Acts, Seen, boxes_of, spaces_of
 from proposer_rl.tasks.gymnasium.trial import tried
 from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
 from proposer_rl.tasks.ranges import spaces
@@ -132,9 +132,9 @@ class GymnasiumTask(Task):
         first = self.evaluated_on["target"][:1]
         with _named(env_id, extra):
             self.max_steps = tried(self._make, parameters, space.bins, plays(first)[0], success)
-        self._seen, self._acts = self._spaces(first)
+        self._seen, self._acts = self._specs(first)
         # MLPs as small as these are faster all at once.
-        small = all(len(box.shape) == 1 for box in boxes_of(self._seen).values())
+        small = all(spec.ndim == 1 for spec in self._seen.values())
         self.batched = True if small and network.memory is None else None
         self._measured = {
             "environment": [env_id, arguments, list(wrappers), [repr(t) for t in transforms or []]],
@@ -187,11 +187,11 @@ class GymnasiumTask(Task):
     def network(self) -> nn.Module:
         """The network of one Solver, by what the environment shows and takes."""
         make = SolverNetwork if self._network.memory is None else memory_network
-        return make(self._seen, self._acts, self._network)
+        return make(list(self._seen.values()), self._acts, self._network)
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
         """K networks, with memory or without."""
-        seen, memory = list(boxes_of(self._seen)), self._network.memory
+        seen, memory = list(self._seen), self._network.memory
         distribution = distribution_of(env.full_action_spec["action"])
         if memory is not None:
             return memory_actor_critic(population, seen, memory, distribution_class=distribution)
@@ -238,23 +238,24 @@ class GymnasiumTask(Task):
         )
         return TransformedEnv(env, Compose(*map(_copied, transforms))) if transforms else env
 
-    def _spaces(self, level: TensorDictBase) -> tuple[Seen, Acts]:
-        """What Solvers see and do, after the transforms; the network is tried on them.
+    def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
+        """Of what Solvers see and do, after the transforms; the network is tried on them.
 
         Raises:
             ValueError: naming the key, where there is no network for them.
         """
         try:
             env = self._env(level, self._transforms)
-            seen, acts = spaces_of(env.observation_spec[0], env.full_action_spec["action"][0])
+            shown, acts = env.observation_spec[0], env.full_action_spec["action"][0]
             env.close()
-            SolverNetwork(seen, acts, self._network)
+            seen = {name: spec for name, spec in shown.items() if name not in FLAGS}
+            SolverNetwork(list(seen.values()), acts, self._network)
         except (RuntimeError, KeyError) as error:
             kind = "transforms" if self._transforms else "network"
             raise ValueError(f"{kind}: {told(error)}") from error
         for name in ("channels", "image"):
             given = getattr(self._network, name)
-            if given is not None and all(len(box.shape) == 1 for box in boxes_of(seen).values()):
+            if given is not None and all(spec.ndim == 1 for spec in seen.values()):
                 raise ValueError(f"network.{name}={given}: is of images, of which none is seen")
         return seen, acts
 

@@ -9,11 +9,11 @@ from typing import Annotated
 import numpy as np
 import torch
 from annotated_types import Ge
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl.data import Unbounded
 
 from proposer_rl.learning import in_first_episode
 from proposer_rl.learning.settings import SolverSettings
@@ -102,8 +102,7 @@ class PointMassTask(Task):
 
     def network(self) -> nn.Module:
         """Two MLPs, of the policy and of the critic."""
-        seen = Box(-np.inf, np.inf, (4 + len(LEVEL),))
-        return SolverNetwork(seen, Box(-np.inf, np.inf, (2,)), self._network)
+        return SolverNetwork([Unbounded(4 + len(LEVEL))], Unbounded(2), self._network)
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None

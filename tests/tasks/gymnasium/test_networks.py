@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.models import Population, draw, joint_categorical, normal
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
-from proposer_rl.tasks.gymnasium.spaces import boxes_of, plain
+from proposer_rl.tasks.gymnasium.spaces import plain
 from tests.tasks.gymnasium.odd import Mixed
 
 SETTINGS = NetworkSettings(hidden=[16, 8], channels=[4, 6])
-NUMBERS = spaces.Box(-1, 1, (5,))
-FOUR = spaces.Discrete(4)
-TWO = spaces.Box(-1, 1, (2,))
+NUMBERS, FOUR, TWO = Unbounded(5), Categorical(4), Unbounded(2)
 
 
-def images(side: int) -> spaces.Box:
-    return spaces.Box(0, 255, (side, side + 1, 3), np.uint8)
+def images(side: int) -> TensorSpec:
+    return Unbounded((side, side + 1, 3), dtype=torch.uint8)
 
 
-@pytest.mark.parametrize("seen", [NUMBERS, images(7), images(40)], ids=str)
+@pytest.mark.parametrize("seen", [NUMBERS, images(7), images(40)])
 @pytest.mark.parametrize(("acts", "shape"), [(FOUR, (4,)), (TWO, (2, 2))])
 def test_any_batch_goes_in(seen: Any, acts: Any, shape: tuple[int, ...]) -> None:
-    network = SolverNetwork(seen, acts, SETTINGS)
-    one = torch.as_tensor(np.stack([seen.sample() for _ in range(6)]))
+    network, one = SolverNetwork([seen], acts, SETTINGS), seen.rand([6])
     logits, value = network(one)
     assert logits.shape == (6, *shape) and value.shape == (6, 1)
     both = network(one.unflatten(0, (2, 3)))
@@ -38,16 +36,16 @@ def test_any_batch_goes_in(seen: Any, acts: Any, shape: tuple[int, ...]) -> None
     torch.testing.assert_close(both[1].flatten(0, 1), value)
 
 
-@pytest.mark.parametrize("seen", [NUMBERS, images(9)], ids=str)
+@pytest.mark.parametrize("seen", [NUMBERS, images(9)])
 @pytest.mark.parametrize("batched", [True, False])
 def test_copies_are_networks_of_their_own(seen: Any, batched: bool) -> None:
-    alone = [SolverNetwork(seen, TWO, SETTINGS) for _ in range(3)]
-    made = iter([SolverNetwork(seen, TWO, SETTINGS) for _ in range(3)])
+    alone = [SolverNetwork([seen], TWO, SETTINGS) for _ in range(3)]
+    made = iter([SolverNetwork([seen], TWO, SETTINGS) for _ in range(3)])
     population = Population(lambda: next(made), 3, batched=batched)
     for index, name in enumerate(population.names):
         for copy, network in enumerate(alone):
             population.stacked[index].data[copy] = dict(network.named_parameters())[name]
-    observed = torch.as_tensor(np.stack([seen.sample() for _ in range(12)])).unflatten(0, (3, 4))
+    observed = seen.rand([3, 4])
     for copy, network in enumerate(alone):
         for ours, its in zip(population(observed), network(observed[copy]), strict=True):
             torch.testing.assert_close(ours[copy], its, atol=1e-5, rtol=1e-5)
@@ -55,33 +53,31 @@ def test_copies_are_networks_of_their_own(seen: Any, batched: bool) -> None:
 
 def test_bytes_are_scaled_and_numbers_are_not() -> None:
     black, white = torch.zeros(1, 7, 8, 3, dtype=torch.uint8), torch.full((1, 7, 8, 3), 255)
-    network = SolverNetwork(images(7), FOUR, SETTINGS)
-    scaled = SolverNetwork(
-        spaces.Box(0, 1, (7, 8, 3)), FOUR, NetworkSettings(hidden=[16, 8], channels=[4, 6])
-    )
+    network = SolverNetwork([images(7)], FOUR, SETTINGS)
+    scaled = SolverNetwork([Unbounded((7, 8, 3))], FOUR, SETTINGS)
     scaled.load_state_dict(network.state_dict())
     torch.testing.assert_close(network(white)[1], scaled(torch.ones(1, 7, 8, 3))[1])
     torch.testing.assert_close(network(black)[1], scaled(torch.zeros(1, 7, 8, 3))[1])
-    half = SolverNetwork(NUMBERS, FOUR, NetworkSettings(hidden=[8], scale=0.5))
-    whole = SolverNetwork(NUMBERS, FOUR, NetworkSettings(hidden=[8]))
+    half = SolverNetwork([NUMBERS], FOUR, NetworkSettings(hidden=[8], scale=0.5))
+    whole = SolverNetwork([NUMBERS], FOUR, NetworkSettings(hidden=[8]))
     whole.load_state_dict(half.state_dict())
     seen = torch.rand(3, 5)
     torch.testing.assert_close(half(seen)[0], whole(seen / 2)[0])
 
 
 def test_the_first_policies_are_wide() -> None:
-    seen = torch.as_tensor(np.stack([NUMBERS.sample() for _ in range(50)]))
-    even = SolverNetwork(NUMBERS, FOUR, SETTINGS)(seen)[0].softmax(-1)
+    seen = 2 * torch.rand(50, 5) - 1
+    even = SolverNetwork([NUMBERS], FOUR, SETTINGS)(seen)[0].softmax(-1)
     assert ((even - 0.25).abs() < 0.02).all()
-    distribution = normal(SolverNetwork(NUMBERS, TWO, SETTINGS)(seen)[0])
+    distribution = normal(SolverNetwork([NUMBERS], TWO, SETTINGS)(seen)[0])
     drawn = draw(distribution, torch.rand(50, 2))
     assert drawn.shape == (50, 2) and 0.4 < drawn.std() < 0.8
 
 
 def test_of_several_choices_none_is_drawn_that_there_is_not() -> None:
     """Each has as many options as it has; together they are one action."""
-    acts = spaces.MultiDiscrete([2, 5, 3])
-    logits, _ = SolverNetwork(NUMBERS, acts, SETTINGS)(torch.rand(4000, 5))
+    acts = MultiCategorical([2, 5, 3])
+    logits, _ = SolverNetwork([NUMBERS], acts, SETTINGS)(torch.rand(4000, 5))
     distribution = joint_categorical(logits)
     drawn = draw(distribution, torch.rand(4000, 3))
     assert [set(column.tolist()) for column in drawn.T] == [{0, 1}, set(range(5)), {0, 1, 2}]
@@ -105,12 +101,12 @@ def test_of_several_choices_none_is_drawn_that_there_is_not() -> None:
 )  # fmt: skip
 def test_images_have_their_channels_where_they_are(shape: Any, setting: Any, channels: int) -> None:
     """Where they are decides what a convolution reads: its numbers are those of the one beside."""
-    seen = spaces.Box(0, 255, shape, np.uint8)
+    seen = Unbounded(shape, dtype=torch.uint8)
     settings = NetworkSettings(hidden=[8], channels=[4], image=setting)
-    network = SolverNetwork(seen, FOUR, settings)
+    network = SolverNetwork([seen], FOUR, settings)
     first = network.encoder.convolutions[0][0]
     assert first.in_channels == channels
-    image = torch.as_tensor(seen.sample())
+    image = seen.rand()
     moved = image if shape.index(channels) == 0 else image.movedim(-1, 0)
     expected = network.encoder.convolutions[0](moved[None].float() / 255)
     torch.testing.assert_close(network.encoder(image[None]), expected)
@@ -118,7 +114,7 @@ def test_images_have_their_channels_where_they_are(shape: Any, setting: Any, cha
 
 def test_an_image_that_does_not_tell_its_channels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"images \[9, 9, 9\].*network.image=HWC or CHW"):
-        SolverNetwork(spaces.Box(0, 255, (9, 9, 9), np.uint8), FOUR, SETTINGS)
+        SolverNetwork([Unbounded((9, 9, 9), dtype=torch.uint8)], FOUR, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +133,8 @@ def test_what_is_seen_becomes_numbers_and_images(space: Any, shapes: Any) -> Non
     env: Any = gymnasium.make("Mixed-v0")
     env.unwrapped.observation_space = space
     made = plain(env)
-    boxes = boxes_of(cast(Any, made.observation_space))
+    shown: Any = made.observation_space
+    boxes = shown.spaces if isinstance(shown, spaces.Dict) else {"observation": shown}
     assert {name: box.shape for name, box in boxes.items()} == shapes
     seen = space.sample()
     env.unwrapped.seen = lambda: seen

@@ -40,7 +40,6 @@ from proposer_rl.tasks.gymnasium.settings import (
     ParameterSettings,
     SuccessSettings,
 )
-from proposer_rl.tasks.gymnasium.spaces import boxes_of
 from tests.tasks.gymnasium.odd import (
     LIMIT,
     Line,
@@ -580,7 +579,7 @@ def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
     task = line_task(paid, success=SuccessSettings(kind="survived"), transforms=transforms)
     levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
     shown = [
-        env.rollout(3)["next"].select(*boxes_of(task._seen))
+        env.rollout(3)["next"].select(*task._seen)
         for env in (task.environment(levels), task.evaluation_environment(levels))
     ]
     assert (shown[0] == shown[1]).all()
