@@ -271,14 +271,12 @@ def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
     return partial(imported(name), **arguments)
 
 
-def imported(name: str | None) -> Callable[..., Any]:
+def imported(name: str) -> Callable[..., Any]:
     """What a dotted name stands for.
 
     Raises:
         ValueError: if there is no such thing.
     """
-    if name is None:
-        raise ValueError("missing: which function, as module.name")
     module, _, last = name.rpartition(".")
     try:
         result = getattr(import_module(module), last)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
 
+from proposer_rl.task import named
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
 from proposer_rl.tasks.gymnasium.attributes import read
 from proposer_rl.tasks.gymnasium.pictures import Camera
@@ -65,7 +65,9 @@ def tried(
     _check_places(parameters)
     _check_functions(make, parameters)
     _check_wrappers(make, parameters, target)
-    _ask_gymnasium(replace(make, wrappers=[], as_it_is=True, check=True), parameters, target)
+    # Gymnasium's own checker sees the beginning of an episode; it warns for the most part.
+    watched = replace(make, wrappers=[], as_it_is=True, check=True)
+    list(_played(LevelPlayer(watched, parameters, target), 1))
     player = LevelPlayer(make, parameters, target, success)
     limit = make.limit(player)
     if not limit:
@@ -73,9 +75,9 @@ def tried(
     _check_kinds(player, parameters, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
-        ends = [{**target.values, name: end} for end in (part.low[0].item(), part.high[-1].item())]
-        plays = [Play(values, target.seed) for values in ends]
-        _check_ends(player, name, plays, partial(_look_alike, make, parameters, plays))
+        ends = part.low[0].item(), part.high[-1].item()
+        plays = [target._replace(values={**target.values, name: end}) for end in ends]
+        _check_ends(player, make, parameters, name, plays)
     player.close()
     return limit
 
@@ -102,20 +104,15 @@ def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
 
 
 def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
-    functions: list[tuple[str, partial[Any]]] = [
-        ("wrappers", partial(wrapper_of, one)) for one in make.wrappers
-    ]
-    functions += [
-        (f"parameters.{name}.name", partial(imported, path if given.name else None))
-        for name, given in parameters.items()
-        if given.set == "call"
-        for path in given.names(name)
-    ]
-    for key, find in functions:
-        try:
-            find()
-        except ValueError as error:
-            raise ValueError(f"{key}: {error}") from error
+    for wrapper in make.wrappers:
+        named("wrappers", wrapper_of, wrapper)
+    for name, given in parameters.items():
+        if given.set != "call":
+            continue
+        if given.name is None:
+            raise ValueError(f"parameters.{name}.name: missing: which function, as module.name")
+        for path in given.names(name):
+            named(f"parameters.{name}.name", imported, path)
 
 
 def _check_wrappers(
@@ -126,7 +123,8 @@ def _check_wrappers(
         some = replace(make, wrappers=make.wrappers[:count], as_it_is=True)
         try:
             player = LevelPlayer(some, parameters, play)
-            _check_spaces(player)
+            check_observation_space(player.observation_space)
+            check_action_space(player.action_space)
             if count == len(make.wrappers):
                 _tell_misleading(player.observation_space)
             first, second = (list(_played(player, SHORT)) for _ in range(2))
@@ -155,13 +153,6 @@ def _check_wrappers(
             stacklevel=2,
         )
         return
-
-
-def _ask_gymnasium(
-    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
-) -> None:
-    """Let Gymnasium's own checker see the beginning of an episode; it warns for the most part."""
-    list(_played(LevelPlayer(make, parameters, play), 1))
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
@@ -220,7 +211,11 @@ def _check_kinds(
 
 
 def _check_ends(
-    player: LevelPlayer, name: str, ends: list[Play], look_alike: Callable[[], bool]
+    player: LevelPlayer,
+    make: MakeEnvironment,
+    parameters: Mapping[str, ParameterSettings],
+    name: str,
+    ends: list[Play],
 ) -> None:
     """Set both ends of a parameter, see that they are there and stay, and that they matter.
 
@@ -246,7 +241,7 @@ def _check_ends(
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
     first, last = (play.values[name] for play in ends)
-    if first != last and _alike(*episodes) and look_alike():
+    if first != last and _alike(*episodes) and _look_alike(make, parameters, ends):
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
             "same to the last digit; does it arrive?",
@@ -301,14 +296,6 @@ def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
         return space.sample()
     drawn = numbers.normal(size=space.shape).clip(space.low, space.high)
     return drawn.astype(space.dtype)
-
-
-def _check_spaces(player: LevelPlayer) -> None:
-    for space, check in (
-        (player.observation_space, check_observation_space),
-        (player.action_space, check_action_space),
-    ):
-        check(space)
 
 
 def _tell_misleading(space: spaces.Space[Any]) -> None:
