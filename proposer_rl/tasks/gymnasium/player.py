@@ -144,9 +144,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             for name, settings in parameters.items()
             for path in settings.names(name)
         ]
-        self._arguments = self._named("argument", play)
-        super().__init__(self._built(play))
         self.play = play
+        super().__init__(self._built())
         self.told: Mapping[str, Any] = {}
 
     @property
@@ -173,7 +172,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self._seen, {}
         self._played, self._return = True, 0.0
         self._set_up()
-        given = self._named("option", self._play)
+        given = self._named("option")
         try:
             self._seen, self.told = self.env.reset(
                 seed=self._play.seed, **({"options": given} if given else {})
@@ -181,7 +180,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         except UnfitEnvironmentError:
             raise
         except Exception as error:
-            raise self._refused(self._play, error) from error
+            raise self._refused(error) from error
         return self._seen, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -214,10 +213,9 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return None
 
     def _set_up(self) -> None:
-        arguments = self._named("argument", self._play)
-        if arguments != self._arguments:
+        if self._named("argument") != self._arguments:
             self.env.close()
-            self.env, self._arguments = self._built(self._play), arguments
+            self.env = self._built()
         inner = self.env.unwrapped
         for name, how, path in self._ways:
             value = self._play.values[name]
@@ -230,26 +228,28 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                 try:
                     imported(path)(inner, value)
                 except Exception as error:
-                    raise self._refused(self._play, error) from error
+                    raise self._refused(error) from error
 
-    def _built(self, play: Play) -> gymnasium.Env[Any, Any]:
-        arguments = self._named("argument", play)
+    def _built(self) -> gymnasium.Env[Any, Any]:
+        self._arguments = self._named("argument")
         try:
-            env = self._make(**arguments)
+            return self._make(**self._arguments)
         except (ImportError, gymnasium.error.Error, WrapperError, UnfitEnvironmentError):
             raise
         except Exception as error:
-            if arguments:
-                raise self._refused(play, error) from error
+            if self._arguments:
+                raise self._refused(error) from error
             raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
-        return env
 
-    def _named(self, way: str, play: Play) -> dict[str, float]:
+    def _named(self, way: str) -> dict[str, float]:
         """The values that get into the environment in one way, by the names they have there."""
-        return {name: play.values[parameter] for parameter, how, name in self._ways if how == way}
+        values = self._play.values
+        return {name: values[parameter] for parameter, how, name in self._ways if how == way}
 
-    def _refused(self, play: Play, error: Exception) -> RefusedLevelError:
-        return RefusedLevelError(f"parameters: {self._make.env_id} refuses {play}: {told(error)}")
+    def _refused(self, error: Exception) -> RefusedLevelError:
+        return RefusedLevelError(
+            f"parameters: {self._make.env_id} refuses {self._play}: {told(error)}"
+        )
 
 
 def _wrappers(env: Any) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
