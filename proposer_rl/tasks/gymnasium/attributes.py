@@ -28,7 +28,8 @@ def read(environment: Any, path: str) -> Any:
     place = environment
     for name in path.split("."):
         try:
-            place = _part(place, name)
+            key = _key(place, name)
+            place = getattr(place, name) if key is None else place[key]
         except (AttributeError, LookupError, TypeError, ValueError) as error:
             raise AttributeRefusedError(
                 f"{type(environment).__name__} has no attribute {path!r}; numbers that it has: "
@@ -52,9 +53,13 @@ def write(environment: Any, path: str, value: float) -> None:
     within, _, last = path.rpartition(".")
     holder = read(environment, within) if within else environment
     new = _alike(before, value, path)
+    key = _key(holder, last)
     try:
-        shadows = _shadows(holder, last)
-        _set_part(holder, last, new)
+        shadows = key is None and _shadows(holder, last)
+        if key is None:
+            setattr(holder, last, new)
+        else:
+            holder[key] = new
     except Exception as error:  # a setter may raise anything
         reason = " ".join(str(error).split())
         raise AttributeRefusedError(
@@ -102,33 +107,17 @@ def _alike(before: Any, value: float, path: str) -> Any:
     raise AttributeRefusedError(f"{path} is no number but a {type(before).__name__}")
 
 
-def _part(holder: Any, name: str) -> Any:
-    if isinstance(holder, Mapping):
-        return holder[_key(holder, name)]
-    return holder[int(name)] if _is_index(name) else getattr(holder, name)
-
-
-def _set_part(holder: Any, name: str, value: Any) -> None:
-    if isinstance(holder, Mapping):
-        holder[_key(holder, name)] = value  # type: ignore[index]
-    elif _is_index(name):
-        holder[int(name)] = value
-    else:
-        setattr(holder, name, value)
-
-
-def _key(holder: Mapping[Any, Any], name: str) -> Any:
-    return int(name) if name not in holder and _is_index(name) else name
-
-
-def _is_index(name: str) -> bool:
-    return name.removeprefix("-").isdecimal()
+def _key(holder: Any, name: str) -> str | int | None:
+    """The key or index of an item by its name; None for an attribute."""
+    if isinstance(holder, Mapping) and name in holder:
+        return name
+    if name.removeprefix("-").isdecimal():
+        return int(name)
+    return name if isinstance(holder, Mapping) else None
 
 
 def _shadows(holder: Any, name: str) -> bool:
     """Whether an attribute is none of the object's own: it looks it up elsewhere."""
-    if isinstance(holder, Mapping) or _is_index(name):
-        return False
     try:
         inspect.getattr_static(holder, name)
     except AttributeError:
