@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -189,7 +190,7 @@ class ParameterSpace:
         self.bins, self._seeded, self._seeds = dict(bins), seeded, seeds
         self._device = torch.device(device)
         self.axes = {name: part.middles for name, part in self.bins.items()}
-        self.size = reduce(lambda count, values: count * len(values), self.axes.values(), 1)
+        self.size = math.prod(len(values) for values in self.axes.values())
         if self.size > MOST_COMBINATIONS:
             raise ValueError(
                 f"parameters: {self.size:,} combinations of their bins, more than can be numbered; "
@@ -228,8 +229,7 @@ class ParameterSpace:
         return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts, none).float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
-        sizes = [len(values) for values in self.axes.values()]
-        places = torch.unravel_index(choices, sizes) if sizes else ()
+        places = torch.unravel_index(choices, [len(values) for values in self.axes.values()])
         level = {
             name: part.draw(place, generator)
             for (name, part), place in zip(self.bins.items(), places, strict=True)

@@ -15,8 +15,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper
 
-Make = Callable[[], Any]
-
 # A forked process need not import torch again, of which it has no use.
 CONTEXT: Any = multiprocessing.get_context(
     "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
@@ -44,7 +42,7 @@ class ProcessVectorEnv:
         processes: that step them.
     """
 
-    def __init__(self, makes: Sequence[Make], count: int) -> None:
+    def __init__(self, makes: Sequence[Callable[[], Any]], count: int) -> None:
         self.num_envs = len(makes)
         self._parts = np.array_split(np.arange(len(makes)), min(count, len(makes)))
         self._pipes: list[Connection] = []
@@ -52,7 +50,8 @@ class ProcessVectorEnv:
         for part in self._parts:
             ours, theirs = CONTEXT.Pipe()
             some = [makes[index] for index in part]
-            make: Any = CloudpickleWrapper(partial(_side_by_side, some))
+            side_by_side = partial(SyncVectorEnv, some, autoreset_mode=AutoresetMode.DISABLED)
+            make: Any = CloudpickleWrapper(side_by_side)
             process = CONTEXT.Process(target=_serve, args=(theirs, ours, make), daemon=True)
             process.start()
             theirs.close()
@@ -113,10 +112,6 @@ class ProcessVectorEnv:
             if failed:
                 raise answer
         return [answer for _, answer in answers]
-
-
-def _side_by_side(makes: Sequence[Make]) -> Any:
-    return SyncVectorEnv(makes, autoreset_mode=AutoresetMode.DISABLED)
 
 
 def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> None:
