@@ -9,6 +9,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+# Spaces whose values are one number or an array of them.
+NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+
 
 class UnfitEnvironmentError(ValueError):
     """An environment does not do as Gymnasium's interface says; the message is one line."""
@@ -108,9 +111,7 @@ def _unlike(space: spaces.Space[Any], seen: Any) -> str | None:
             return f"{_short(seen)} instead of a tuple of {len(space.spaces)}"
         parts = zip(space.spaces, seen, strict=True)
         return next(filter(None, (_unlike(s, one) for s, one in parts)), None)
-    if not isinstance(
-        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-    ):
+    if not isinstance(space, NUMERIC):
         return None if space.contains(seen) else _short(seen)
     try:
         array = np.asarray(seen)

@@ -12,17 +12,17 @@ from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
 
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
+from proposer_rl.tasks.gymnasium.answers import NUMERIC, UnfitEnvironmentError, check_seen
 
 Array = NDArray[Any]
-Change = tuple[Callable[[Any], Any], spaces.Space[Any]]
+Env = gymnasium.Env[Any, Any]
 
 UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
 IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
 NUMBERS = "observation"  # the entry of all numbers, or of the only image
 
 
-def plain(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+def plain(env: Env) -> Env:
     """An environment whose observations and actions are plain arrays.
 
     Observations become a box: of numbers [D], where whole numbers to choose from are one-hot; or of
@@ -35,25 +35,18 @@ def plain(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     Raises:
         UnfitEnvironmentError: for spaces that no network is for, saying what there is one for.
     """
-    acts = _actions(env.action_space)
-    if acts is not None:
-        env = TransformAction(env, *acts)
-    seen = _observations(env.observation_space)
-    return env if seen is None else TransformObservation(env, *seen)
+    return _with_plain_observations(_with_plain_actions(env))
 
 
-def _observations(space: spaces.Space[Any]) -> Change | None:
-    """What makes observations plain, and their space; None where they are.
-
-    Any numbers are floats to a vector environment, which keeps whole ones only of their own type.
-    """
+def _with_plain_observations(env: Env) -> Env:
+    space = env.observation_space
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
-        return (partial(_typed, space), space) if space.dtype.kind in "biu" else None
+        # Any numbers are floats to a vector environment, which keeps whole ones only of their type.
+        whole = space.dtype.kind in "biu"
+        return TransformObservation(env, partial(_typed, space), space) if whole else env
     parts = dict(leaves(space))
     for name, part in parts.items():
-        if not isinstance(
-            part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-        ):
+        if not isinstance(part, NUMERIC):
             way = "; a wrapper can make numbers of it"
             if name:
                 way = (
@@ -65,6 +58,12 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
             )
     images = {name: cast(spaces.Box, part) for name, part in parts.items() if is_image(part)}
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
+    new: dict[str, spaces.Space[Any]] = {}
+    for name, box in images.items():
+        low, high = (_of_three_axes(end) for end in (box.low, box.high))
+        new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, box.dtype.type))
+    if rest.spaces:
+        new[NUMBERS] = spaces.flatten_space(rest)
 
     def changed(seen: Any) -> Any:
         shown = dict(values(seen))
@@ -76,7 +75,8 @@ def _observations(space: spaces.Space[Any]) -> Change | None:
             out[NUMBERS] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
         return out if len(out) > 1 else next(iter(out.values()))
 
-    return changed, _space_of(images, rest)
+    together = spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
+    return TransformObservation(env, changed, together)
 
 
 def _typed(space: spaces.Box, seen: Any) -> Array:
@@ -89,16 +89,6 @@ def _typed(space: spaces.Box, seen: Any) -> Array:
     if array.dtype != space.dtype and space.dtype.kind in "biu":
         check_seen(space, array, "the environment")
     return array.astype(space.dtype, copy=False)
-
-
-def _space_of(images: Mapping[str, spaces.Box], rest: spaces.Dict) -> spaces.Space[Any]:
-    new: dict[str, spaces.Space[Any]] = {}
-    for name, part in images.items():
-        low, high = (_of_three_axes(end) for end in (part.low, part.high))
-        new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, part.dtype.type))
-    if rest.spaces:
-        new[NUMBERS] = spaces.flatten_space(rest)
-    return spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
@@ -142,24 +132,23 @@ def _of_three_axes(image: Array) -> Array:
     return image.transpose(1, 2, 0, 3).reshape(*image.shape[1:3], -1)
 
 
-def _actions(space: spaces.Space[Any]) -> Change | None:
-    """What makes actions of plain ones, and the space of those; None where they are plain."""
+def _with_plain_actions(env: Env) -> Env:
+    space = env.action_space
     if isinstance(space, spaces.Discrete):
-        return None
-    parts = dict(leaves(space))
-    if all(_is_continuous(part) for part in parts.values()):
-        boxes = [_Scaled(cast(spaces.Box, part)) for part in parts.values()]
-        new: spaces.Space[Any] = spaces.Box(
-            np.concatenate([box.least for box in boxes]),
-            np.concatenate([-box.least for box in boxes]),
-        )
-        sizes = [len(box.least) for box in boxes]
-        read: list[Callable[[Array], Any]] = [*boxes]
-    elif all(_is_choice(part) for part in parts.values()):
-        options = [_options(part) for part in parts.values()]
+        return env
+    parts = [part for _, part in leaves(space)]
+    new: spaces.Space[Any]
+    read: list[Callable[[Array], Any]]
+    if all(isinstance(part, spaces.Box) and part.dtype.kind == "f" for part in parts):
+        boxes = [_Scaled(cast(spaces.Box, part)) for part in parts]
+        read, least = [*boxes], [box.least for box in boxes]
+        new = spaces.Box(np.concatenate(least), -np.concatenate(least))
+        sizes = [len(part) for part in least]
+    elif all(isinstance(part, NUMERIC) and not isinstance(part, spaces.Box) for part in parts):
+        options = [_options(part) for part in parts]
         new = spaces.MultiDiscrete(np.concatenate(options))
         sizes = [len(part) for part in options]
-        read = [partial(_chosen, part) for part in parts.values()]
+        read = [partial(_chosen, part) for part in parts]
     else:
         raise UnfitEnvironmentError(
             f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
@@ -172,7 +161,7 @@ def _actions(space: spaces.Space[Any]) -> Change | None:
         own = [make(part) for make, part in zip(read, np.split(action, ends), strict=True)]
         return _composed(space, iter(own))
 
-    return changed, new
+    return TransformAction(env, changed, new)
 
 
 class _Scaled:
@@ -182,23 +171,14 @@ class _Scaled:
         self._box = box
         low, high = (end.astype(np.float64).ravel() for end in (box.low, box.high))
         self._low, self._high = low, high
-        above, below = low > -UNBOUNDED, high < UNBOUNDED
-        both = above & below
-        self._middle = np.where(both, (np.where(both, low, 0) + np.where(both, high, 0)) / 2, 0.0)
-        self._reach = np.where(both, np.where(both, high, 2) - np.where(both, low, 0), 2.0) / 2
-        self.least = np.where(both, -1.0, -np.inf).astype(np.float32)
+        bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
+        first, last = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        self._middle, self._reach = (first + last) / 2, (last - first) / 2
+        self.least = np.where(bounded, -1.0, -np.inf).astype(np.float32)
 
     def __call__(self, action: Array) -> Array:
         scaled = (self._middle + self._reach * action).clip(self._low, self._high)
         return scaled.astype(self._box.dtype).reshape(self._box.shape)
-
-
-def _is_continuous(space: spaces.Space[Any]) -> bool:
-    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
-
-
-def _is_choice(space: spaces.Space[Any]) -> bool:
-    return isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
 
 
 def _options(space: spaces.Space[Any]) -> Array:
