@@ -60,9 +60,10 @@ class GymnasiumEnv(EnvBase):
     ) -> None:
         super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
         self._reward_scale = reward_scale
-        self._once = once
-        self._plays = plays(levels, once)
-        players = [partial(LevelPlayer, make, parameters, play, success) for play in self._plays]
+        self._plays = plays(levels)
+        players = [
+            partial(LevelPlayer, make, parameters, play, success, once) for play in self._plays
+        ]
         self._vector: SyncVectorEnv | ProcessVectorEnv
         if vectorization == "sync":
             self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
@@ -72,7 +73,7 @@ class GymnasiumEnv(EnvBase):
 
     def set_levels(self, levels: TensorDictBase) -> None:
         """Play these levels [*B] from the next reset on."""
-        self._plays = plays(levels, self._once)
+        self._plays = plays(levels)
         self._vector.set_attr("play", self._plays)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -162,12 +163,12 @@ class GymnasiumEnv(EnvBase):
         """Do nothing: what is random belongs to the levels."""
 
 
-def plays(levels: TensorDictBase, once: bool = False) -> list[Play]:
+def plays(levels: TensorDictBase) -> list[Play]:
     """What players are to play for levels [*B], in one row."""
     columns = {str(name): entry.flatten().tolist() for name, entry in levels.items()}
     seeds = columns.pop(SEED)
     return [
-        Play(dict(zip(columns, row, strict=True)), seed, once)
+        Play(dict(zip(columns, row, strict=True)), seed)
         for seed, *row in zip(seeds, *columns.values(), strict=True)
     ]
 

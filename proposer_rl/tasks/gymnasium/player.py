@@ -101,12 +101,10 @@ class Play(NamedTuple):
     Attributes:
         values: of the parameters, by name.
         seed: of every reset.
-        once: stand still after the first episode, for evaluations.
     """
 
     values: Mapping[str, float]
     seed: int
-    once: bool = False
 
     def __str__(self) -> str:
         """The level."""
@@ -124,6 +122,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         parameters: what differs between levels, by name.
         play: the first level.
         success: whether a step ended an episode that is one; None where nobody asks.
+        once: stand still after the first episode of a level, for evaluations.
 
     Attributes:
         told: the last info.
@@ -137,8 +136,9 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         parameters: Mapping[str, ParameterSettings],
         play: Play,
         success: Callable[[Step], bool] | None = None,
+        once: bool = False,
     ) -> None:
-        self._make, self._succeeded = make, success
+        self._make, self._succeeded, self._once = make, success, once
         self._ways = [
             (name, settings.set, path)
             for name, settings in parameters.items()
@@ -167,7 +167,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on the level, whose seed and options are its own."""
-        if self._play.once and self._played:
+        if self._once and self._played:
             self._still = True
             return self._seen, {}
         self._played, self._return = True, 0.0

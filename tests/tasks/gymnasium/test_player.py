@@ -49,9 +49,9 @@ def test_each_number_gets_where_it_belongs() -> None:
 
 
 def test_once_it_stands_still_after_an_episode() -> None:
-    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7, once=True))
+    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7), once=True)
     for _ in range(2):
-        player.play = Play({**LEVEL, "speed": 0.5}, 7, once=True)
+        player.play = Play({**LEVEL, "speed": 0.5}, 7)
         player.reset()
         ends = [player.step(1)[3] for _ in range(LIMIT)]
         assert ends == [False] * (LIMIT - 1) + [True]
