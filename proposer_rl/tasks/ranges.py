@@ -40,8 +40,9 @@ class RangeSettings:
         values: rising; whole numbers, if all are.
         low, high, bins: of a range.
         target: what is to be mastered: a number; of ``values`` one or several, equally likely; of a
-            range also [from, to]. Or a mapping: :class:`WeightedPoints`, or a ``distribution`` of
-            :mod:`scipy.stats` by its name, with its arguments.
+            range also [from, to]. Or a mapping: rising ``values``, with their ``weights``, which
+            need not add up to one; or a ``distribution`` of :mod:`scipy.stats` by its name, with
+            its arguments.
     """
 
     values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
@@ -93,51 +94,40 @@ class RangeSettings:
     def _law(self, distribution: str | None = None, **given: Any) -> Law:
         if distribution is None:
             try:
-                weighted = WeightedPoints(**arguments(WeightedPoints, given))
+                read = arguments(weighted_points, given, ("line",))
             except ArgumentError as error:
                 raise ValueError(f"target.{error}") from error
-            return weighted.on(self._points(weighted.values, "target.values").low)
+            line = self._points(read["values"], "target.values").low
+            return weighted_points(line, **read)
         if self.values is not None:
             raise ValueError("target.distribution: of a range only; give weights of values")
         space = self.space_bins()
         return _named(distribution, given, space.low[:1], space.high[-1:])
 
 
-@settings
-class WeightedPoints:
-    """Single values that are more or less likely.
+def weighted_points(
+    line: Tensor, values: Annotated[list[Number], Len(1)], weights: list[Positive]
+) -> Law:
+    """Single values, also as a tensor [n], that are more or less likely.
 
-    Attributes:
-        values: rising.
-        weights: of each; they need not add up to one.
+    Raises:
+        ValueError: if there is not a weight for each.
     """
+    if len(weights) != len(line):
+        raise ValueError(f"target.weights={weights}: must be one for each of {len(line)} values")
+    summed = torch.tensor(weights, dtype=torch.float64).cumsum(0)
+    reached = summed / summed[-1]
 
-    values: Annotated[list[Number], Len(1)]
-    weights: list[Positive]
+    def quantile(shares: Tensor) -> Tensor:
+        return line[torch.searchsorted(reached, shares, right=True)]
 
-    def on(self, line: Tensor) -> Law:
-        """The distribution on the values as a tensor.
+    def cumulative(ends: Tensor) -> Tensor:
+        known = torch.cat([torch.zeros(1, dtype=torch.float64), reached])
+        return known[torch.searchsorted(line.double(), ends.double(), right=True)]
 
-        Raises:
-            ValueError: if there is not a weight for each.
-        """
-        if len(self.weights) != len(line):
-            raise ValueError(
-                f"target.weights={self.weights}: must be one for each of {len(line)} values"
-            )
-        summed = torch.tensor(self.weights, dtype=torch.float64).cumsum(0)
-        reached = summed / summed[-1]
-
-        def quantile(shares: Tensor) -> Tensor:
-            return line[torch.searchsorted(reached, shares, right=True)]
-
-        def cumulative(ends: Tensor) -> Tensor:
-            known = torch.cat([torch.zeros(1, dtype=torch.float64), reached])
-            return known[torch.searchsorted(line.double(), ends.double(), right=True)]
-
-        pairs = zip(self.values, self.weights, strict=True)
-        name = " or ".join(f"{value:g} (weight {weight:g})" for value, weight in pairs)
-        return Law(line[:1], line[-1:], quantile, cumulative, name)
+    pairs = zip(values, weights, strict=True)
+    name = " or ".join(f"{value:g} (weight {weight:g})" for value, weight in pairs)
+    return Law(line[:1], line[-1:], quantile, cumulative, name)
 
 
 def spaces(
