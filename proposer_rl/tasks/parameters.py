@@ -269,14 +269,10 @@ class ParameterSpace:
         for _ in range(count):
             which = torch.randint(len(self.bins), shape, generator=generator)
             noise = torch.randn(shape, generator=generator, dtype=torch.float64)
-            for i, name in enumerate(self.bins):
+            for i, (name, part) in enumerate(self.bins.items()):
                 old = levels[name]
-                levels[name] = self._moved(name, old, noise).where(which == i, old)
+                levels[name] = part.moved(old, noise).where(which == i, old)
         return levels.to(self._device)
-
-    def _moved(self, name: str, old: Tensor, noise: Tensor) -> Tensor:
-        """Values [n] of a parameter moved by normal noise, float64 [n]."""
-        return self.bins[name].moved(old, noise)
 
     def _drawn_seeds(self, shape: torch.Size, generator: torch.Generator) -> dict[str, Tensor]:
         if not self._seeded:

@@ -132,14 +132,6 @@ class Parameters(LevelSpace, ParameterSpace):
                 columns[name] = [labels[place] for place in columns[name]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
-    def _moved(self, name: str, old: Tensor, noise: Tensor) -> Tensor:
-        """Of texts another one, so many places further on; numbers as those of any space."""
-        labels = self._labels[name]
-        if labels is None:
-            return super()._moved(name, old, noise)
-        further = 1 + (noise.abs() * 1e6).long() % max(len(labels) - 1, 1)
-        return (old + further) % len(labels)
-
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
         """The bins of a part of the space: one for each parameter or value."""
         _check_names(key, ranges, self.bins)
@@ -162,6 +154,16 @@ class Parameters(LevelSpace, ParameterSpace):
                 raise ArgumentError(f"{where}={values}: must be whole, as the range is")
             parts[name] = Bins(part.low.to(whole.low), part.high.to(whole.high))
         return parts
+
+
+class _Texts(Bins):
+    """The places of texts in their list, which has no order."""
+
+    def moved(self, old: Tensor, noise: Tensor) -> Tensor:
+        """Another place, so many further on."""
+        count = len(self.low)
+        further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
+        return (old + further) % count
 
 
 class Items(LevelSpace):
@@ -335,7 +337,8 @@ def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
     if not isinstance(count, int) or count < 1:
         raise ArgumentError(f"bins={count}: must be at least 1")
     if labels is not None:
-        return points(list(range(len(labels))))
+        places = torch.arange(len(labels))
+        return _Texts(places, places)
     try:
         if isinstance(values, range) and values.step == 1 and len(values) > count:
             edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
