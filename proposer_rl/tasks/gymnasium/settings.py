@@ -111,26 +111,22 @@ class SuccessSettings:
             UnfitEnvironmentError: naming the key and the entries that there are.
         """
         if self.kind == "info" and not self.optional and self._entry(info) is None:
+            there = ", ".join(name for name, _ in _entries(info))
             raise UnfitEnvironmentError(
                 f"success.key={self.key}: the last info of an episode has no such entry; it has: "
-                f"{', '.join(_entries(info)) or 'none'}; where only episodes that succeed have it, "
-                "set success.optional=true"
+                f"{there or 'none'}; where only episodes that succeed have it, set "
+                "success.optional=true"
             )
 
     def _entry(self, info: Mapping[str, Any]) -> Any:
         """The info's entry; None where it is absent."""
-        key, value = self.key or "", info
-        for part in [key] if key in info else key.split("."):
-            if not isinstance(value, Mapping) or part not in value:
-                return None
-            value = value[part]
-        return value
+        return dict(_entries(info)).get(self.key or "")
 
 
-def _entries(info: Mapping[str, Any], within: str = "") -> Iterator[str]:
-    """Names of an info's entries, also of those within others."""
+def _entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """An info's entries by their names, also those within others."""
     for name, value in info.items():
-        yield f"{within}{name}"
+        yield f"{within}{name}", value
         if isinstance(value, Mapping):
             yield from _entries(value, f"{within}{name}.")
 
