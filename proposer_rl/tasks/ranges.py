@@ -79,8 +79,7 @@ class RangeSettings:
             return self._points(target, "target")
         if len(target) > 2 or not target[0] < target[1]:
             raise ValueError(f"target={target} must be a number or [from, to]")
-        low, high = torch.tensor(target, dtype=torch.float64)
-        return Bins(low.view(1), high.view(1))
+        return intervals(target[0], target[1])
 
     def _points(self, values: list[Number], key: str) -> Bins:
         """Single values, of the type of the space's."""
