@@ -66,7 +66,7 @@ def _with_plain_observations(env: Env) -> Env:
         new[NUMBERS] = spaces.flatten_space(rest)
 
     def changed(seen: Any) -> Any:
-        shown = dict(values(seen))
+        shown = dict(leaves(seen))
         out: dict[str, Any] = {
             f"image {name}": _of_three_axes(_typed(box, shown[name]))
             for name, box in images.items()
@@ -199,23 +199,13 @@ def _chosen(space: spaces.Space[Any], choices: Array) -> Any:
     return (shaped + start).astype(space.dtype)
 
 
-def leaves(space: spaces.Space[Any], name: str = "") -> Iterator[tuple[str, spaces.Space[Any]]]:
-    """The parts of a space that are no dictionaries or tuples, by their dotted names."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        within = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for part, inner in within:
+def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Parts of a space or an observation that are no dictionaries or tuples, by dotted names."""
+    if isinstance(whole, Mapping | tuple | spaces.Tuple):  # a space of dictionaries is a Mapping
+        for part, inner in whole.items() if isinstance(whole, Mapping) else enumerate(whole):
             yield from leaves(inner, f"{name}.{part}" if name else str(part))
     else:
-        yield name, space
-
-
-def values(seen: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """The parts of an observation that are no dictionaries or tuples, by their dotted names."""
-    if isinstance(seen, Mapping | tuple):
-        for part, inner in seen.items() if isinstance(seen, Mapping) else enumerate(seen):
-            yield from values(inner, f"{name}.{part}" if name else str(part))
-    else:
-        yield name, seen
+        yield name, whole
 
 
 def _composed(space: spaces.Space[Any], values: Iterator[Any]) -> Any:

@@ -29,7 +29,7 @@ from proposer_rl.tasks.gymnasium.player import (
     wrapper_of,
 )
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
-from proposer_rl.tasks.gymnasium.spaces import leaves, values
+from proposer_rl.tasks.gymnasium.spaces import leaves
 from proposer_rl.tasks.parameters import Bins
 
 EXACT = 2**24  # up to which float32 has all whole numbers
@@ -285,7 +285,7 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
             raise UnfitEnvironmentError(
                 f"step pays a reward of {reward}: it must be finite, also as float32"
             )
-        yield _Played([np.array(part) for _, part in values(seen)], reward, terminated, truncated)
+        yield _Played([np.array(part) for _, part in leaves(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
 
