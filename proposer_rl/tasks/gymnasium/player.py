@@ -138,7 +138,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         success: Callable[[Step], bool] | None = None,
         once: bool = False,
     ) -> None:
-        self._make, self._succeeded, self._once = make, success, once
+        self.make, self.parameters = make, parameters
+        self._succeeded, self._once = success, once
         self._ways = [
             (name, settings.set, path)
             for name, settings in parameters.items()
@@ -233,7 +234,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _built(self) -> gymnasium.Env[Any, Any]:
         self._arguments = self._named("argument")
         try:
-            return self._make(**self._arguments)
+            return self.make(**self._arguments)
         except (ImportError, gymnasium.error.Error, WrapperError, UnfitEnvironmentError):
             raise
         except Exception as error:
@@ -248,7 +249,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _refused(self, error: Exception) -> RefusedLevelError:
         return RefusedLevelError(
-            f"parameters: {self._make.env_id} refuses {self._play}: {told(error)}"
+            f"parameters: {self.make.env_id} refuses {self._play}: {told(error)}"
         )
 
 

@@ -72,12 +72,12 @@ def tried(
     limit = make.limit(player)
     if not limit:
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
-    _check_kinds(player, parameters, bins)
+    _check_kinds(player, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
         ends = part.low[0].item(), part.high[-1].item()
         plays = [target._replace(values={**target.values, name: end}) for end in ends]
-        _check_ends(player, make, parameters, name, plays)
+        _check_ends(player, name, plays)
     player.close()
     return limit
 
@@ -193,11 +193,9 @@ def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], li
         )
 
 
-def _check_kinds(
-    player: LevelPlayer, parameters: Mapping[str, ParameterSettings], bins: Mapping[str, Bins]
-) -> None:
+def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
     """Warn of fractions in the place of whole numbers, before there has been a reset."""
-    for name, given in parameters.items():
+    for name, given in player.parameters.items():
         if given.set != "attribute" or not bins[name].low.is_floating_point():
             continue
         for path in given.names(name):
@@ -210,13 +208,7 @@ def _check_kinds(
                 )
 
 
-def _check_ends(
-    player: LevelPlayer,
-    make: MakeEnvironment,
-    parameters: Mapping[str, ParameterSettings],
-    name: str,
-    ends: list[Play],
-) -> None:
+def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
     """Set both ends of a parameter, see that they are there and stay, and that they matter.
 
     They do, too, if the environment draws them in different ways: it may take skill to get there.
@@ -241,7 +233,7 @@ def _check_ends(
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
     first, last = (play.values[name] for play in ends)
-    if first != last and _alike(*episodes) and _look_alike(make, parameters, ends):
+    if first != last and _alike(*episodes) and _look_alike(player, ends):
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
             "same to the last digit; does it arrive?",
@@ -249,10 +241,8 @@ def _check_ends(
         )
 
 
-def _look_alike(
-    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], ends: list[Play]
-) -> bool:
-    camera = Camera(make, parameters, ends[0])
+def _look_alike(player: LevelPlayer, ends: list[Play]) -> bool:
+    camera = Camera(player.make, player.parameters, ends[0])
     first, last = (camera.picture(play, None) for play in ends)
     return not camera.works or np.array_equal(first, last)
 
