@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import in_first_episode
 from proposer_rl.runs.pictures import written
-from proposer_rl.tasks.gymnasium.env import as_actions, plays
+from proposer_rl.tasks.gymnasium.env import as_actions
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from proposer_rl.tasks.parameters import SEED
@@ -41,11 +39,6 @@ NO_FRAMES = "The environment draws no frames here; the numbers are those of the 
 class Camera:
     """Plays levels again, with the actions that a Solver took, and takes pictures.
 
-    Args:
-        make: makes the environment.
-        parameters: what differs between levels, by name.
-        play: any level.
-
     Attributes:
         works: whether there are frames: the environment can draw, and has what it needs for it.
     """
@@ -56,27 +49,16 @@ class Camera:
         try:
             if MODE not in LevelPlayer(make, parameters, play).metadata["render_modes"]:
                 raise ValueError("it draws nothing")
-            self._player = LevelPlayer(replace(make, render_mode=MODE), parameters, play)
+            drawing = {**make.arguments, "render_mode": MODE}  # which not every constructor takes
+            self._player = LevelPlayer(replace(make, arguments=drawing), parameters, play)
             self._player.reset()
             self._frame()
             self.works = True
         except Exception:  # a package, a display, a driver: the numbers are shown instead
             self.works = False
 
-    def pictures(
-        self, levels: TensorDictBase, rollout: TensorDictBase | None
-    ) -> list[NDArray[np.uint8]]:
-        """Pictures uint8 [H, W, 3] of levels [n], and of first episodes there [n, T]."""
-        if rollout is None:
-            return [self.picture(play, None) for play in plays(levels)]
-        first = in_first_episode(rollout)
-        return [
-            self.picture(play, actions[steps])
-            for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
-        ]
-
     def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
-        """Of one level, and of an episode with actions [T, ...] there."""
+        """A picture uint8 [H, W, 3] of a level, and of an episode with actions [T, ...] there."""
         if self.works:
             try:
                 return self._drawn(play, actions)

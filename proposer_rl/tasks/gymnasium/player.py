@@ -43,11 +43,8 @@ class MakeEnvironment:
     """Makes an environment; can be sent to another process.
 
     Attributes:
-        env_id: as :func:`gymnasium.make` takes it, ``module:name`` included.
-        arguments: of its constructor.
-        max_steps: after which an episode is truncated; None for the environment's own limit.
-        wrappers: what is put around it, the innermost first: dotted names, or one with arguments.
-        render_mode: None, or ``"rgb_array"``.
+        env_id, arguments, max_steps, wrappers: as of
+            :class:`~proposer_rl.tasks.gymnasium.task.GymnasiumTask`.
         check: whether Gymnasium's own checker watches, and warns.
         as_it_is: whether observations and actions are those of the environment; else those of
             :func:`~proposer_rl.tasks.gymnasium.spaces.plain`.
@@ -57,7 +54,6 @@ class MakeEnvironment:
     arguments: Mapping[str, Any] = field(default_factory=dict)
     max_steps: int | None = None
     wrappers: Sequence[WrapperSettings] = ()
-    render_mode: str | None = None
     check: bool = False
     as_it_is: bool = False
 
@@ -67,11 +63,11 @@ class MakeEnvironment:
         Raises:
             WrapperError: if a wrapper cannot be put around it.
         """
-        given = {**self.arguments, **arguments}
-        if self.render_mode is not None:  # which not every constructor takes
-            given["render_mode"] = self.render_mode
         env: gymnasium.Env[Any, Any] = gymnasium.make(
-            self.env_id, max_episode_steps=-1, disable_env_checker=not self.check, **given
+            self.env_id,
+            max_episode_steps=-1,
+            disable_env_checker=not self.check,
+            **{**self.arguments, **arguments},
         )
         limit = self.limit(env)
         env = Answers(env)

@@ -22,6 +22,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
 from proposer_rl.extras import install_command
+from proposer_rl.learning import in_first_episode
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.streams import Streams
@@ -220,7 +221,13 @@ class GymnasiumTask(Task):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """Frames of levels [n], and of the Solver's first episode there [n, T]."""
-        return self._camera.pictures(levels, rollout)
+        if rollout is None:
+            return [self._camera.picture(play, None) for play in plays(levels)]
+        first = in_first_episode(rollout)
+        return [
+            self._camera.picture(play, actions[steps])
+            for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
+        ]
 
     @cached_property
     def _camera(self) -> Camera:
