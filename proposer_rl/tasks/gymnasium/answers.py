@@ -88,13 +88,8 @@ def check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
 
     A number beyond its bounds is not: nothing here depends on them.
 
-    Args:
-        space: of observations.
-        seen: one of them.
-        by: what has shown it.
-
     Raises:
-        UnfitEnvironmentError: saying what it is, and the space.
+        UnfitEnvironmentError: saying by what it was shown, what it is, and the space.
     """
     line = _unlike(space, seen)
     if line is not None:

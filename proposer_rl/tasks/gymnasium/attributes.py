@@ -16,11 +16,9 @@ class AttributeRefusedError(ValueError):
 
 
 def read(environment: Any, path: str) -> Any:
-    """What stands at a path.
+    """What stands at a path in an environment without wrappers.
 
-    Args:
-        environment: without wrappers.
-        path: names of attributes, keys of mappings and indices, with dots in between.
+    A path is names of attributes, keys of mappings and indices, with dots in between.
 
     Raises:
         AttributeRefusedError: if there is nothing, listing the numbers that there are.
@@ -40,11 +38,6 @@ def read(environment: Any, path: str) -> Any:
 
 def write(environment: Any, path: str, value: float) -> None:
     """Put a number in the place of another, and see that it is there.
-
-    Args:
-        environment: without wrappers.
-        path: as of :func:`read`.
-        value: the number.
 
     Raises:
         AttributeRefusedError: if there is no number at the path, or it cannot be changed.

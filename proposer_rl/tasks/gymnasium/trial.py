@@ -46,12 +46,7 @@ def tried(
 ) -> int:
     """Play a whole episode on a level of the target, and a short one at the ends of each parameter.
 
-    Args:
-        make: makes the environment.
-        parameters: what differs between levels, by name.
-        bins: of the parameters, whose ends are tried; the others are as in the target.
-        target: a level of the target.
-        success: when an episode is one.
+    At the ends of a parameter's bins all others are as in the target.
 
     Returns:
         Steps of an episode at most.
