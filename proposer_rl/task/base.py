@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.utils._pytree import tree_leaves
 from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase
 
@@ -135,7 +134,8 @@ class Task(ABC):
         self._levels, self._seed = levels, seed
         self._measured = dict(measured or {"levels": [levels, seed], "target": target})
         self.evaluated_on = {name: self.evaluation_levels(name) for name in names}
-        self.device = _place(self.evaluated_on[names[0]])
+        entry = next(iter(self.evaluated_on[names[0]].values(True, True)), None)
+        self.device = torch.device("cpu") if entry is None else entry.device
         self._compile = context.compile
         self._graphs = context.graphs and graphs.has_graphs(self.device)
         if self._graphs:
@@ -427,12 +427,6 @@ def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distr
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
     """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
     return levels.expand(agent.copies, levels.batch_size[-1])
-
-
-def _place(levels: Levels) -> torch.device:
-    """Where levels are."""
-    leaves = tree_leaves(levels.to_dict())
-    return leaves[0].device if leaves else torch.device("cpu")
 
 
 def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
