@@ -177,9 +177,7 @@ class Task(ABC):
                 return self.network()
 
         population = Population(network, copies, self.precision, self.cores, self.batched)
-        # A placeholder of the right shape; every update sets its own levels.
-        level = next(iter(self.evaluated_on.values()))[:1]
-        env = self.environment(level.expand(copies, self.batch_size))
+        env = self.environment(self._placeholders(copies, self.batch_size))
         ppo = PPO(env, self.actor_critic(population.to(self.device), env), self.solver.ppo)
         if self._compile:
             ppo.compile()
@@ -194,8 +192,7 @@ class Task(ABC):
         """
         if not learner.settings.continue_episodes:
             return learner.env, learner.collector
-        level = next(iter(self.evaluated_on.values()))[:1]
-        env = self.environment(level.expand(*learner.env.batch_size))
+        env = self.environment(self._placeholders(*learner.env.batch_size))
         horizon = max(self.max_steps, learner.horizon)
         return env, RolloutCollector(env, learner.agent, horizon)
 
@@ -406,11 +403,15 @@ class Task(ABC):
     @property
     def _actions(self) -> int:
         """Numbers of a probe of one level."""
-        level = next(iter(self.evaluated_on.values()))[:1]
-        spec = self.evaluation_environment(level.expand(1, 1)).full_action_spec["action"]
+        env = self.evaluation_environment(self._placeholders(1, 1))
+        spec = env.full_action_spec["action"]
         if isinstance(spec, MultiCategorical):
             return len(spec.nvec[0, 0]) * int(spec.nvec.max())
         return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
+
+    def _placeholders(self, *shape: int) -> Levels:
+        """Levels of a shape, for an environment whose levels are set later."""
+        return next(iter(self.evaluated_on.values()))[:1].expand(*shape)
 
     def _numbers(self, levels: Levels) -> list[str]:
         """Axes of the space that are entries of the levels."""
