@@ -82,7 +82,7 @@ class MakeEnvironment:
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
         """Steps after which an episode is truncated; None for never."""
-        limits = [one._max_episode_steps for one in _wrappers(env) if isinstance(one, TimeLimit)]
+        limits = [limit._max_episode_steps for limit in _time_limits(env)]
         declared = self.max_steps
         if declared is None and env.unwrapped.spec is not None:
             declared = gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
@@ -157,8 +157,10 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     @property
     def in_time(self) -> bool:
         """Whether the episode has reached no time limit, each counting the steps it has seen."""
-        limits = [one for one in _wrappers(self.env) if isinstance(one, TimeLimit)]
-        return all((one._elapsed_steps or 0) < one._max_episode_steps for one in limits)
+        return all(
+            (limit._elapsed_steps or 0) < limit._max_episode_steps
+            for limit in _time_limits(self.env)
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -249,10 +251,10 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         )
 
 
-def _wrappers(env: Any) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
-    """The wrappers around an environment, the outermost first."""
+def _time_limits(env: Any) -> Iterator[TimeLimit]:
     while isinstance(env, gymnasium.Wrapper):
-        yield env
+        if isinstance(env, TimeLimit):
+            yield env
         env = env.env
 
 
