@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -224,9 +223,10 @@ class ParameterSpace:
 
     def shares(self, other: ParameterSpace) -> Tensor:
         """Which of these bins the levels of another distribution lie in, float [N]."""
-        parts = [self.bins[name].shares(bins) for name, bins in other.bins.items()]
-        none = torch.ones(1, dtype=torch.float64)
-        return reduce(lambda all_, part: torch.outer(all_, part).flatten(), parts, none).float()
+        shares = torch.ones(1, dtype=torch.float64)
+        for name, bins in other.bins.items():
+            shares = torch.outer(shares, self.bins[name].shares(bins)).flatten()
+        return shares.float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
         places = torch.unravel_index(choices, [len(values) for values in self.axes.values()])

@@ -74,14 +74,14 @@ class ProcessVectorEnv:
             info.get("success", np.zeros(len(part), np.bool_))
             for info, part in zip(infos, self._parts, strict=True)
         ]
-        joined = [np.concatenate(part) for part in ends]
-        return _joined(seen), joined[0], joined[1], joined[2], {"success": np.concatenate(success)}
+        rewards, terminated, truncated, successes = map(np.concatenate, (*ends, success))
+        return _joined(seen), rewards, terminated, truncated, {"success": successes}
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Give each environment an attribute's value."""
         self._ask("set_attr", [(name, [values[i] for i in part]) for part in self._parts])
 
-    def close(self, **_: object) -> None:
+    def close(self) -> None:
         """End the processes."""
         for pipe, process in zip(self._pipes, self.processes, strict=True):
             # Processes that were forked later have the pipe, too: closing it would tell nothing.
