@@ -1,8 +1,6 @@
-"""The base of tasks: environments in which Solvers are trained, and how they are measured there.
+"""The base of tasks; ``examples/own_task.py`` is a whole one.
 
-:class:`Task` asks for three things: levels to draw from, an environment that plays them, and a
-network; all the rest can be replaced. ``examples/own_task.py`` is a whole task in forty lines. K
-are Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
+K are Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
 """
 
 from __future__ import annotations
@@ -49,7 +47,8 @@ class Task(ABC):
     numbers that sum this up (:meth:`measure`), or the training (:meth:`training_metrics`).
     **Records** are levels as pictures and text. **Facts** describe the task for readers.
 
-    A task must give :meth:`environment`, :meth:`network`, a ``title``, and call this constructor.
+    A task must give :meth:`environment`, :meth:`network`, a ``title``, and call this constructor;
+    all the rest can be replaced.
 
     Args:
         distributions: by name, for hand-designed curricula and to be measured on.

@@ -92,12 +92,7 @@ class MakeEnvironment:
 
 
 class Play(NamedTuple):
-    """What a player is to play.
-
-    Attributes:
-        values: of the parameters, by name.
-        seed: of every reset.
-    """
+    """A level: values of the parameters by name, and the seed of every reset."""
 
     values: Mapping[str, float]
     seed: int
@@ -114,8 +109,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     Of an info only ``success`` is handed on, where a step ended an episode that is one.
 
     Args:
-        make: the environment.
-        parameters: what differs between levels, by name.
+        make, parameters: the environment, and what differs between levels, by name.
         play: the first level.
         success: whether a step ended an episode that is one; None where nobody asks.
         once: stand still after the first episode of a level, for evaluations.
