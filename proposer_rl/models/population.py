@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call, vmap
+from torch.nn.functional import linear
 
 from proposer_rl.models.convolution import Conv3x3
-from proposer_rl.models.stacked import Call, apply_alone, apply_batched, apply_on_cores
 
 
 class Population(nn.Module):
@@ -79,16 +85,110 @@ class Population(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Any:
         """Apply replica ``k`` to slice ``k`` of each input [K, ...]; outputs are [K, ...], too."""
-        call = Call(self._template[0], self.names, self.precision)
-        stacked = list(self.stacked)
+        template, stacked = self._template[0], list(self.stacked)
         batched = stacked[0].device.type != "cpu" if self.batched is None else self.batched
-        if self.copies == 1:
-            outputs = apply_alone(call, stacked, inputs)
-        elif batched:
-            outputs = apply_batched(call, stacked, inputs)
-        else:
-            outputs = apply_on_cores(call, stacked, inputs, self.cores)
+        if self.copies == 1:  # the network that it is
+            outputs = self._call(template, [p.squeeze(0) for p in stacked], [x[0] for x in inputs])
+            outputs = tuple(output.unsqueeze(0) for output in outputs)
+        elif not batched:
+            with_graph = torch.is_grad_enabled()  # unknown inside, where gradients are always off
+            outputs = _OnCores.apply(self, with_graph, len(inputs), *inputs, *stacked)
+        elif getattr(template, "stackable", False):
+            outputs = self._call(template, stacked, inputs)
+        else:  # convolutions become grouped ones: few launches, for a GPU
+            outputs = vmap(partial(self._call, template))(tuple(stacked), inputs)
         return outputs[0] if len(outputs) == 1 else outputs
+
+    def _call(
+        self, network: nn.Module, parameters: Sequence[Tensor], inputs: Sequence[Tensor]
+    ) -> tuple[Tensor, ...]:
+        """Outputs of the network with these parameters."""
+        named = dict(zip(self.names, parameters, strict=True))
+        low, device = self.precision == "bf16", parameters[0].device.type
+        with torch.autocast(device, torch.bfloat16) if low else nullcontext():
+            outputs = functional_call(network, named, tuple(inputs), tie_weights=False)
+        if isinstance(outputs, Tensor):
+            outputs = (outputs,)
+        return tuple(output.float() for output in outputs)
+
+
+class StackedLinear(nn.Linear):
+    """A linear layer whose parameters may be stacked, [K, ...], for inputs [K, *B, features].
+
+    Networks of nothing but such layers say so by a true ``stackable``: all replicas are then
+    computed without ``vmap``, which costs as much as the arithmetic of a small network.
+    """
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """The layer's outputs, [*B, features] or [K, *B, features]."""
+        if self.weight.ndim == 2:
+            return linear(inputs, self.weight, self.bias)
+        rows = inputs.flatten(1, -2)
+        outputs = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
+        return outputs.unflatten(1, inputs.shape[1:-1])
+
+
+class _OnCores(torch.autograd.Function):
+    """Forward and backward of the replicas in threads, each through a graph of its own."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, population: Population, with_graph: bool, n_inputs: int, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        needs, pool = ctx.needs_input_grad[3:], _pool(population.cores)
+
+        def one(k: int) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+            leaves = [
+                x[k].detach().requires_grad_(with_graph and need)
+                for x, need in zip(tensors, needs, strict=True)
+            ]
+            network = _own_network(population._template[0])
+            with torch.set_grad_enabled(with_graph):
+                outputs = population._call(network, leaves[n_inputs:], leaves[:n_inputs])
+            return outputs, leaves
+
+        results = list(pool.map(one, range(len(tensors[-1]))))
+        # The graphs live in ctx, not among its saved tensors: they are made here and freed with it.
+        ctx.graphs, ctx.pool = results, pool
+        outputs = zip(*(outputs for outputs, _ in results), strict=True)
+        return tuple(torch.stack([o.detach() for o in slices]) for slices in outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        needs = ctx.needs_input_grad[3:]
+
+        def one(k: int) -> tuple[Tensor, ...]:
+            outputs, leaves = ctx.graphs[k]
+            wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
+            slopes = [g[k] for g in gradients]
+            # A parameter that the network does not use has a gradient of zero.
+            return torch.autograd.grad(outputs, wanted, slopes, materialize_grads=True)
+
+        results = zip(*ctx.pool.map(one, range(len(ctx.graphs))), strict=True)
+        stacked = iter([torch.stack(slices) for slices in results])
+        ctx.graphs = None
+        return None, None, None, *(next(stacked) if need else None for need in needs)
+
+
+@cache
+def _pool(cores: int) -> ThreadPoolExecutor:
+    """Threads that each compute on one core."""
+    return ThreadPoolExecutor(cores, "replica", initializer=torch.set_num_threads, initargs=(1,))
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # A forked process inherits the pool, but not its threads.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+_networks = threading.local()
+
+
+def _own_network(network: nn.Module) -> nn.Module:
+    """This thread's own copy of a template: functional calls put parameters into it meanwhile."""
+    own = getattr(_networks, "of", None)
+    if own is None or own[0] is not network:
+        own = _networks.of = (network, copy.deepcopy(network))
+    return own[1]
 
 
 def available_cores() -> int:

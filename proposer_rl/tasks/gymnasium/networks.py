@@ -11,7 +11,7 @@ from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.modules import MLP
 
 from proposer_rl.models import MemoryNetwork, orthogonal_
-from proposer_rl.models.stacked import StackedLinear
+from proposer_rl.models.population import StackedLinear
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
 from proposer_rl.tasks.gymnasium.spaces import channels_first
 
