@@ -45,19 +45,13 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
     """A copy of weights and Adam's state, batch [K] with replicas and [] without."""
     batch = _batch(agent)
     entries: dict[str, TensorDict] = {}
-    for name, parameter in agent.named_parameters():
-        state = adam.state[parameter]
-        entries[name] = TensorDict(
-            {
-                "value": parameter.detach().clone(),
-                "exp_avg": state["exp_avg"].clone(),
-                "exp_avg_sq": state["exp_avg_sq"].clone(),
-                "step": state["step"].expand(batch).clone(),
-            },
-            batch,
-        )
-    for name, statistic in _statistics(agent).items():
-        entries[name] = TensorDict({"value": statistic.clone()}, batch)
+    for name, value in agent_values(agent).items():
+        entry = {"value": value.detach().clone()}
+        if value in adam.state:
+            state = adam.state[value]
+            entry |= {key: state[key].clone() for key in ("exp_avg", "exp_avg_sq")}
+            entry["step"] = state["step"].expand(batch).clone()
+        entries[name] = TensorDict(entry, batch)
     return TensorDict(entries, batch)
 
 
@@ -100,15 +94,11 @@ def _batch(agent: ActorCritic) -> torch.Size:
     return torch.Size([] if agent.copies is None else [agent.copies])
 
 
-def _statistics(agent: ActorCritic) -> dict[str, Tensor]:
-    """What an agent has learnt without gradients: moments of its observations and rewards."""
-    named = () if agent.normalization is None else agent.normalization.named_buffers()
-    return {f"normalization.{name}": statistic for name, statistic in named}
-
-
 def agent_values(agent: ActorCritic) -> dict[str, Tensor]:
-    """All numbers that make an agent what it is, by name: weights and statistics, as they stand."""
-    return {**dict(agent.named_parameters()), **_statistics(agent)}
+    """Weights of an agent, and moments of its observations and rewards, by name, as they stand."""
+    learnt = agent.normalization
+    moments = () if learnt is None else learnt.named_buffers("normalization")
+    return dict([*agent.named_parameters(), *moments])
 
 
 def agent_weights(agent: ActorCritic) -> TensorDict:
