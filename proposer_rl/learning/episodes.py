@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,20 +16,6 @@ SEEDS = 2**62
 SWEEP = 16  # steps between two checks which levels all Solvers have finished
 
 
-class Step(NamedTuple):
-    """A step on those levels on which some Solver may still be playing.
-
-    Attributes:
-        place: of these m levels among all, int64 [m].
-        after: the state after the step, with the reward, [K, m].
-        counts: whether the step belongs to the Solver's first episode there, bool [K, m].
-    """
-
-    place: Tensor
-    after: TensorDictBase
-    counts: Tensor
-
-
 @torch.no_grad()
 def play(
     agent: ActorCritic,
@@ -37,7 +23,7 @@ def play(
     max_steps: int,
     noise: Tensor | None = None,
     remake: Callable[[Tensor], EnvBase] | None = None,
-) -> Iterator[Step]:
+) -> Iterator[tuple[Tensor, TensorDictBase, Tensor]]:
     """Play one episode of each of K Solvers on each of its levels, all at once.
 
     Args:
@@ -49,6 +35,11 @@ def play(
         remake: makes an environment [K, m] of some of the levels, int64 [m]. With it levels that
             all Solvers have finished are left out now and then; without it they are reset, and
             begin again without being counted.
+
+    Yields:
+        Of each step on the m levels on which some Solver may still be playing: their places among
+        all, int64 [m]; the state after it, with the reward, [K, m]; and whether it belongs to the
+        Solver's first episode there, bool [K, m].
     """
     device = env.device or torch.device("cpu")
     place = torch.arange(env.batch_size[1], device=device)
@@ -69,7 +60,7 @@ def play(
             given = noise[step, place]
             action = draw(distribution, given.expand(len(over), *given.shape))
         after = env.step(state.set(agent.action_key, action))["next"]
-        yield Step(place, after, ~over)
+        yield place, after, ~over
         over = over | after["done"].squeeze(-1)
         state = after.exclude("reward")
         if remake is None:
