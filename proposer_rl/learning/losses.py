@@ -1,4 +1,7 @@
-"""PPO's loss of K replicas at once: TorchRL's, without what would mix them or wait for a device."""
+"""PPO's loss of K replicas at once: TorchRL's, without what would mix them or wait for a device.
+
+And what is told of it, and the clipping of its gradients, for each replica by itself.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent
 from torchrl.objectives import ClipPPOLoss, LossModule
 
@@ -117,3 +120,27 @@ def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
     return 1 - residual / total.clamp_min(1e-12)
+
+
+def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
+    """Scale gradients (in place) so that no replica's norm exceeds ``max_norm``.
+
+    Args:
+        parameters: with replicas, each [K, ...].
+        max_norm: largest norm over all parameters of one replica.
+        copies: K, or None if the parameters belong to a single network.
+
+    Returns:
+        The norms before clipping, [K] or [].
+    """
+    if copies is None:
+        return nn.utils.clip_grad_norm_(parameters, max_norm)
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    # Slice by slice, since a norm over a row of several is rounded otherwise than over one alone.
+    slices = [gradient[k] for k in range(copies) for gradient in gradients]
+    norms = torch.stack(torch._foreach_norm(slices)).view(copies, len(gradients))
+    norm = norms.square().sum(1).sqrt()  # [K]
+    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+    for gradient in gradients:
+        gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
+    return norm

@@ -26,11 +26,11 @@ from torchrl.modules import set_recurrent_mode
 from proposer_rl.learning import graphs
 from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.learning.gradients import clip_gradients_
 from proposer_rl.learning.losses import (
     ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
+    clip_gradients_,
     explained_variance,
     make_loss,
     of_copies,

@@ -22,8 +22,7 @@ from torch.utils._pytree import tree_leaves
 from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
-from proposer_rl.learning.gradients import clip_gradients_
-from proposer_rl.learning.losses import MakeLoss
+from proposer_rl.learning.losses import MakeLoss, clip_gradients_
 from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.maps import read_maps
