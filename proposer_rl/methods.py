@@ -44,10 +44,9 @@ from proposer_rl.meta.assembly import (
     proposer_actions,
     proposer_agent,
     solver_view,
-    worker_env,
 )
 from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
-from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings
+from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings, worker_env
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams

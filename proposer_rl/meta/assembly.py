@@ -58,20 +58,6 @@ def meta_env(
     )
 
 
-def worker_env(
-    make_task: Callable[[str], Task],
-    config: ProposerSettings,
-    streams: Streams,
-    reward: rewards.Reward,
-    *,
-    share: range,
-    device: str,
-    kind: type[SolverTrainingEnv],
-) -> SolverTrainingEnv:
-    """The same in another process, whose task is made there, on its device."""
-    return meta_env(make_task(device), config, streams, reward, share, kind=kind)
-
-
 def solver_view(task: Task, config: ProposerSettings) -> SolverView:
     """What a Proposer sees of a Solver."""
     return SolverView(
@@ -87,25 +73,23 @@ def proposer_actions(task: Task, config: ProposerSettings) -> Actions:
 
 def proposer_agent(task: Task, config: ProposerSettings) -> ActorCritic:
     """The Proposer, with weights from torch's default generator."""
+    action, hidden = config.action, config.hidden
     width = config.context + len(config.observes)
-    head, distribution = _head(task, config, width)
+    head: nn.Module
+    distribution: Callable[..., Distribution]
+    if isinstance(action, MixtureSettings):
+        directions = task.space.coordinates.shape[1]
+        head = MixtureHead(width, directions, hidden=hidden, spread=action.spread)
+        distribution = normal
+    else:
+        size = task.batch_size, task.space.size
+        head = ProblemHead(width, *size, hidden=hidden, bands=action.bands)
+        distribution = joint_categorical if action.ratio == "joint" else categorical
     network = ProposerNetwork(
         head,
         task.probe_encoder(config.context),
         context=config.context,
         numbers=len(config.observes),
-        hidden=config.hidden,
+        hidden=hidden,
     ).to(task.device)
     return proposer_actor_critic(network, distribution, ["probes", *config.observes])
-
-
-def _head(
-    task: Task, config: ProposerSettings, width: int
-) -> tuple[nn.Module, Callable[..., Distribution]]:
-    """From a context of that width to the parameters of the action's distribution."""
-    action, hidden = config.action, config.hidden
-    if isinstance(action, MixtureSettings):
-        directions = task.space.coordinates.shape[1]
-        return MixtureHead(width, directions, hidden=hidden, spread=action.spread), normal
-    head = ProblemHead(width, task.batch_size, task.space.size, hidden=hidden, bands=action.bands)
-    return head, joint_categorical if action.ratio == "joint" else categorical

@@ -6,5 +6,6 @@ that its results are the same wherever it is computed, but for rounding.
 
 from proposer_rl.meta.workers.copies import CopiesInWorkers, shares
 from proposer_rl.meta.workers.engines import WorkersError, WorkerSettings
+from proposer_rl.meta.workers.remote import worker_env
 
-__all__ = ["CopiesInWorkers", "WorkerSettings", "WorkersError", "shares"]
+__all__ = ["CopiesInWorkers", "WorkerSettings", "WorkersError", "shares", "worker_env"]

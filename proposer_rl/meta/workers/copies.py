@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
 from itertools import cycle
@@ -15,6 +15,7 @@ from torchrl.collectors import BaseCollector
 
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.meta.copies import Copies, Trained
+from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.workers.engines import (
     WorkersError,
     WorkerSettings,
@@ -23,7 +24,7 @@ from proposer_rl.meta.workers.engines import (
     start,
     stop,
 )
-from proposer_rl.meta.workers.remote import MakeEnv, WorkerPolicy, make_worker_env
+from proposer_rl.meta.workers.remote import WorkerPolicy
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 
@@ -38,7 +39,8 @@ class CopiesInWorkers(Copies):
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` of all
             replicas; it is used for all but the replicas' training.
-        make_env: makes a worker's environment.
+        make_env: makes a worker's environment of a ``share`` on a ``device`` with so many
+            ``threads``; can be pickled.
         settings: how many workers there are, and where.
 
     Raises:
@@ -48,7 +50,7 @@ class CopiesInWorkers(Copies):
     def __init__(
         self,
         proposer: PPO,
-        make_env: MakeEnv,
+        make_env: Callable[..., SolverTrainingEnv],
         settings: WorkerSettings,
     ) -> None:
         super().__init__(proposer)
@@ -137,7 +139,10 @@ class CopiesInWorkers(Copies):
         placed = list(zip(self._shares, cycle(self._settings.devices), strict=False))
         return start(
             self._settings,
-            [partial(make_worker_env, self._make_env, *place, threads) for place in placed],
+            [
+                partial(self._make_env, share=share, device=device, threads=threads)
+                for share, device in placed
+            ],
             [partial(WorkerPolicy, agent, horizon, shape, device) for _, device in placed],
             frames=len(self._shares[0]) * horizon,
             check=partial(self._env.on_update, 0),

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
 from proposer_rl.learning import DivergedError, RolloutPolicy
+from proposer_rl.meta.assembly import meta_env
 from proposer_rl.meta.copies import Trained, taken_out
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
+from proposer_rl.meta.rewards import Reward
+from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.models import ActorCritic, uniform_noise, use_device
 from proposer_rl.streams import Streams
+from proposer_rl.task import Task
 
 
 class WorkerEnv(SolverTrainingEnv):
@@ -52,15 +55,23 @@ class WorkerEnv(SolverTrainingEnv):
         return state.set("reward", torch.full_like(state["return"], torch.nan))
 
 
-MakeEnv = Callable[..., SolverTrainingEnv]
-"""Makes an environment of the class ``kind`` for a ``share`` on a ``device``; can be pickled."""
+def worker_env(
+    make_task: Callable[[str], Task],
+    config: ProposerSettings,
+    streams: Streams,
+    reward: Reward,
+    *,
+    share: range,
+    device: str,
+    threads: int,
+) -> SolverTrainingEnv:
+    """A worker's environment, whose task is made there, on its device; threads as in the main one.
 
-
-def make_worker_env(make_env: MakeEnv, share: range, device: str, threads: int) -> Any:
-    """The environment of a worker, computed with as many threads as in the main process."""
+    The first arguments are as of :func:`~proposer_rl.meta.assembly.meta_env`.
+    """
     use_device(torch.device(device))
     torch.set_num_threads(threads)
-    return make_env(share=share, device=device, kind=WorkerEnv)
+    return meta_env(make_task(device), config, streams, reward, share, kind=WorkerEnv)
 
 
 class WorkerPolicy(RolloutPolicy):
