@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import make_composite_from_td
 
 from proposer_rl.learning import located
 from proposer_rl.meta.actions import Actions
@@ -173,17 +174,12 @@ class SolverTrainingEnv(EnvBase):
         return state.update({"proposed": proposed, "terminated": ended, "done": ended.clone()})
 
     def _make_specs(self) -> None:
-        def like(entry: Tensor) -> Unbounded:
-            return Unbounded(entry.shape, dtype=entry.dtype, device=self.device)
-
         flags = ("terminated", "done")
         state = self._reset()
-        observed = state.exclude(*flags)
-        self.observation_spec = Composite(
-            {str(key): like(entry) for key, entry in observed.items()}, shape=self.batch_size
-        )
+        self.observation_spec = make_composite_from_td(state.exclude(*flags))
         self.action_spec = self.actions.spec(self.batch_size[0], self.batch_of_levels, self.device)
-        self.reward_spec = like(state["return"])
+        told = state["return"]
+        self.reward_spec = Unbounded(told.shape, dtype=told.dtype, device=self.device)
         flag = Categorical(2, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         self.done_spec = Composite({key: flag.clone() for key in flags}, shape=self.batch_size)
 
