@@ -240,9 +240,7 @@ class PPO:
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The sum of all losses, and what is told of them."""
         agent, copies = self.agent, self.copies
-        steps = agent.decode(steps.copy(), agent.encode(level))
-        trained_on = agent.value_key, ACTED_VALUE, "value_target", "advantage"
-        steps = self.statistics.in_units(steps, *trained_on)
+        steps = self.statistics.in_units(agent.decode(steps.copy(), agent.encode(level)))
         losses = self._loss(steps)
         metrics = {
             key: of_copies(losses[key], copies)

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from proposer_rl.learning.losses import ACTED_VALUE
 from proposer_rl.learning.rollout import set_values
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic
@@ -88,12 +89,12 @@ class Statistics:
         if self._agent.normalization is not None and not first:
             self._agent.normalization.update_observations(rollout)
 
-    def in_units(self, steps: TensorDictBase, *keys: str) -> TensorDictBase:
-        """Entries of steps in the unit of the agent's values."""
-        normalization = self._agent.normalization
+    def in_units(self, steps: TensorDictBase) -> TensorDictBase:
+        """Steps whose values, targets and advantages are in the unit of the agent's values."""
+        value, normalization = self._agent.value_key, self._agent.normalization
         if normalization is not None and normalization.returns is not None:
-            unit = normalization.unit(steps[self._agent.value_key])
-            for key in set(keys) & set(steps.keys()):
+            unit = normalization.unit(steps[value])
+            for key in {value, ACTED_VALUE, "value_target", "advantage"} & set(steps.keys()):
                 steps.set(key, steps[key] / unit)
         return steps
 
