@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -38,11 +36,10 @@ def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCrit
         read_maps, ["policy_map", "value_map", "agent"], ["logits", "state_value"]
     )
     copies = network.copies if isinstance(network, Population) else None
-    build = partial(ActorCritic, distribution_class=categorical, copies=copies)
-    if not per_step:
-        return build(head, maps)
-    head = TensorDictSequential(maps, head, selected_out_keys=["logits", "state_value"])
-    return build(head)
+    encoder = None if per_step else maps
+    if per_step:
+        head = TensorDictSequential(maps, head, selected_out_keys=["logits", "state_value"])
+    return ActorCritic(head, encoder, distribution_class=categorical, copies=copies)
 
 
 def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Tensor, Tensor]:
