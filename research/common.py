@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -20,15 +20,8 @@ Rows = list[dict[str, Any]]
 STAGES = "A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000."
 
 
-class Checkpoint(NamedTuple):
-    """A run and one of its stages."""
-
-    run: StoredRun
-    stage: Stage
-
-
-def checkpoints(folders: Sequence[Path]) -> Iterator[Checkpoint]:
-    """Every checkpoint of the runs in some folders, with a progress bar.
+def checkpoints(folders: Sequence[Path]) -> Iterator[tuple[StoredRun, Stage]]:
+    """The runs in some folders, each with every stage that it has kept; with a progress bar.
 
     Raises:
         ConfigError, CheckpointError: if a folder is no run's, or a checkpoint cannot be read.
@@ -36,7 +29,7 @@ def checkpoints(folders: Sequence[Path]) -> Iterator[Checkpoint]:
     runs = [stored_run(folder) for folder in folders]
     found = [(run, file) for run in runs for file in run.files]
     for run, file in tqdm(found, desc="checkpoints", disable=not sys.stderr.isatty()):
-        yield Checkpoint(run, run.stage(file))
+        yield run, run.stage(file)
 
 
 def parser_of(name: str, description: str, seed: str, epilog: str = "") -> argparse.ArgumentParser:
@@ -55,15 +48,15 @@ def answer(
     show: Callable[[str, Rows], Table],
 ) -> None:
     """Measure, print a table for each run, and write the rows; bad input ends in one line."""
-    command(lambda: _answer(options, measure, show))
 
+    def body() -> None:
+        check_file("output", options.output, ".json")
+        try:
+            rows = measure(options)
+        except (ValueError, TypeError) as error:
+            raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
+        for run in dict.fromkeys(row["run"] for row in rows):
+            Console().print(show(run, [row for row in rows if row["run"] == run]))
+        write_rows(rows, options.output)
 
-def _answer(options: argparse.Namespace, measure: Any, show: Any) -> None:
-    check_file("output", options.output, ".json")
-    try:
-        rows: Rows = measure(options)
-    except (ValueError, TypeError) as error:
-        raise error if hasattr(error, "exit_code") else ConfigError(str(error)) from error
-    for run in dict.fromkeys(row["run"] for row in rows):
-        Console().print(show(run, [row for row in rows if row["run"] == run]))
-    write_rows(rows, options.output)
+    command(body)

@@ -21,12 +21,13 @@ from torch import Tensor
 
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.transport import interim_target, mastered, squared_distances
 from proposer_rl.meta.first_order import Direction, exact_alignment, exact_direction, scaled
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask, Levels, LocatedTarget
-from research.common import Checkpoint, Rows, answer, checkpoints, parser_of
+from research.common import Rows, answer, checkpoints, parser_of
 from research.signal import variance_components
 
 DELTA = 0.2  # least success of the bins that the interim target lies on
@@ -38,12 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _rows(options: argparse.Namespace) -> Rows:
-    return [row for one in checkpoints(options.folders) for row in _measure(one, options)]
+    return [row for one in checkpoints(options.folders) for row in _measure(*one, options)]
 
 
-def _measure(checkpoint: Checkpoint, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def _measure(run: StoredRun, stage: Stage, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for every direction, from a checkpoint."""
-    run, stage = checkpoint
     task, size, each = run.task, run.task.space.size, options.each
     if not isinstance(task, DifferentiableTask) or not isinstance(task, LocatedTarget):
         raise ConfigError(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv
@@ -27,7 +28,7 @@ from proposer_rl.meta.rewards import log_success, log_success_gain
 from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask
-from research.common import Checkpoint, Rows, answer, checkpoints, parser_of
+from research.common import Rows, answer, checkpoints, parser_of
 from research.signal import performance_at, uneven_shares
 
 CANDIDATES = 32  # levels of each bin that are scored
@@ -39,12 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _rows(options: argparse.Namespace) -> Rows:
-    return [row for one in checkpoints(options.folders) for row in _measure(one, options)]
+    return [row for one in checkpoints(options.folders) for row in _measure(*one, options)]
 
 
-def _measure(checkpoint: Checkpoint, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def _measure(run: StoredRun, stage: Stage, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for every number of updates ahead of a checkpoint."""
-    run, stage = checkpoint
     task = run.task
     if not isinstance(task, DifferentiableTask):
         raise ConfigError(

@@ -17,6 +17,7 @@ from rich.table import Table
 from torch import Tensor
 
 from proposer_rl.cli.arguments import number
+from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success, performance_gain
@@ -24,7 +25,7 @@ from proposer_rl.meta.settings import MixtureSettings
 from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
-from research.common import Checkpoint, Rows, answer, checkpoints, parser_of
+from research.common import Rows, answer, checkpoints, parser_of
 from research.signal import by_validation_size, performance_at, uneven_shares
 
 SPREAD = MixtureSettings().spread  # of a Proposer's first policy over mixtures
@@ -43,14 +44,13 @@ def _rows(options: argparse.Namespace) -> Rows:
     """A row for every checkpoint, exploration, measure and validation size."""
     return [
         row
-        for checkpoint in checkpoints(options.folders)
+        for one in checkpoints(options.folders)
         for name in options.explorations
-        for row in _measure(checkpoint, name, options)
+        for row in _measure(*one, name, options)
     ]
 
 
-def _measure(checkpoint: Checkpoint, exploration: str, options: argparse.Namespace) -> Rows:
-    run, stage = checkpoint
+def _measure(run: StoredRun, stage: Stage, exploration: str, options: argparse.Namespace) -> Rows:
     task = run.task
     length = options.meta_episode_length or run.config.proposer.meta_episode_length
     streams = Streams(options.seed, "snr", run.folder.name, stage.step)
