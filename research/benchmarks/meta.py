@@ -53,34 +53,26 @@ def meta_step(options: Options) -> Result:
 
 def step_and_parts(env: SolverTrainingEnv, rounds: int, device: str) -> Timings:
     """A step, as ``step``, and what it consists of, timed in turns."""
-    parts = StepParts(env)
-    calls = {part: getattr(parts, part) for part in PARTS}
-    return interleave({"step": MetaStep(env), **calls}, rounds, device)
+    step = MetaStep(env)
+    return interleave({name: getattr(step, name) for name in ("step", *PARTS)}, rounds, device)
 
 
 class MetaStep:
-    """A step with random actions, as a collector makes it."""
+    """A step, and what it consists of without the environment around it."""
 
     def __init__(self, env: SolverTrainingEnv) -> None:
         self.env = env
         self.state = env.reset()
-
-    @torch.no_grad()
-    def __call__(self) -> None:
-        """Step every Solver once."""
-        action = self.env.action_spec.rand()
-        _, self.state = self.env.step_and_maybe_reset(self.state.set("action", action))
-
-
-class StepParts:
-    """What a step consists of, without the environment around it."""
-
-    def __init__(self, env: SolverTrainingEnv) -> None:
-        self.env = env
         self.solvers = env.solvers
         self.task = env.view.task
         self.streams = [Streams(copy, "bench") for copy in range(env.batch_size[0])]
         self.generators = [stream.generator() for stream in self.streams]
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Step every Solver once with random actions, as a collector does."""
+        action = self.env.action_spec.rand()
+        _, self.state = self.env.step_and_maybe_reset(self.state.set("action", action))
 
     def generation(self) -> None:
         """Levels for random actions."""
