@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from research.benchmarks.jaxued_peer import __file__ as PROGRAM
+from research.benchmarks.timing import Timings, interleave
 
 ISOLATED = "-I"  # else it would find our packages, and our modules beside the program
 
@@ -32,6 +34,22 @@ class Peer(NamedTuple):
 
     about: str
     play: Callable[[str], tuple[float, float]]
+
+    def in_turn(
+        self, ways: Sequence[str], ours: Mapping[str, Callable[[], object]], repeats: int
+    ) -> Timings:
+        """Time what is ours and some ways of the process in turn.
+
+        Seconds of the ways are by the process's own clock, which leaves out the way there and back.
+        """
+        clock: Timings = {way: [] for way in ways}
+
+        def theirs(way: str) -> None:
+            clock[way].append(self.play(way)[0])
+
+        calls = dict(ours) | {way: partial(theirs, way) for way in ways}
+        seconds = interleave(calls, repeats)
+        return seconds | {way: times[-repeats:] for way, times in clock.items()}
 
 
 def said_by(python: str, program: str, *arguments: object) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from proposer_rl.tasks.view_mazes.generation import scattered_walls
 from proposer_rl.tasks.view_mazes.levels import ViewLevel
 from research.benchmarks.environment import through_torchrl
 from research.benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
-from research.benchmarks.peer import Peer, jaxued_maze
+from research.benchmarks.peer import jaxued_maze
 from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.timing import interleave, rate, ratio
 
@@ -83,16 +83,8 @@ def beside_jaxued(sizes: list[tuple[ViewLevel, Tensor]], python: str, repeats: i
                 theirs = peer.play(way)[1]  # compiles, too
                 if abs(ours - theirs) > 1e-3:
                     raise AssertionError(f"the environments differ: total rewards {(ours, theirs)}")
-            clock: dict[str, list[float]] = {way: [] for way in WAYS}
-            seconds = interleave(
-                {
-                    "TorchRL": partial(through_torchrl, env, actions),
-                    **{way: partial(_timed, peer, way, clock[way]) for way in WAYS},
-                },
-                repeats,
-            )
-        # What that process's own clock says leaves out the way there and back.
-        seconds |= {way: times[-repeats:] for way, times in clock.items()}
+            through = partial(through_torchrl, env, actions)
+            seconds = peer.in_turn(WAYS, {"TorchRL": through}, repeats)
         interface = f"ViewMazeEnv through TorchRL, batch {len(levels):,}"
         result.rows.append(
             Row(
@@ -137,7 +129,3 @@ def through_minigrid(levels: ViewLevel, actions: Tensor) -> float:
             if terminated or truncated:
                 env.reset()
     return total
-
-
-def _timed(peer: Peer, way: str, seconds: list[float]) -> None:
-    seconds.append(peer.play(way)[0])

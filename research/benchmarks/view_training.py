@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from functools import partial
 
 import torch
 
 from proposer_rl.models.population import available_cores
 from proposer_rl.streams import Streams
 from research.benchmarks.jaxued_peer import TRAINING
-from research.benchmarks.peer import Peer, jaxued_maze
+from research.benchmarks.peer import jaxued_maze
 from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.scales import Scale, Solvers
 from research.benchmarks.timing import interleave, rate, ratio, threads
@@ -52,12 +51,7 @@ def on_these_cores(scale: Scale, options: Options) -> Result:
     actions = torch.zeros(settings.horizon, task.batch_size, dtype=torch.int64)
     numbers = asdict(settings) | scale.config.task["network"]
     with jaxued_maze(options.jaxued, levels, actions, task.maze.max_steps, numbers) as peer:
-        clock: list[float] = []
-        seconds = interleave(
-            {"update": solvers.update, TRAINING: partial(_trained, peer, clock)}, options.few
-        )
-    # What that process's own clock says leaves out the way there and back.
-    seconds[TRAINING] = clock[-options.few :]
+        seconds = peer.in_turn([TRAINING], {"update": solvers.update}, options.few)
     fast, theirs = (rate(frames, seconds[name]) for name in ("update", TRAINING))
     return Result(
         [
@@ -73,7 +67,3 @@ def on_these_cores(scale: Scale, options: Options) -> Result:
         ],
         notes=[f"{peer.about}; torch with {torch.get_num_threads()} thread(s)."],
     )
-
-
-def _trained(peer: Peer, seconds: list[float]) -> None:
-    seconds.append(peer.play(TRAINING)[0])
