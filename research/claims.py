@@ -7,8 +7,7 @@ What the runs cannot decide is undecided, never taken as refuted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import Literal
 
@@ -36,7 +35,6 @@ from research.ranking import TARGET, Needs, needs_of
 
 Verdict = Literal["supported", "contradicted", "undecided", "too few seeds"]
 Evidence = tuple[Verdict, str]
-Test = Callable[[Sequence[Group]], Evidence]  # whether the first of two methods beats the second
 
 TITLE = (
     "All Life is Problem Creation: Learning to Generate Environments that Maximize Performance "
@@ -56,16 +54,12 @@ HARDER = {"obstacle fraction", "walls", "path length"}
 
 def paper_claims(study: Study) -> list[tuple[str, Evidence | None]]:
     """The claims of the paper, and what the runs say; None where its methods are missing."""
-    beats = beats_in(study)
     tests: list[tuple[str, Callable[[Study], Evidence | None]]] = [
         ("The baseline that trains on the target alone stalls at first.", _stall),
         ("Both Proposers learn almost at once.", _learn_at_once),
-        ("Performance gain learns faster than the baseline.", partial(_faster, beats=beats)),
+        ("Performance gain learns faster than the baseline.", _faster),
         ("Out of distribution the methods end up alike.", _alike),
-        (
-            "Performance gain beats task difficulty slightly, not significantly.",
-            partial(_slightly, beats=beats),
-        ),
+        ("Performance gain beats task difficulty slightly, not significantly.", _slightly),
         ("Proposals start easy and grow harder.", _grow_harder),
         (
             "The maximum gain of the replicas stays positive while the mean falls below zero.",
@@ -73,11 +67,6 @@ def paper_claims(study: Study) -> list[tuple[str, Evidence | None]]:
         ),
     ]
     return [(claim, test(study)) for claim, test in tests]
-
-
-def beats_in(study: Study) -> Test:
-    """A test of two methods of a study: does the first beat the second?"""
-    return partial(_beats, study=study, decided=decisions(study))
 
 
 def rules(study: Study) -> str:
@@ -93,26 +82,25 @@ def rules(study: Study) -> str:
     )
 
 
-def _faster(study: Study, beats: Test) -> Evidence | None:
+def _faster(study: Study) -> Evidence | None:
     groups = _present(study, GAIN, BASELINE)
-    return beats(groups) if len(groups) == 2 else None
+    return _beats(study, *groups) if len(groups) == 2 else None
 
 
-def _beats(
-    groups: Sequence[Group], study: Study, decided: Mapping[tuple[str, str], Decision]
-) -> Evidence:
+def _beats(study: Study, one: Group, other: Group) -> Evidence:
     """Does the first of two methods beat the second, and at what cost in frames?"""
-    one, other = (group.label for group in groups)
-    decision = decided[one, other]
+    decision = decisions(study)[one.label, other.label]
     verdict: Verdict = "too few seeds" if decision.verdict == TOO_FEW else "undecided"
     if decision.winner:
-        verdict = "supported" if decision.winner == one else "contradicted"
+        verdict = "supported" if decision.winner == one.label else "contradicted"
     text = "; ".join(
-        f"{outcome.name}: {write(difference(outcome, groups[0], groups[1]).interval())}"
+        f"{outcome.name}: {write(difference(outcome, one, other).interval())}"
         f"{f' ({decision.reason})' * (number == 0)}"
         for number, outcome in enumerate(outcomes(study)[:3])
     )
-    costs = [np.mean([r.total_frames[-1] / max(r.updates, 1) for r in g.runs]) for g in groups]
+    costs = [
+        np.mean([r.total_frames[-1] / max(r.updates, 1) for r in g.runs]) for g in (one, other)
+    ]
     ratio = costs[0] / costs[1] if costs[1] else math.nan
     return verdict, f"{text}; frames: {ratio:.1f} times as many"
 
@@ -190,11 +178,11 @@ def _alike(study: Study) -> Evidence | None:
     return _either(math.nan, smallest), text
 
 
-def _slightly(study: Study, beats: Test) -> Evidence | None:
+def _slightly(study: Study) -> Evidence | None:
     groups = _present(study, GAIN, DIFFICULTY)
     if len(groups) < 2:
         return None
-    verdict, text = beats(groups)
+    verdict, text = _beats(study, *groups)
     if verdict == "too few seeds":
         return verdict, text
     if verdict != "undecided":
@@ -375,9 +363,8 @@ def _learns_where_the_other_does_not(study: Study) -> Evidence | None:
     own, literal, random = (study.group(label) for label in (PROPOSER, LITERAL, RANDOM))
     if own is None or literal is None or random is None or not is_rate(study.headline):
         return None
-    beats = beats_in(study)
-    verdict, text = beats((own, random))
-    other, more = beats((literal, random))
+    verdict, text = _beats(study, own, random)
+    other, more = _beats(study, literal, random)
     text = f"{own.label} against {random.label}: {text}. {literal.label} against it: {more}"
     if "too few seeds" in (verdict, other):
         return "too few seeds", text
