@@ -42,28 +42,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _rows(options: argparse.Namespace) -> Rows:
-    found = shown(options.proposer, options.solvers, options.seed)
-    return [{"run": options.proposer.name, **row} for row in found]
-
-
-def shown(proposer: Path, solvers: Path, seed: int = 0) -> Rows:
     """What a Proposer proposes to the Solver of every checkpoint, and to mixtures of Solvers.
 
-    Args:
-        proposer: the folder of the run that it learnt in.
-        solvers: the folder of the run whose checkpoints hold the Solvers; same task.
-        seed: of the validation and probe levels.
-
-    Returns:
-        For every stage and everything that is seen of a Solver, in turn taken from the first or the
-        last stage instead: the mean of the proposals along each axis of the space, and their
-        distance (total variation, 0 to 1) from those to the Solver as it is.
+    For every stage and everything that is seen of a Solver, in turn taken from the first or the
+    last stage instead: the mean of the proposals along each axis of the space, and their distance
+    (total variation, 0 to 1) from those to the Solver as it is.
     """
+    proposer, seed = options.proposer, options.seed
     config = saved_config(proposer)
     task = make_task(config)
     frozen = frozen_proposer(Components(task, config.proposer, [seed]), str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
-    stages = _stages(task, frozen, stored_run(solvers))
+    stages = _stages(task, frozen, stored_run(options.solvers))
     rows = []
     for stage in stages:
         shares = _shares(frozen, stage.seen, task.batch_size)
@@ -75,7 +65,7 @@ def shown(proposer: Path, solvers: Path, seed: int = 0) -> Rows:
                 swapped = stage.seen.clone().set(part, other.seen[part])
                 changed = _shares(frozen, swapped, task.batch_size)
                 rows.append(_row(task.space, stage, f"{part} of the {name}", changed, shares))
-    return rows
+    return [{"run": proposer.name, **row} for row in rows]
 
 
 def _stages(task: Task, frozen: ProposerCurriculum, solvers: StoredRun) -> list[Seen]:

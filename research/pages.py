@@ -56,39 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _answer(options: argparse.Namespace) -> None:
-    asked = (options.threshold, options.baseline, options.scores, options.seconds)
-    for path in write_pages(options.folder, options.output, needs([CONFIG_FOLDER]), *asked):
-        print(f"Page: {path}")
-
-
-def write_pages(
-    folders: Sequence[Path],
-    output: Path,
-    needs: Needs,
-    threshold: float | None = None,
-    baseline: str | None = None,
-    scores: Path | None = None,
-    seconds: Sequence[Path] = (),
-) -> list[Path]:
-    """Write the pages.
-
-    Args:
-        folders: of runs, or with runs in them; all measured alike.
-        output: a folder for the pages and their figures, such as the study's own.
-        needs: what methods need, for runs that do not tell.
-        threshold: see :func:`~proposer_rl.report.build.write_report`.
-        baseline: the same.
-        scores: of the runs on further levels, by ``bin/research scores``; None for none.
-        seconds: of the methods, as ``bin/bench curricula --runs`` writes them; none for what the
-            runs took.
-
-    Returns:
-        The pages.
-
-    Raises:
-        UnreadableRun: if a folder has no run, none can be read, or a file holds something else.
-        OutputError: if the output folder holds something else, or the runs were not measured alike.
-    """
+    folders, output, seconds = options.folder, options.output, options.seconds
+    scores, threshold, baseline = options.scores, options.threshold, options.baseline
+    needed = needs([CONFIG_FOLDER])  # by methods whose runs do not tell
     check_output(output, CHOICE, STUDY)
     studies, notes = read_checked(folders, threshold, baseline)
     if len(studies) > 1:
@@ -104,8 +74,8 @@ def write_pages(
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}
     pages = {
-        CHOICE: _choice(ranked, rounds, needs, files),
-        CLAIMS: _claims(ranked, needs, others, files),
+        CHOICE: _choice(ranked, rounds, needed, files),
+        CLAIMS: _claims(ranked, needed, others, files),
     }
     for name, parts in pages.items():
         lines = [*parts, "## How this page is made", _origin(study, made, notes)]
@@ -113,7 +83,8 @@ def write_pages(
     (output / FIGURES).mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         write_atomically(output / name, content)
-    return [output / name for name in pages]
+    for name in pages:
+        print(f"Page: {output / name}")
 
 
 def _choice(

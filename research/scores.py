@@ -48,13 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def compare(folders: Sequence[Path], names: Sequence[str], output: Path | None) -> None:
-    """Print a table of methods.
-
-    Args:
-        folders: of runs, or with runs in them.
-        names: of sets of levels, as ``bin/eval`` takes them.
-        output: a file for the scores; None for none.
-    """
+    """Print a table of methods; new scores are added to the output where there is one."""
     _check(names, output)
     studies, notes = read_studies(find_runs(folders), None)
     scores = _stored(output)

@@ -50,23 +50,13 @@ def answer(arguments: argparse.Namespace) -> None:
     # Told to end, it ends the benchmark's process too.
     before = signal.signal(signal.SIGTERM, _terminated)
     try:
-        sys.exit(run(arguments.names, _options(arguments), arguments.threads, arguments.output))
+        sys.exit(_run(arguments.names, _options(arguments), arguments.threads, arguments.output))
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def run(names: list[str], options: Options, threads: int | None, output: Path) -> int:
-    """Run benchmarks one after another, each in a process of its own.
-
-    Args:
-        names: of the benchmarks; empty for the default ones.
-        options: for each of them.
-        threads: of torch; None leaves torch's choice.
-        output: the JSON file to write.
-
-    Returns:
-        The exit code.
-    """
+def _run(names: list[str], options: Options, threads: int | None, output: Path) -> int:
+    """Run benchmarks, each in a process of its own; write the file and return the exit code."""
     chosen = selected(names, options.size == "full", options.device.startswith("cuda"))
     content: dict[str, Any] = {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
