@@ -40,6 +40,7 @@ from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
@@ -117,7 +118,7 @@ def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
     state = learner.snapshot()
     direction = {}
     for name, gradient in zip(parameters, gradients, strict=True):
-        step = _per_copy(state[name, "step"], gradient)
+        step = expand_as_right(state[name, "step"], gradient)
         bias = 1 - SECOND_MOMENT_DECAY**step
         moment = torch.where(step > 0, state[name, "exp_avg_sq"] / bias, torch.ones_like(gradient))
         direction[name] = gradient / (moment.sqrt() + learner.settings.adam_eps)
@@ -133,7 +134,7 @@ def scaled(direction: Direction) -> dict[str, Tensor]:
     size = root_mean_square(direction)
     _refuse(~size.isfinite(), "the target direction is not finite")
     size = torch.where(size > 0, size, torch.ones_like(size))
-    return {name: entry / _per_copy(size, entry) for name, entry in direction.items()}
+    return {name: entry / expand_as_right(size, entry) for name, entry in direction.items()}
 
 
 def _refuse(wrong: Tensor, why: str) -> None:
@@ -279,8 +280,3 @@ def bin_scores(values: Tensor) -> tuple[Tensor, Tensor]:
     if count < 2:
         return values.mean(-1), torch.full_like(values[..., 0], torch.inf)
     return values.mean(-1), values.std(-1) / count**0.5
-
-
-def _per_copy(values: Tensor, like: Tensor) -> Tensor:
-    """Values [K], to be broadcast against [K, ...]."""
-    return values.view(-1, *[1] * (like.ndim - 1))
