@@ -116,7 +116,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     if agent.level_keys or not population.at_hand(value):  # to count is to wait
         steps.set(("next", key), agent.decode(after, context).get(key))
         return
-    shape = (1 if agent.copies is None else agent.copies, -1)
+    shape = (agent.copies or 1, -1)
     unknown = steps.get(("next", "done")).squeeze(-1).clone()
     unknown[..., -1] = True
     unknown = unknown.reshape(shape)

@@ -124,11 +124,7 @@ class ActorCritic(TensorDictModuleBase):
         return self.distribution_class(logits=tensordict.get(self.logits_key))
 
     def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
-        """The module that turns logits into an action and its log-probability.
-
-        Args:
-            sample: see :meth:`actor`.
-        """
+        """The module that turns logits into an action and its log-probability; as :meth:`actor`."""
         return ProbabilisticTensorDictModule(
             in_keys={"logits": self.logits_key},
             out_keys=[self.action_key],

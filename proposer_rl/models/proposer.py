@@ -72,7 +72,6 @@ class ProposerNetwork(nn.Module):
         width = context + numbers
         self.encoder = encoder
         self.value = nn.Sequential(nn.Linear(width, hidden), nn.Tanh(), nn.Linear(hidden, 1))
-        self.context = context
         orthogonal_(self)
         orthogonal_(self.value[-1], 1.0)
         self.head = head
@@ -84,14 +83,12 @@ class ProposerNetwork(nn.Module):
             probes: float [*B, C, ...].
             numbers: of what else is observed, each [*B, 1].
         """
-        context = torch.cat([self._encode(probes), *numbers], -1)
-        return self.head(context), self.value(context)
-
-    def _encode(self, probes: Tensor) -> Tensor:
         features = self.encoder(probes)  # [*B, C, context]
-        if features.shape[-2] == 0:  # C = 0: a Proposer that does not see the Solver's answers
-            return features.new_zeros(*features.shape[:-2], self.context)
-        return torch.relu(features.mean(-2))
+        *batch, probed, width = features.shape
+        # Without probes the Proposer does not see the Solver's answers.
+        seen = torch.relu(features.mean(-2)) if probed else features.new_zeros(*batch, width)
+        context = torch.cat([seen, *numbers], -1)
+        return self.head(context), self.value(context)
 
 
 class ProblemHead(nn.Module):

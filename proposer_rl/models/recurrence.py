@@ -50,8 +50,7 @@ def distinct(codes: Tensor) -> tuple[Tensor, Tensor]:
         One row of each kind, int64 [U], and the kind of each row, int64 [R]. On a GPU, which would
         have to be waited for, and under ``vmap`` every row is a kind of its own.
     """
-    kinds, kind = _Distinct.apply(codes)
-    return kinds, kind
+    return _Distinct.apply(codes)
 
 
 class _Distinct(torch.autograd.Function):
