@@ -10,8 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-NextLevels = Callable[[Tensor], Any]
-
 
 class ContinuedEpisodes(TransformedEnv):
     """Hands out where its episodes stand when it is reset, after the first time.
@@ -29,7 +27,7 @@ class ContinuedEpisodes(TransformedEnv):
 
     def __init__(self, env: EnvBase) -> None:
         super().__init__(env, Compose(), auto_unwrap=False)
-        self.next_levels: NextLevels | None = None
+        self.next_levels: Callable[[Tensor], Any] | None = None
         self.begin_anew()
 
     @property

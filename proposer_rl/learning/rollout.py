@@ -45,10 +45,10 @@ class RolloutCollector:
         self._agent = agent
         self._action = env.full_action_spec[agent.action_key]
         self._horizon = horizon
-        self._level = _LevelAside(*agent.level_keys)
-        self._policy = RolloutPolicy(agent)
+        self._level = _LevelAside(*agent.level_keys) if agent.level_keys else None
+        self._policy = RolloutPolicy(agent, self._level)
         acted_in = self.episodes or env
-        if agent.level_keys:
+        if self._level is not None:
             acted_in = _WithoutLevel(acted_in, self._level, auto_unwrap=False)
         self._collector = Collector(
             acted_in,
@@ -83,14 +83,15 @@ class RolloutCollector:
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
         """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
-        level = self._level if self._agent.level_keys else None
-        self._policy.begin(inputs["noise"], level, self.memory)
+        self._policy.begin(inputs["noise"], self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
             self.memory = self._policy.memory
         set_next_values(self._agent, rollout, self._policy.context)
-        entries = TensorDict({}, rollout.batch_size[:-1]) if level is None else level.entries
-        return TensorDict({"rollout": rollout, "level": entries})
+        level = TensorDict({}, rollout.batch_size[:-1])
+        if self._level is not None:
+            level = self._level.entries
+        return TensorDict({"rollout": rollout, "level": level})
 
 
 @torch.no_grad()
@@ -140,15 +141,16 @@ class RolloutPolicy(TensorDictModuleBase):
 
     Args:
         agent: its parameters do not become the policy's, so that a collector leaves them be.
+        level: where a reset puts the level aside; None where it stays in every step.
     """
 
     context: TensorDictBase
     memory: TensorDictBase
 
-    def __init__(self, agent: ActorCritic) -> None:
+    def __init__(self, agent: ActorCritic, level: _LevelAside | None = None) -> None:
         super().__init__()
-        # In a tuple, nn.Module does not register it.
-        self._agent = (agent,)
+        # In tuples, nn.Module does not register them.
+        self._agent, self._level = (agent,), (level,)
         self.in_keys = agent.step_keys
         self.out_keys = [
             agent.action_key,
@@ -158,21 +160,14 @@ class RolloutPolicy(TensorDictModuleBase):
             *agent.memory_keys,
         ]
 
-    def begin(
-        self,
-        noise: Tensor,
-        level: _LevelAside | None = None,
-        memory: TensorDictBase | None = None,
-    ) -> None:
-        """Expect a rollout with this noise [T, ...].
+    def begin(self, noise: Tensor, memory: TensorDictBase | None = None) -> None:
+        """Expect a rollout.
 
         Args:
-            noise: uniform numbers in [0, 1), one for each element of T actions.
-            level: where the next reset puts the level aside; None where it stays in every step.
+            noise: uniform numbers in [0, 1), [T, ...], one for each element of T actions.
             memory: of the episodes that go on, [*B]; None where all of them begin.
         """
         self._steps = enumerate(noise)
-        self._level = (level,)
         self._before = memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
