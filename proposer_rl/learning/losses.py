@@ -45,10 +45,7 @@ class CopiesClipLoss(ClipPPOLoss):
     ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
     are means over all replicas.
 
-    Args:
-        actor, critic: as :meth:`~proposer_rl.models.ActorCritic.readout` makes them.
-        copies: K, or None for a single network.
-        numbers: further arguments of :class:`torchrl.objectives.ClipPPOLoss`.
+    ``numbers`` are further arguments of :class:`torchrl.objectives.ClipPPOLoss`.
     """
 
     def __init__(
@@ -123,15 +120,10 @@ def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None
 
 
 def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
-    """Scale gradients (in place) so that no replica's norm exceeds ``max_norm``.
-
-    Args:
-        parameters: with replicas, each [K, ...].
-        max_norm: largest norm over all parameters of one replica.
-        copies: K, or None if the parameters belong to a single network.
+    """Scale gradients (in place) so that no replica's norm over its parameters exceeds a largest.
 
     Returns:
-        The norms before clipping, [K] or [].
+        The norms before clipping, [K], without replicas [].
     """
     if copies is None:
         return nn.utils.clip_grad_norm_(parameters, max_norm)

@@ -50,8 +50,7 @@ class Minibatches:
     def draw(self, generators: Sequence[torch.Generator] | None) -> dict[str, Tensor]:
         """The orders of one update, one for each epoch by its entry's name: int64 [K, N] or [N].
 
-        Args:
-            generators: replica k's orders come from the k-th; None for torch's default one.
+        Replica k's come from the k-th generator; without any, from torch's default one.
         """
         settings, copies = self._settings, self._agent.copies
         if settings.minibatches == 1:
@@ -69,12 +68,9 @@ class Minibatches:
     def __call__(
         self, steps: TensorDictBase, level: TensorDictBase, order: Tensor | None
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """The parts of steps [*B, T] on a level [*B], each with its part of the level.
+        """The parts of steps [*B, T] on a level [*B] in an epoch's order, each with its level.
 
-        Args:
-            steps: with all that a loss reads.
-            level: what the agent's encoder reads.
-            order: of an epoch; None for all of it as it is.
+        Without an order that is all of it as it is.
         """
         if order is None:
             yield steps, level

@@ -22,10 +22,7 @@ class Statistics:
     begins with the policy that acted; those of the very first one before, since until then there
     are none. Rewards are taken in before, and the rollout's values are put into the new unit.
 
-    Args:
-        env: that the agent trains in.
-        agent: whose ``normalization`` is set.
-        settings: whether there is one.
+    It sets the agent's ``normalization``, to None where the settings ask for none.
 
     Attributes:
         discounted: rewards so far of episodes that go on, discounted, float64 [*B]; None where
@@ -65,10 +62,7 @@ class Statistics:
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
         """Take in the rewards of a rollout [*B, T], and put its values into their unit.
 
-        Args:
-            rollout: complete.
-            level: what the agent's encoder reads.
-            first: whether nothing was trained on before.
+        In the first one, before which nothing was trained on, observations come first.
         """
         agent, normalization = self._agent, self._agent.normalization
         if normalization is None:

@@ -35,17 +35,7 @@ def meta_env(
     on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
-    """The environment in which a share of a Solver's K replicas is trained.
-
-    Args:
-        task: that they learn.
-        config: what is seen of them, how actions are drawn and how long they hold.
-        streams: of the run's Proposer.
-        reward: of an update.
-        share: numbers of the copies.
-        on_update: called with the number of updates done in an episode.
-        kind: the class.
-    """
+    """The environment in which those of a Solver's K replicas train whose numbers are ``share``."""
     return kind(
         task.learner([streams] * len(share)),
         view=solver_view(task, config),

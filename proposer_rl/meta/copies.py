@@ -52,19 +52,14 @@ class Copies:
         self._env: SolverTrainingEnv = proposer.env
 
     def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
-        """One episode of K replicas of a Solver.
-
-        Args:
-            solver: a snapshot of one Solver, batch [].
-            streams: of the cycle.
+        """One episode of K replicas of a Solver, whose snapshot is given, batch [].
 
         Returns:
             The Proposer's rollout, [K, T], ready for
             :meth:`~proposer_rl.learning.ppo.PPO.optimise`.
         """
-        env = self._env
-        env.fork(solver, streams)
-        copies = range(env.batch_size[0])
+        self._env.fork(solver, streams)
+        copies = range(self._env.batch_size[0])
         return self._proposer.collect(action_generators(streams, copies))
 
     def trained(self, copy: int) -> Trained:

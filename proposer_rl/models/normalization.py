@@ -22,11 +22,8 @@ TINY = 1e-8  # added to variances
 class RunningMoments(nn.Module):
     """Mean and variance of all numbers so far, those of each replica by themselves.
 
-    Merged by Chan et al. 1983 ("Algorithms for computing the sample variance"), in float64.
-
-    Args:
-        copies: K, or None for a single set.
-        shape: S, of what has a mean and a variance.
+    Merged by Chan et al. 1983 ("Algorithms for computing the sample variance"), in float64, of
+    whatever has the shape S.
     """
 
     count: Tensor
@@ -82,10 +79,7 @@ class Normalization(nn.Module):
     deviation of the discounted return, and its loss is taken in that unit: the same as rewards
     divided by it, and whoever reads a value need not know.
 
-    Args:
-        copies: K, or None for a single agent.
-        observations: shapes of the entries that are normalised, by name.
-        rewards: whether values have a unit.
+    ``observations`` are the shapes of the entries that are normalised, by name.
     """
 
     def __init__(

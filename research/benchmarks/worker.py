@@ -25,12 +25,7 @@ class BenchmarkFailed(Exception):
 
 
 def run_apart(name: str, options: Options, threads: int | None) -> dict[str, Any]:
-    """Run a benchmark in a fresh process.
-
-    Args:
-        name: of the benchmark.
-        options: for it.
-        threads: of torch; None leaves torch's choice.
+    """Run a benchmark in a fresh process; without a number of threads, torch chooses.
 
     Returns:
         ``seconds``, ``peak_memory`` in bytes, ``threads``, and the ``result`` as plain dicts; on

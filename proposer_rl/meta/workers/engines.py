@@ -56,18 +56,13 @@ def start(
     environments: list[Callable[[], Any]],
     policies: list[Callable[[], Any]],
     frames: int,
-    check: Callable[[], None] = lambda: None,
-    patient: bool = False,
+    check: Callable[[], None],
+    patient: bool,
 ) -> BaseCollector:
-    """Start the workers.
+    """Start the workers, each of which collects so many frames in a batch.
 
-    Args:
-        settings: where and how many they are.
-        environments: a factory for each worker, which can be pickled.
-        policies: the same.
-        frames: that each worker collects in a batch.
-        check: called while they are waited for; what it raises ends the wait.
-        patient: whether machines may come that are missing, as after one was lost.
+    Their factories can be pickled. While they are waited for there is a ``check``, which may raise;
+    the ``patient`` also wait for machines that are missing, as after one was lost.
 
     Raises:
         WorkersError: if there is no such cluster, it is too small, or its workers do not come up.

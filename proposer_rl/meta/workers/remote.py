@@ -75,13 +75,9 @@ def worker_env(
 
 
 class WorkerPolicy(RolloutPolicy):
-    """The Proposer in a worker; :meth:`start` before every rollout.
+    """The Proposer in a worker, where an action of one replica has this shape.
 
-    Args:
-        agent: the Proposer on the CPU; its weights do not matter.
-        horizon: steps T of a rollout.
-        shape: of one replica's action.
-        device: where it acts.
+    It gets its weights before every rollout.
     """
 
     def __init__(self, agent: ActorCritic, horizon: int, shape: torch.Size, device: str) -> None:
@@ -90,7 +86,7 @@ class WorkerPolicy(RolloutPolicy):
         self.shape = shape
 
     def start(self, weights: TensorDictBase, streams: Streams, share: range) -> None:
-        """Expect a rollout."""
+        """Expect a rollout of these replicas."""
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():
             parameter.data.copy_(weights[name])
