@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -16,35 +16,6 @@ from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_single_bin
-
-
-class BinCounts:
-    """How many levels of each bin have come back since they were last asked for.
-
-    Args:
-        space: that has the bins.
-    """
-
-    def __init__(self, space: Space) -> None:
-        self._shape = [len(values) for values in space.axes.values()]
-        self.counts = torch.zeros(space.size, dtype=torch.int64)
-
-    def add(self, bins: Tensor) -> None:
-        """Count levels of these bins, int64 of any shape."""
-        self.counts = self.counts + bins.flatten().bincount(minlength=len(self.counts))
-
-    def histogram(self) -> list[Any]:
-        """The counts along the axes of the space; they begin anew."""
-        counts, self.counts = self.counts, torch.zeros_like(self.counts)
-        return list(counts.view(self._shape).tolist())
-
-    def state_dict(self) -> dict[str, Any]:
-        """The counts."""
-        return {"counts": self.counts}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on counting."""
-        self.counts = state["counts"]
 
 
 class BinCurriculum(Curriculum):
@@ -67,7 +38,7 @@ class BinCurriculum(Curriculum):
         refuse_single_bin(space)
         self.space, self._every = space, every
         self._proposed = 0
-        self._counts = BinCounts(space)
+        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._inbox = Inbox()
         self.scores: dict[str, Tensor] = {}  # what the shares come from, each [K, N], on the CPU
 
@@ -102,7 +73,7 @@ class BinCurriculum(Curriculum):
         """Count the levels, and put what can be learnt from them aside."""
         self._inbox.check(batch, outcome)
         evidence = self.evidence(student, batch, outcome)
-        self._counts.add(batch.notes["bins"])
+        self._counts += counts_of_bins(batch.notes["bins"], self.space)
         if evidence:
             self._inbox.put(batch, bins=batch.notes["bins"], **evidence)
 
@@ -111,11 +82,11 @@ class BinCurriculum(Curriculum):
         self._take_in()
         if not self.scores:
             return {}
-        shape = [len(values) for values in self.space.axes.values()]
-        shares = self.shares()
+        shares, counts = self.shares(), self._counts
+        self._counts = torch.zeros_like(counts)
         return {
-            "histogram": self._counts.histogram(),
-            **{name: self.scores[name].unflatten(-1, shape).tolist() for name in self.shown},
+            "histogram": along_axes(counts, self.space),
+            **{name: along_axes(self.scores[name], self.space) for name in self.shown},
             "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
             "effective_bins": (1 / shares.square().sum(-1)).tolist(),
         }
@@ -123,6 +94,16 @@ class BinCurriculum(Curriculum):
     def _take_in(self) -> None:
         for evidence in self._inbox.take():
             self.learn(evidence)
+
+
+def counts_of_bins(bins: Tensor, space: Space) -> Tensor:
+    """How many levels there are of each of a space's bins, int64 [N], of bins of any shape."""
+    return bins.flatten().bincount(minlength=space.size)
+
+
+def along_axes(values: Tensor, space: Space) -> list[Any]:
+    """Numbers of a space's bins [*B, N], nested along its axes."""
+    return values.unflatten(-1, [len(axis) for axis in space.axes.values()]).tolist()
 
 
 def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, Tensor]:

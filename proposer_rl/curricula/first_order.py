@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
+from proposer_rl.curricula.bins import BinCurriculum, along_axes, means_of_bins
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.probes import Measure as Outcome
 from proposer_rl.curricula.probes import Probes, tell_cost
@@ -109,8 +109,7 @@ class FirstOrderCurriculum(_AlignedBins):
         if told:
             told["target_performance"] = self.scores["target"].tolist()
         if told and self._candidates > 1:
-            shape = [len(values) for values in self.space.axes.values()]
-            told["score_error"] = self.scores["variance"].sqrt().unflatten(-1, shape).tolist()
+            told["score_error"] = along_axes(self.scores["variance"].sqrt(), self.space)
         return told
 
 

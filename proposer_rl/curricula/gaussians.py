@@ -12,7 +12,7 @@ from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import BinCounts
+from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import Student
 from proposer_rl.extras import install_command
@@ -116,7 +116,7 @@ class MixtureCurriculum(Curriculum):
         self._mixtures: list[TaskMixture] = []  # of each student
         self._fitted = 0  # episodes at the last fit
         self._inbox = Inbox()
-        self._counts = BinCounts(space)
+        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
     @property
@@ -144,7 +144,7 @@ class MixtureCurriculum(Curriculum):
         """Put tasks and returns aside for the histories."""
         self._inbox.check(batch, outcome)
         notes = batch.notes
-        self._counts.add(notes["bins"])
+        self._counts += counts_of_bins(notes["bins"], self.space)
         returns = outcome["return"].double() if self._source == "episodes" else notes["returns"]
         self._inbox.put(batch, points=notes["points"], bins=notes["bins"], returns=returns)
 
@@ -155,8 +155,9 @@ class MixtureCurriculum(Curriculum):
             return {}
         drawn, clipped = self._drawn.tolist()
         self._drawn = torch.zeros_like(self._drawn)
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
-            "histogram": self._counts.histogram(),
+            "histogram": along_axes(counts, self.space),
             "progress": self._history["progress"][:, -self._refit :].mean(1).tolist(),
             "components": [len(mixture.means) for mixture in self._mixtures],
             "means": [mixture.means.tolist() for mixture in self._mixtures],

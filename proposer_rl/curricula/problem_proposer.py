@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
-from proposer_rl.curricula.bins import BinCounts
+from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
@@ -75,7 +75,7 @@ class ProblemProposer(Curriculum):
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
         self._inbox = Inbox()
-        self._counts = BinCounts(space)
+        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
     @abstractmethod
@@ -126,14 +126,15 @@ class ProblemProposer(Curriculum):
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Count the levels."""
         self._inbox.check(batch, outcome)
-        self._counts.add(batch.notes["bins"])
+        self._counts += counts_of_bins(batch.notes["bins"], self.space)
 
     def log(self) -> dict[str, Any]:
         """The last metrics of the policy, and counts."""
         self._take_in()
         if not self._metrics:
             return {}
-        return {**self._metrics, "histogram": self._counts.histogram()}
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        return {**self._metrics, "histogram": along_axes(counts, self.space)}
 
     def learnt(self) -> dict[str, Any]:
         """The Proposer, without its optimiser."""

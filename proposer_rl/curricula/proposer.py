@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula.bins import along_axes
 from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedCurriculum
 from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
@@ -217,7 +218,6 @@ class ProposerTrainer:
         self, rollout: TensorDictBase, rewards: Tensor, training: TensorDict
     ) -> dict[str, Any]:
         proposed = rollout["next", "proposed"].sum((0, 1))  # [N]
-        sides = [len(axis) for axis in self.env.actions.space.axes.values()]
         gains = {
             f"{name}_gain": (rollout["next", name][:, -1, 0] - rollout[name][:, 0, 0]).tolist()
             for name in ("return", "log_success")
@@ -228,5 +228,5 @@ class ProposerTrainer:
             "total_reward": rewards.tolist(),
             "reward_sd": float(rewards.std(correction=0)),
             **{key: float(value) for key, value in training.items()},
-            "histogram": proposed.unflatten(0, sides).tolist(),
+            "histogram": along_axes(proposed, self.env.actions.space),
         }
