@@ -101,16 +101,15 @@ def packed(entries: TensorDictBase) -> dict[str, Any]:
 
 def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
     """What :func:`packed` made a state of, batch [K, m]; ``level`` is of that level's kind."""
-    shape = next(entry.shape[:2] for entry in state.values() if isinstance(entry, Tensor))
-    entries = TensorDict.from_dict(dict(state), batch_size=shape)
-    if "level" in entries and not isinstance(like, Tensor):
-        entries["level"] = of_kind(like, state["level"], shape)
+    entries = TensorDict.from_dict(dict(state), batch_dims=2)
+    if "level" in entries:
+        entries["level"] = of_kind(like, state["level"])
     return entries.clone()
 
 
-def of_kind(like: Levels, state: Mapping[str, Any], shape: Sequence[int]) -> Levels:
-    """Levels of a kind from the nested dicts of their entries."""
-    return type(like).from_dict(state, batch_size=shape)
+def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
+    """Levels [K, m] of a kind from the nested dicts of their entries."""
+    return type(like).from_dict(state, batch_dims=2)
 
 
 def device_of(levels: Levels) -> torch.device:

@@ -178,10 +178,10 @@ class ContinuedLevels:
 
         Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
         """
-        shape, device = self._steps.shape, self._learner.env.device
+        device = self._learner.env.device
         self._proposed, self._most = state["proposed"], state["most"]
         self._waiting = [deque(map(tuple, waiting)) for waiting in state["waiting"]]
-        self._levels = _of_kind(self._levels, state["levels"], shape)
+        self._levels = _of_kind(self._levels, state["levels"])
         self._playing, self._steps = state["playing"].clone(), state["steps"].clone()
         self._batches = {
             number: _Outstanding.of_state(each, self._levels, device)
@@ -190,20 +190,17 @@ class ContinuedLevels:
         self._history = self._shown = None
         if state["shown"] is not None:
             levels, episodes = state["shown"]
-            size = episodes["action"].shape[:3]
             self._shown = (
-                _of_kind(self._levels, levels, size[:2]),
-                TensorDict.from_dict(episodes, batch_size=size).to(device),
+                _of_kind(self._levels, levels),
+                TensorDict.from_dict(episodes, batch_dims=3).to(device),
             )
         if state["history"] is not None:
-            length = state["history"]["action"].shape[2]
-            history = TensorDict.from_dict(state["history"], batch_size=[*shape, length])
-            self._history = history.to(device)
+            self._history = TensorDict.from_dict(state["history"], batch_dims=3).to(device)
             self._episodes.stand(self._levels, self._history["action"], self._steps)
         if state["discounted"] is not None:
             self._learner.statistics.discounted = state["discounted"].clone().to(device)
         if state["memory"] is not None:
-            memory = TensorDict.from_dict(state["memory"], batch_size=shape)
+            memory = TensorDict.from_dict(state["memory"], batch_dims=2)
             self._learner.collector.memory = memory.to(device)
 
 
@@ -271,25 +268,22 @@ class _Outstanding:
         cls, state: Mapping[str, Any], like: Levels, device: torch.device | None
     ) -> _Outstanding:
         """What :meth:`state_dict` returned, with levels of a kind and episodes on a device."""
-        shape = state["state"].shape
-        levels = _of_kind(like, state["levels"], shape)
+        levels = _of_kind(like, state["levels"])
         places = state["places"]
         kept = levels if places is None else levels[:, places]
         notes = TensorDict.from_dict(state["notes"], batch_size=kept.shape[:2])
         each = cls(levels, Batch(kept, notes))
         each.state, each._places = state["state"].clone(), places
         each._played = {
-            (copy, place): TensorDict.from_dict(episode, batch_size=[len(episode["action"])]).to(
-                device
-            )
+            (copy, place): TensorDict.from_dict(episode, batch_dims=1).to(device)
             for copy, place, episode in state["played"]
         }
         return each
 
 
-def _of_kind(like: Levels, state: Mapping[str, Any], shape: Sequence[int]) -> Levels:
+def _of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
     """Levels as others are, and where they are."""
-    return moved(of_kind(like, state, shape), device_of(like))
+    return moved(of_kind(like, state), device_of(like))
 
 
 def outcome_of_episodes(episodes: Sequence[Sequence[TensorDictBase]]) -> TensorDict:

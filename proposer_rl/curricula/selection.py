@@ -114,4 +114,4 @@ class SelectionCurriculum(Curriculum):
         """Go on with it."""
         super().load_state_dict(state)
         kept = state["kept"]
-        self.kept = None if kept is None else of_kind(self._template, kept, self.scores.shape)
+        self.kept = None if kept is None else of_kind(self._template, kept)

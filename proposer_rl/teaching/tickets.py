@@ -173,7 +173,7 @@ class Tickets:
         for kept in state["blocks"]:
             shape = kept["results"]["return"].shape
             notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=shape)
-            batch = Batch(of_kind(like, kept["levels"], shape), notes.clone())
+            batch = Batch(of_kind(like, kept["levels"]), notes.clone())
             block = Block(kept["start"], batch)
             block.state[:] = kept["state"].numpy()
             for name, result in kept["results"].items():
