@@ -9,10 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import level_keys, levels_at
 from proposer_rl.curricula.scores import Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
-from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels
 
 Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
@@ -22,63 +20,20 @@ Parents = Literal["batch", "easy"]
 EASY = 4  # parents of a batch of edits, where they are not all of the batch
 
 
-class Children:
-    """Makes batches of children of what was trained on; false where there are none.
+def parents_among(evidence: TensorDictBase) -> Tensor:
+    """Places of the parents of so many children as there are levels: int64 [K, n].
 
-    Args:
-        edit: of levels; None where they cannot be edited.
-        edits: of each child; 0 for no children.
-        parents: of a batch of children: all that was trained on (``batch``), or the four of it with
-            the lowest difference of mean return and mean absolute advantage (``easy``).
-
-    Attributes:
-        reads: entries of an outcome by which parents are chosen.
-
-    Raises:
-        ArgumentError: if there are to be edits and nothing makes them.
+    All that was trained on; or where evidence [K, n] has the entry ``easy``, the few levels with
+    most of it.
     """
-
-    def __init__(self, edit: Edit | None, edits: int, parents: Parents) -> None:
-        if edits and edit is None:
-            raise ArgumentError(
-                f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
-                "set edits=0"
-            )
-        self._edit, self._edits = edit, edits
-        self.reads: tuple[str, ...] = ("rollout",) if edits and parents == "easy" else ()
-
-    def __bool__(self) -> bool:
-        return self._edits > 0
-
-    def evidence(self, student: Student, outcome: TensorDictBase) -> dict[str, Tensor]:
-        """What of an outcome [K, n] says which levels become parents, [K, n]."""
-        return {"easy": _easiness(student, outcome)} if self.reads else {}
-
-    def of(
-        self, evidence: TensorDictBase, generation: Tensor, draws: Sequence[torch.Generator]
-    ) -> tuple[Levels, dict[str, Tensor]]:
-        """Children [K, n] of levels, and where they come from.
-
-        Args:
-            evidence: with ``level``, ``slot``, and what :meth:`evidence` gave, [K, n].
-            generation: of the levels in the slots, int64 [K, N].
-            draws: a generator for each student.
-
-        Returns:
-            The children; their ``parent`` and ``generation``, as a buffer has them.
-        """
-        assert self._edit is not None  # or there are no children
-        count = evidence.shape[1]
-        some = torch.arange(count).expand(evidence.shape)
-        if self.reads:
-            easiest = evidence["easy"].topk(min(EASY, count), -1).indices
-            some = easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
-        parents, slot = levels_at(evidence["level"], some), evidence["slot"].gather(1, some)
-        origin = {"parent": level_keys(parents), "generation": generation.gather(1, slot) + 1}
-        return self._edit(parents, self._edits, draws), origin
+    count = evidence.shape[1]
+    if "easy" not in evidence.keys():
+        return torch.arange(count).expand(evidence.shape)
+    easiest = evidence["easy"].topk(min(EASY, count), -1).indices
+    return easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
 
 
-def _easiness(student: Student, outcome: TensorDictBase) -> Tensor:
+def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
     """Mean absolute advantage minus mean return of levels [K, n]: what "easy" parents have most of.
 
     Of the published ones, those with the lowest return minus value loss (the authors' code, dcd).

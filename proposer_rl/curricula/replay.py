@@ -31,6 +31,7 @@ from proposer_rl.curricula.batches import (
     level_keys,
     levels_at,
     moved,
+    of_kind,
     packed,
     unpacked,
 )
@@ -42,7 +43,7 @@ from proposer_rl.curricula.buffer import (
     replay_weights,
     rescore,
 )
-from proposer_rl.curricula.children import Children, Edit, Parents, lineage
+from proposer_rl.curricula.children import Edit, Parents, easiness, lineage, parents_among
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.scores import Scored, Scorer, unseen
 from proposer_rl.curricula.student import Student
@@ -69,7 +70,8 @@ class ReplayCurriculum(Curriculum):
             replayed; None for yes, unless new levels are trained on.
         edits: of each child; 0 for no children.
         edit: makes children: levels [K, n] after so many small random edits each.
-        parents: of a batch of children; see :class:`~proposer_rl.curricula.children.Children`.
+        parents: of a batch of children: all that was trained on (``batch``), or the four of it with
+            the lowest difference of mean return and mean absolute advantage (``easy``).
         renew: whether all scores are renewed before each draw, instead of those of what was trained
             on.
         co_learnability: what is added to the scores of the levels trained on before, for each unit
@@ -81,7 +83,7 @@ class ReplayCurriculum(Curriculum):
         ArgumentError: if there are to be edits and nothing makes them, or options contradict.
     """
 
-    remembers = ("_scored", "_came_back", "_inbox")
+    remembers = ("_scored", "_came_back", "_before", "_inbox")
 
     @checked
     def __init__(
@@ -112,17 +114,19 @@ class ReplayCurriculum(Curriculum):
                 f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
                 "before each draw, what is added to them is lost"
             )
-        self._children = Children(edit, edits, parents)
+        if edits and edit is None:
+            raise ArgumentError(
+                f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
+                "set edits=0"
+            )
+        self._edit, self._edits, self._easy = edit, edits, edits > 0 and parents == "easy"
         # Levels are scored aside where they are new and not trained on, edited, or renewed.
-        aside = not train_on_new or self._children or renew
+        aside = not train_on_new or edits or renew
         self.needs = scorer.needs if aside else scorer.asks
-        self.reads = (*scorer.reads, *self._children.reads)
+        self.reads = (*scorer.reads, "rollout") if self._easy else scorer.reads
         self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
-        self._capacity, self._warm, self._probability = (
-            capacity,
-            fill * capacity,
-            replay_probability,
-        )
+        self._capacity, self._warm = capacity, fill * capacity
+        self._probability = replay_probability
         self._synchronous, self._train_on_new = synchronous, train_on_new
         self._renew, self._co_learnability = renew, co_learnability
         self._template = new_levels.sample(1, torch.Generator())[0]
@@ -131,8 +135,9 @@ class ReplayCurriculum(Curriculum):
         self._inbox = Inbox(self._template)
         # Evidence [K, m] whose children, or exact scores, are due at the next proposal.
         self._due: list[TensorDict] = []
-        self._last: TensorDict | None = None  # "level" [K, m] of the evidence before
-        self._before: TensorDict | None = None  # [K, m]: "slot" and "key", the time before
+        self._last: Levels = self.buffer["level"]  # [K, m] of the evidence before
+        # "slot" and "key" [K, m] of the levels that were trained on the time before.
+        self._before: dict[str, Tensor] = {}
         self._scored = 0  # new levels of each student
         self._came_back = {"levels": 0, "replayed": 0}
 
@@ -193,7 +198,8 @@ class ReplayCurriculum(Curriculum):
             known = notes["best"], notes["before"]
             evidence |= self.scorer.of_outcome(student, outcome, *known)._asdict()
             evidence["reached"] = outcome["return"].float()
-        evidence |= self._children.evidence(student, outcome)
+        if self._easy:
+            evidence["easy"] = easiness(student, outcome)
         self._came_back["levels"] += notes["replayed"].numel()
         self._came_back["replayed"] += int(notes["replayed"].sum())
         self._inbox.put(batch, **evidence)
@@ -215,18 +221,16 @@ class ReplayCurriculum(Curriculum):
             "mean_generation": (buffer["generation"].where(filled, 0).sum(-1) / count).tolist(),
             "levels": self._shown(),
         }
-        if self._last is not None:
-            keys = level_keys(self._last["level"])
-            told["distinct_levels"] = [len(own.unique()) for own in keys]
+        if len(self._last):
+            told["distinct_levels"] = [len(own.unique()) for own in level_keys(self._last)]
         self._came_back = {"levels": 0, "replayed": 0}
         return told
 
     def state_dict(self) -> dict[str, Any]:
         """The buffers, too, and what is known of the levels that were trained on."""
-        optional = {"last": self._last, "before": self._before}
         return super().state_dict() | {
             "buffer": packed(self.buffer),
-            **{name: None if td is None else packed(td) for name, td in optional.items()},
+            "last": packed(self._last),
             "due": [packed(evidence) for evidence in self._due],
         }
 
@@ -234,20 +238,16 @@ class ReplayCurriculum(Curriculum):
         """Go on with them."""
         super().load_state_dict(state)
         self.buffer = unpacked(state["buffer"], self._template)
-        self._last, self._before = (
-            None if state[name] is None else unpacked(state[name], self._template)
-            for name in ("last", "before")
-        )
+        self._last = of_kind(self._template, state["last"])
         self._due = [unpacked(evidence, self._template) for evidence in state["due"]]
 
     def _take_in(self) -> None:
         """Take in what episodes on levels have shown, and note what remains to be done."""
-        for evidence in self._inbox.take(whole=bool(self._children.reads)):
-            self._last = evidence.select("level", "place")
+        for evidence in self._inbox.take(whole=self._easy):
+            self._last = evidence["level"]
             if self.scorer.from_episodes:
-                told = dict(evidence.items())
-                self._take(told, Scored(*(told[name] for name in Scored._fields)), told["reached"])
-            if self._children or not self.scorer.from_episodes:
+                self._take(evidence, Scored(evidence["score"], evidence["best"]))
+            if self._edits or not self.scorer.from_episodes:
                 self._due.append(evidence)
 
     def _finish(self, student: Student, streams: Sequence[Streams]) -> None:
@@ -260,13 +260,24 @@ class ReplayCurriculum(Curriculum):
             known = self._renew and bool(replayed.all())
             if not self.scorer.from_episodes and not known:
                 scored = self._score(student, evidence["level"], streams, "trained", *which)
-                self._take(dict(evidence.items()), scored)
-            if not self._children or not bool(replayed.any()):
-                continue
-            draws = [s.generator("edits", *which) for s in streams]
-            children, origin = self._children.of(evidence, self.buffer["generation"], draws)
-            scored = self._score(student, children, streams, "children", *which)
-            self._add(children, scored, origin, replayed)
+                self._take(evidence, scored)
+            if self._edits and bool(replayed.any()):
+                children, origin = self._children(
+                    evidence, [s.generator("edits", *which) for s in streams]
+                )
+                scored = self._score(student, children, streams, "children", *which)
+                self._add(children, scored, replayed, **origin)
+
+    def _children(
+        self, evidence: TensorDictBase, draws: Sequence[torch.Generator]
+    ) -> tuple[Levels, dict[str, Tensor]]:
+        """Children [K, n] of levels that were trained on, and where they come from."""
+        assert self._edit is not None  # or there are no edits
+        some = parents_among(evidence)
+        parents, slots = levels_at(evidence["level"], some), evidence["slot"].gather(1, some)
+        generation = self.buffer["generation"].gather(1, slots) + 1
+        origin = {"parent": level_keys(parents), "generation": generation}
+        return self._edit(parents, self._edits, draws), origin
 
     def _explore(self, student: Student, count: int, streams: Sequence[Streams]) -> Tensor:
         """Score new levels as long as it takes; whether the next batch is replayed, bool [K]."""
@@ -293,13 +304,11 @@ class ReplayCurriculum(Curriculum):
         self,
         levels: Levels,
         scored: Scored,
-        more: Mapping[str, Tensor | None] | None = None,
         wanted: Tensor | None = None,
+        **more: Tensor,
     ) -> None:
-        """Keep the better ones of new levels [K, n]."""
-        entries = {"level": levels, **scored._asdict(), **(more or {})}
-        known = {name: entry for name, entry in entries.items() if entry is not None}
-        new = TensorDict(known, levels.shape[:2])
+        """Keep the better ones of new levels [K, n]; ``wanted`` as of :func:`insert`."""
+        new = TensorDict({"level": levels, **scored._asdict(), **more}, levels.shape[:2])
         insert(self.buffer, new, self._rule, wanted)
         self._scored += new.shape[1]
 
@@ -335,11 +344,10 @@ class ReplayCurriculum(Curriculum):
         scored = self._score(student, levels, streams, "all", reached=reached.gather(1, slots))
         rescore(self.buffer, slots, *scored)
 
-    def _take(
-        self, evidence: Mapping[str, Any], scored: Scored, reached: Tensor | None = None
-    ) -> None:
+    def _take(self, evidence: TensorDictBase, scored: Scored) -> None:
         """Take the scores of levels that were trained on: new ones go into the buffer."""
         replayed, slots = evidence["replayed"][:, 0], evidence["slot"]
+        reached = evidence.get("reached", unseen(slots.shape))
         if bool(replayed.any()):
             # Another level may have taken the place of one that was long on its way.
             there = self.buffer["key"].gather(1, slots) == evidence["key"]
@@ -350,12 +358,12 @@ class ReplayCurriculum(Curriculum):
                 slots,
                 scored.score.where(there, -torch.inf),
                 scored.best.where(there, -torch.inf),
-                None if reached is None else reached.where(there, -torch.inf),
+                reached.where(there, -torch.inf),
             )
             if self._co_learnability:
                 self._credit(before, slots, replayed)
         if not bool(replayed.all()):
-            self._add(evidence["level"], scored, {"reached": reached}, ~replayed)
+            self._add(evidence["level"], scored, ~replayed, reached=reached)
 
     def _credit(self, score: Tensor, slots: Tensor, replayed: Tensor) -> None:
         """Credit the levels that were trained on before with how far the present scores fell.
@@ -366,18 +374,22 @@ class ReplayCurriculum(Curriculum):
             replayed: bool [K], of the students whose levels they are.
         """
         fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
-        now = TensorDict({"slot": slots, "key": self.buffer["key"].gather(1, slots)}, slots.shape)
-        before = self._before
-        if before is None:
-            before = TensorDict({"slot": slots, "key": torch.full_like(slots, -1)}, slots.shape)
+        now = {"slot": slots, "key": self.buffer["key"].gather(1, slots)}
+        before = self._before or {"slot": slots, "key": torch.full_like(slots, -1)}
         each = replayed.unsqueeze(-1)
         there = self.buffer["key"].gather(1, before["slot"]) == before["key"]  # not evicted since
         credited = torch.zeros_like(self.buffer["filled"]).scatter(1, before["slot"], there & each)
         self.buffer["score"] += self._co_learnability * fell * credited
-        width = torch.arange(max(before.shape[1], now.shape[1]))
         # Batches differ in size: the last level over again is credited no more than once.
-        now, before = (known[:, width.clamp(max=known.shape[1] - 1)] for known in (now, before))
-        self._before = now.where(each, before)
+        width = torch.arange(max(before["slot"].shape[1], slots.shape[1]))
+        self._before = {
+            name: torch.where(
+                each,
+                now[name][:, width.clamp(max=slots.shape[1] - 1)],
+                before[name][:, width.clamp(max=before[name].shape[1] - 1)],
+            )
+            for name in now
+        }
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
         """New levels [K, count] on the CPU."""
@@ -390,6 +402,6 @@ class ReplayCurriculum(Curriculum):
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
             "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
         }
-        if self._children:
+        if self._edits:
             shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
         return {caption: buffer["level"][which] for caption, which in shown.items()}

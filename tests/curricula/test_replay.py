@@ -20,7 +20,7 @@ from proposer_rl.curricula.buffer import (
     level_keys,
     score_weights,
 )
-from proposer_rl.curricula.children import _easiness, lineage
+from proposer_rl.curricula.children import easiness, lineage
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.signals import StopSignals
@@ -190,7 +190,7 @@ def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     rollout, taught = lived.updates[-1].rollout, TaskStudent(TASK, learner)
     loss = Scorer("l1_value_loss", "episodes")
     lost = loss.of_rollouts(taught, [rollout], unseen((1, P))).score[0]
-    easy = _easiness(taught, outcome_of(rollout))
+    easy = easiness(taught, outcome_of(rollout))
     after = rollout["next"][0]
     for p in range(P):
         total, count, reached = 0.0, 0, 0.0
@@ -224,7 +224,7 @@ def test_credit_goes_to_the_levels_trained_on_before() -> None:
     slots, before = torch.tensor([[0, 1, 2, 2]]), torch.tensor([[4, 5, 6, 7]])
     keys = buffer["key"].gather(1, before).clone()
     keys[0, 3] += 1  # this one has been evicted since
-    curriculum._before = type(buffer)({"slot": before, "key": keys}, (1, P))
+    curriculum._before = {"slot": before, "key": keys}
     score = buffer["score"].gather(1, slots)
     buffer["score"][0, :3] -= torch.tensor([0.4, 0.8, 0.2])
     expected = buffer["score"][0].clone()
