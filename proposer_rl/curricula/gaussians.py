@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
@@ -23,18 +23,6 @@ from proposer_rl.task import Space, refuse_single_bin
 LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
 CHUNK = 2**16  # earlier episodes that are compared at once
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
-
-
-class TaskMixture(NamedTuple):
-    """Gaussians over points and progress; the last of the D + 1 coordinates is progress.
-
-    Attributes:
-        means: float64 [J, D + 1].
-        covariances: float64 [J, D + 1, D + 1].
-    """
-
-    means: Tensor
-    covariances: Tensor
 
 
 class MixtureCurriculum(Curriculum):
@@ -113,7 +101,7 @@ class MixtureCurriculum(Curriculum):
         self._warmup, self._exploration, self._rounded = warmup, exploration, rounded
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
-        self._mixtures: list[TaskMixture] = []  # of each student
+        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit
         self._fitted = 0  # episodes at the last fit
         self._inbox = Inbox()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
@@ -159,39 +147,25 @@ class MixtureCurriculum(Curriculum):
         return {
             "histogram": along_axes(counts, self.space),
             "progress": self._history["progress"][:, -self._refit :].mean(1).tolist(),
-            "components": [len(mixture.means) for mixture in self._mixtures],
-            "means": [mixture.means.tolist() for mixture in self._mixtures],
+            "components": [len(means) for means, _ in self._mixtures],
+            "means": [means.tolist() for means, _ in self._mixtures],
             "clipped": clipped / drawn if drawn else 0.0,
         }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with histories and mixtures."""
-        super().load_state_dict(state)
-        self._mixtures = [TaskMixture(*mixture) for mixture in self._mixtures]
 
     def _take_in(self) -> None:
         """Add tasks, returns and progress to the histories."""
         for evidence in self._inbox.take():
-            self._remember(evidence)
-
-    def _remember(self, evidence: TensorDict) -> None:
-        tasks, returns = evidence["points"], evidence["returns"]
-        if self._rounded:
-            tasks = self.space.coordinates.double()[evidence["bins"]]
-        progress = torch.zeros_like(returns)
-        if history := self._history:
-            past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)
-            progress = torch.stack([absolute_progress(*own) for own in past])
-        new = {
-            "points": evidence["points"],
-            "tasks": tasks,
-            "returns": returns,
-            "progress": progress,
-        }
-        self._history = {
-            name: torch.cat([history[name], entry], 1) if history else entry
-            for name, entry in new.items()
-        }
+            points, returns = evidence["points"], evidence["returns"]
+            tasks = self.space.coordinates.double()[evidence["bins"]] if self._rounded else points
+            progress = torch.zeros_like(returns)
+            if history := self._history:
+                past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)
+                progress = torch.stack([absolute_progress(*own) for own in past])
+            new = {"points": points, "tasks": tasks, "returns": returns, "progress": progress}
+            self._history = {
+                name: torch.cat([history[name], entry], 1) if history else entry
+                for name, entry in new.items()
+            }
 
     def _fit(self, streams: Sequence[Streams]) -> None:
         """Fit new mixtures if it is time."""
@@ -213,14 +187,14 @@ class MixtureCurriculum(Curriculum):
         if not self._mixtures:
             return uniform
         explored = torch.rand(count, generator=generator) < self._exploration
-        drawn = draw(self._mixtures[student], count, generator)
+        drawn = draw(*self._mixtures[student], count, generator)
         kept = drawn.clamp(-1, 1)
         clipped = (kept != drawn).any(-1) & ~explored
         self._drawn = self._drawn + torch.stack([(~explored).sum(), clipped.sum()])
         return torch.where(explored.unsqueeze(-1), uniform, kept)
 
 
-def fit(points: Tensor, most: int, generator: torch.Generator) -> TaskMixture:
+def fit(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """The mixture of 2 to ``most`` Gaussians with the least AIC.
 
     Full covariances, expectation maximisation from one start by k-means
@@ -230,6 +204,10 @@ def fit(points: Tensor, most: int, generator: torch.Generator) -> TaskMixture:
         points: float [n, D + 1], n at least ``most``.
         most: components that are tried.
         generator: of the starts.
+
+    Returns:
+        The means of its J Gaussians, float64 [J, D + 1], the last coordinate being progress, and
+        their covariances, float64 [J, D + 1, D + 1].
     """
     # Only this method needs it, and it takes a second to import.
     from sklearn.exceptions import ConvergenceWarning
@@ -247,29 +225,30 @@ def fit(points: Tensor, most: int, generator: torch.Generator) -> TaskMixture:
             for count, seed in zip(range(2, most + 1), seeds, strict=True)
         ]
         best = min(mixtures, key=lambda one: float(one.aic(data)))
-    return TaskMixture(torch.from_numpy(best.means_), torch.from_numpy(best.covariances_))
+    return torch.from_numpy(best.means_), torch.from_numpy(best.covariances_)
 
 
-def draw(mixture: TaskMixture, count: int, generator: torch.Generator) -> Tensor:
+def draw(means: Tensor, covariances: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
 
     Where no Gaussian has progress, all are alike.
 
     Args:
-        mixture: of points with D coordinates.
+        means: of the Gaussians, as :func:`fit` gives them.
+        covariances: likewise.
         count: number P of draws.
         generator: of the CPU.
 
     Returns:
         float64 [P, D].
     """
-    progress = mixture.means[:, -1].clamp(min=0)
+    progress = means[:, -1].clamp(min=0)
     weights = progress if bool(progress.sum() > 0) else torch.ones_like(progress)
     which = torch.multinomial(weights, count, replacement=True, generator=generator)
     # Without its last coordinate a Gaussian is one of the others' means and covariances.
-    means, spread = mixture.means[:, :-1], mixture.covariances[:, :-1, :-1]
-    noise = torch.randn(count, means.shape[1], 1, generator=generator, dtype=means.dtype)
-    return means[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
+    middles, spread = means[:, :-1], covariances[:, :-1, :-1]
+    noise = torch.randn(count, middles.shape[1], 1, generator=generator, dtype=means.dtype)
+    return middles[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:
