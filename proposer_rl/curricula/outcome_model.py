@@ -48,19 +48,9 @@ CLOSE = 1e-10  # coefficients that change no more than this are found
 EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
 
 
-class Logistic(NamedTuple):
-    """K logistic regressions, and how sure they are.
-
-    Attributes:
-        beta: coefficients, float64 [K, F].
-        covariance: of these, float64 [K, F, F].
-    """
-
-    beta: Tensor
-    covariance: Tensor
-
-
-def logistic_ridge(features: Tensor, labels: Tensor, weights: Tensor, ridge: float) -> Logistic:
+def logistic_ridge(
+    features: Tensor, labels: Tensor, weights: Tensor, ridge: float
+) -> tuple[Tensor, Tensor]:
     """Fit K logistic regressions by Newton's method; all coefficients are penalised.
 
     Args:
@@ -68,6 +58,9 @@ def logistic_ridge(features: Tensor, labels: Tensor, weights: Tensor, ridge: flo
         labels: in [0, 1], float64 [K, m].
         weights: of the rows, not negative, float64 [K, m].
         ridge: above 0.
+
+    Returns:
+        Coefficients beta, float64 [K, F], and their covariance, float64 [K, F, F].
     """
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
 
@@ -89,7 +82,7 @@ def logistic_ridge(features: Tensor, labels: Tensor, weights: Tensor, ridge: flo
         beta = beta - step
         if bool((step.abs() < CLOSE).all()):
             break
-    return Logistic(beta, torch.linalg.inv(curvature(_times(features, beta).sigmoid())))
+    return beta, torch.linalg.inv(curvature(_times(features, beta).sigmoid()))
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
@@ -156,8 +149,8 @@ class OutcomeModel:
             return TensorDict({k: features.new_full(shape, v) for k, v in same.items()}, shape)
         self._fitted = fitted = self._fitted or self._fit()
         phi = torch.cat([torch.zeros_like(features[..., :1]), features], -1)  # of age 0
-        z = _times(phi, fitted.success.beta)
-        variance = ((phi @ fitted.success.covariance) * phi).sum(-1)
+        z = _times(phi, fitted.beta)
+        variance = ((phi @ fitted.covariance) * phi).sum(-1)
         return TensorDict(
             {
                 "success": (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid(),
@@ -203,7 +196,7 @@ class OutcomeModel:
         mean = linear_ridge(phi, returns, weights, self._ridge)
         residuals = (returns - _times(phi, mean)).square()
         return _Fitted(
-            logistic_ridge(phi, self.labels(entries), weights, self._ridge),
+            *logistic_ridge(phi, self.labels(entries), weights, self._ridge),
             middle,
             unit,
             mean,
@@ -214,7 +207,8 @@ class OutcomeModel:
 class _Fitted(NamedTuple):
     """Regressions on features and age, and the mean and deviation of returns [K, 1]."""
 
-    success: Logistic
+    beta: Tensor
+    covariance: Tensor
     middle: Tensor
     unit: Tensor
     mean: Tensor

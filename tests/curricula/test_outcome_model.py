@@ -35,7 +35,7 @@ def test_logistic_regressions_are_those_of_scikit_learn(ridge: float) -> None:
     """With labels between 0 and 1, too: there a row is two rows."""
     features, labels, weights = rows()
     labels[0] = labels[0] * 0.8 + 0.1
-    found = logistic_ridge(features, labels, weights, ridge).beta
+    found, _ = logistic_ridge(features, labels, weights, ridge)
     for k in range(K):
         theirs = LogisticRegression(C=1 / ridge, fit_intercept=False, tol=1e-10, max_iter=10_000)
         theirs.fit(
@@ -52,7 +52,7 @@ def test_it_is_found_where_labels_are_all_alike_or_features_are_large() -> None:
     """Newton's method by itself goes astray there: the slope must vanish all the same."""
     features, labels, weights = rows()
     labels[0], features[1] = 1, features[1] * 100
-    beta = logistic_ridge(features, labels, weights, 1e-3).beta
+    beta, _ = logistic_ridge(features, labels, weights, 1e-3)
     misses = weights * ((features @ beta.unsqueeze(-1)).squeeze(-1).sigmoid() - labels)
     slope = (features.mT @ misses.unsqueeze(-1)).squeeze(-1) + 1e-3 * beta
     assert slope.abs().max() < 1e-6
@@ -60,15 +60,15 @@ def test_it_is_found_where_labels_are_all_alike_or_features_are_large() -> None:
 
 def test_the_covariance_is_the_inverse_of_the_loss_curvature() -> None:
     features, labels, weights = (entry[:1] for entry in rows())
-    fit = logistic_ridge(features, labels, weights, 0.5)
+    beta, covariance = logistic_ridge(features, labels, weights, 0.5)
 
     def loss(beta: Tensor) -> Tensor:
         p = (features[0] @ beta).sigmoid()
         entropy = labels[0] * p.log() + (1 - labels[0]) * (1 - p).log()
         return -(weights[0] * entropy).sum() + 0.25 * beta.square().sum()
 
-    hessian = torch.autograd.functional.hessian(loss, fit.beta[0])
-    torch.testing.assert_close(fit.covariance[0] @ hessian, torch.eye(F).double())
+    hessian = torch.autograd.functional.hessian(loss, beta[0])
+    torch.testing.assert_close(covariance[0] @ hessian, torch.eye(F).double())
 
 
 def test_linear_regressions_are_those_of_scikit_learn() -> None:
@@ -95,9 +95,9 @@ def test_older_batches_count_less_and_the_oldest_are_forgotten() -> None:
     model = model_of(features, labels, half_life=6.0, ridge=1.0)
     ages = torch.arange(23, -1, -1).double() / 6
     phi = torch.cat([-ages.unsqueeze(-1), features[-24:]], -1)
-    fit = logistic_ridge(phi[None], labels[-24:][None], 0.5 ** ages[None], 1.0)
+    beta, covariance = logistic_ridge(phi[None], labels[-24:][None], 0.5 ** ages[None], 1.0)
     asked = torch.cat([torch.zeros(M, 1), features], -1)
-    z, deviation = asked @ fit.beta[0], ((asked @ fit.covariance[0]) * asked).sum(-1).sqrt()
+    z, deviation = asked @ beta[0], ((asked @ covariance[0]) * asked).sum(-1).sqrt()
     noise = torch.linspace(-8, 8, 2001).double()
     density = torch.exp(-noise.square() / 2) / math.sqrt(2 * math.pi) * 16 / 2000
     draws = z.unsqueeze(-1) + deviation.unsqueeze(-1) * noise
@@ -183,7 +183,7 @@ def test_it_follows_a_learner_whose_success_moves(speed: float) -> None:
         seen = [*seen, (phi_of(x), solved)][-48:]
         phi, labels = (torch.cat(entries, 1) for entries in zip(*seen, strict=True))
         age = torch.arange(len(seen) - 1, -1, -1).repeat_interleave(32).double() / 12
-        plain = logistic_ridge(phi, labels, 0.5 ** age[None], 0.3).beta[0]
+        plain = logistic_ridge(phi, labels, 0.5 ** age[None], 0.3)[0][0]
         off += float((model.predict(phi_of(at)[None])["success"][0] - law(at)).abs().mean())
         off_without_age += float(((phi_of(at) @ plain).sigmoid() - law(at)).abs().mean())
         count += 1
