@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -16,7 +17,8 @@ from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.learnt import learnt_proposer
 from proposer_rl.curricula.student import Student
-from proposer_rl.learning.divergence import located, require_finite
+from proposer_rl.learning import load_agent, located
+from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.streams import Streams
@@ -142,31 +144,14 @@ class ProblemProposer(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's state, too."""
-        moments = {
-            name: self._adam.state[parameter]
-            for name, parameter in self.agent.named_parameters()
-            if parameter in self._adam.state
-        }
-        return super().state_dict() | {
-            "proposer": {
-                name: {"value": parameter.detach().clone()}
-                | {key: value.clone() for key, value in moments.get(name, {}).items()}
-                for name, parameter in self.agent.named_parameters()
-            },
-            "observed": self.agent.in_keys,
-        }
+        adam = deepcopy(self._adam.state_dict())
+        return super().state_dict() | learnt_proposer(self.agent) | {"adam": adam}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with them."""
         super().load_state_dict(state)
-        for name, parameter in self.agent.named_parameters():
-            entry = dict(state["proposer"][name])
-            parameter.data.copy_(entry.pop("value"))
-            # Adam counts its steps on the CPU, whatever the device.
-            self._adam.state[parameter] = {
-                key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
-                for key, value in entry.items()
-            }
+        load_agent(self.agent, TensorDict(state["proposer"]))
+        self._adam.load_state_dict(deepcopy(state["adam"]))
 
     def _take_in(self) -> None:
         """Take in what came of the levels; here, nothing."""
