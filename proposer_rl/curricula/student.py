@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -159,7 +160,7 @@ class Student:
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
-ABILITIES = tuple(name for name in Student.__annotations__)
+ABILITIES = tuple(Student.__annotations__)
 """Names of the functions that a student can have."""
 
 
@@ -197,8 +198,6 @@ class TaskStudent(Student):
             **{name: getattr(self, f"_{name}") for name in ABILITIES},
         )
         self._task, self._learner = task, learner
-        self._beside: tuple[EnvBase, RolloutCollector] | None = None
-        self._gradients: LevelGradients | None = None
 
     def lacks(self, name: str) -> str | None:
         """Why its task does not allow it; None if it does."""
@@ -219,7 +218,7 @@ class TaskStudent(Student):
 
     def _play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
         count = levels.shape[1]
-        env, collector = self._spectators()
+        env, collector = self._spectators
         env.set_levels(self._filled_up(levels))
         rollout = collector.collect(list(generators))
         self.spend(frames=rollout[0].numel())
@@ -247,15 +246,15 @@ class TaskStudent(Student):
 
     def _gradient_norms(self, levels: Levels) -> Tensor:
         self.spend(evaluations=levels.shape[-1])
-        return self._of_levels().of_returns(self._learner, levels)
+        return self._gradients.of_returns(self._learner, levels)
 
     def _policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
         advantage = advantages(self, rollout).float()
-        return self._of_levels().of_rollouts(self._learner, rollout, advantage)
+        return self._gradients.of_rollouts(self._learner, rollout, advantage)
 
-    def _of_levels(self) -> LevelGradients:
-        self._gradients = self._gradients or LevelGradients(self._task)
-        return self._gradients
+    @cached_property
+    def _gradients(self) -> LevelGradients:
+        return LevelGradients(self._task)
 
     def _target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
         self.spend(evaluations=levels.shape[-1])
@@ -306,9 +305,9 @@ class TaskStudent(Student):
     def _restore(self, snapshot: TensorDictBase) -> None:
         self._learner.restore(snapshot)
 
+    @cached_property
     def _spectators(self) -> tuple[EnvBase, RolloutCollector]:
-        self._beside = self._beside or self._task.spectators(self._learner)
-        return self._beside
+        return self._task.spectators(self._learner)
 
     def _filled_up(self, levels: Levels) -> Levels:
         """As many levels as the environment takes: the last one over again."""
