@@ -255,10 +255,10 @@ def rescore(
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
-    """What slots [K, N] held, or the mean of what is new and finite in them, both [K, P]."""
+    """What slots [*B, N] held, or the mean of what is new and finite in them, both [*B, P]."""
     finite, none = new.isfinite(), torch.zeros_like(old, dtype=torch.float64)
-    counts = none.scatter_add(1, slots, finite.double())
-    means = none.scatter_add(1, slots, new.double().where(finite, 0.0)) / counts
+    counts = none.scatter_add(-1, slots, finite.double())
+    means = none.scatter_add(-1, slots, new.double().where(finite, 0.0)) / counts
     return means.to(old).where(counts > 0, old)
 
 
@@ -275,9 +275,8 @@ def _row(entries: Mapping[str, Any], copy: int) -> dict[str, Any]:
 def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
     """Numbers [M] as those of all equal levels: the mean of finite scores, the highest return."""
     groups, group = key.unique(return_inverse=True)
-    finite, none = score.isfinite(), torch.zeros(len(groups), dtype=torch.float64)
-    total = none.scatter_add(0, group, score.double().where(finite, 0.0))
-    mean = total / none.scatter_add(0, group, finite.double())
+    unknown = torch.full((len(groups),), torch.nan, dtype=torch.float64)
+    mean = _mean_of_slots(unknown, group, score)
     lowest = torch.full((len(groups),), -torch.inf, dtype=best.dtype)
     return mean[group], lowest.scatter_reduce(0, group, best, "amax")[group]
 
