@@ -74,16 +74,12 @@ class LearningProgressCurriculum(BinCurriculum):
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
         """Move the averages by the performance on the probes, or in the episodes since."""
-        seen = torch.full((len(streams), self.space.size), torch.nan)
+        seen = torch.full((len(streams), self.space.size), torch.nan)  # where nothing was
         if self._source == "exact":
             seen = self._probes.performance(student, streams)
         elif self._episodes:
             seen = self._episodes[0] / self._episodes[1]
         self._episodes = []
-        self._average(seen)
-
-    def _average(self, seen: Tensor) -> None:
-        """Take in what was seen in each bin, [K, N], NaN where nothing was."""
         unknown = torch.full_like(seen, torch.nan)
         fast, slow = (self.scores.get(name, unknown) for name in ("fast", "slow"))
         new_fast = torch.where(fast.isnan(), seen, fast.lerp(seen, 1 - self._fast))
