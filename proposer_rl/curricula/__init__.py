@@ -36,9 +36,9 @@ from proposer_rl.curricula.first_order import (
 )
 from proposer_rl.curricula.gaussians import MixtureCurriculum as MixtureCurriculum
 from proposer_rl.curricula.modelled import Modelled as Modelled
+from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
+from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
-from proposer_rl.curricula.problem_rewards import FirstOrderProposer as FirstOrderProposer
-from proposer_rl.curricula.problem_rewards import PairedProposer as PairedProposer
 from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer

@@ -1,4 +1,4 @@
-"""The paper's Proposer, rewarded for each problem by itself."""
+"""The paper's Proposer, rewarded for each problem by itself: by first-order gain or by regret."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.learnt import learnt_proposer
-from proposer_rl.curricula.student import Student
+from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import load_agent, located
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.meta.first_order import Measure
 from proposer_rl.models import ActorCritic, draw
+from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
 
@@ -96,7 +98,6 @@ class ProblemProposer(Curriculum):
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
-        self._take_in()
         (stream,), agent = streams, self.agent
         probes = self.target.sample(self._probe_levels, stream.generator("probes"))
         with torch.no_grad():
@@ -120,10 +121,7 @@ class ProblemProposer(Curriculum):
         )
         self._learn(seen, played)
         self._metrics |= metrics
-        return self._numbered(levels[:, :count], bins[:, :count], stream)
-
-    def _numbered(self, levels: Levels, bins: Tensor, stream: Streams) -> Batch:
-        return self._inbox.batch(levels, bins=bins)
+        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Count the levels."""
@@ -132,7 +130,6 @@ class ProblemProposer(Curriculum):
 
     def log(self) -> dict[str, Any]:
         """The last metrics of the policy, and counts."""
-        self._take_in()
         if not self._metrics:
             return {}
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
@@ -152,9 +149,6 @@ class ProblemProposer(Curriculum):
         super().load_state_dict(state)
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
-
-    def _take_in(self) -> None:
-        """Take in what came of the levels; here, nothing."""
 
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
         """A few steps on all draws: the clipped objective of each problem, with its advantage.
@@ -179,3 +173,135 @@ class ProblemProposer(Curriculum):
         self._metrics |= {
             key: float(losses[key].detach()) for key in ("entropy", "kl_approx", "clip_fraction")
         }
+
+
+class FirstOrderProposer(ProblemProposer):
+    """A problem's reward is its alignment with the target direction.
+
+    Args:
+        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        target_levels: fresh levels E of the target that the direction is taken from.
+        step: of the differences that tell the alignments, in learning rates.
+        measure: of the target's performance; see
+            :func:`~proposer_rl.meta.first_order.target_performance`.
+    """
+
+    needs = ("probe", "target_direction", "alignment")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        *,
+        probe_levels: int = 16,
+        target_levels: Count = 256,
+        step: Positive = 1.0,
+        measure: Measure = "log_success",
+    ) -> None:
+        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
+        self._target_levels, self._step, self._measure = target_levels, step, measure
+
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The alignment of each level, which is evaluated on either side of the student."""
+        target = self.target.sample(self._target_levels, stream.generator("target"))
+        reached, direction = student.target_direction(target.unsqueeze(0), self._measure)
+        aligned = student.alignment(direction, levels, self._step)
+        return aligned, {
+            "target_performance": float(reached.mean()),
+            "alignment": float(aligned.mean()),
+            "alignment_sd": float(aligned.std(correction=0)),
+        }
+
+
+class PairedProposer(ProblemProposer):
+    """A problem's reward is what another student, the antagonist, gets more on it.
+
+    PAIRED (Dennis et al. 2020, arXiv 2012.02096, algorithm 1): protagonist and antagonist train on
+    the same levels, and the generator is rewarded
+
+        max(0, J(antagonist, level) - J(protagonist, level)).
+
+    Of the students' performance, which may be exact; published are the antagonist's best and the
+    protagonist's mean episode. The levels are draws from the space's bins rather than built cell by
+    cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back, or
+    32 newer ones have been proposed.
+
+    Args:
+        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        antagonist: the second student.
+    """
+
+    needs = ("probe", "performance")
+
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        *,
+        antagonist: TaskStudent,
+        probe_levels: int = 16,
+    ) -> None:
+        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
+        self.antagonist = antagonist
+        self._inbox = Inbox(target.sample(1, torch.Generator())[0])
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [1, n], when the antagonist has trained on those that came back.
+
+        Raises:
+            ValueError: for several students.
+            DivergedError: if a number of the antagonist is not finite.
+        """
+        self._train_antagonist()
+        batch = super().propose(student, count, streams)
+        seed = streams[0].generator("antagonist").initial_seed()  # of its actions on these levels
+        batch.notes["seed"] = torch.full(batch.notes.batch_size, seed)
+        return batch
+
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The regret of each level."""
+        antagonist, protagonist = (
+            each.performance(levels, stream.generator("regret"))["return"]
+            for each in (self.antagonist, student)
+        )
+        student.spend(evaluations=levels.shape[1])  # of the antagonist
+        regret = (antagonist - protagonist).clamp_min(0)
+        return regret, {
+            "regret": float(regret.mean()),
+            "regret_sd": float(regret.std(correction=0)),
+        }
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Put the levels aside for the antagonist; it takes as many steps on them."""
+        super().observe(student, batch, outcome)
+        student.spend(frames=int(outcome["steps"][0].sum()))
+        self._inbox.put(batch, level=batch.levels, seed=batch.notes["seed"])
+
+    def log(self) -> dict[str, Any]:
+        """As of :class:`ProblemProposer`, when the antagonist has trained."""
+        self._train_antagonist()
+        return super().log()
+
+    def _train_antagonist(self) -> None:
+        """On the batches that are complete."""
+        for evidence in self._inbox.take(whole=True):
+            generator = torch.Generator().manual_seed(int(evidence["seed"][0, 0]))
+            self.antagonist.train(evidence["level"], [generator])
+
+    def state_dict(self) -> dict[str, Any]:
+        """The antagonist, too."""
+        return {**super().state_dict(), "antagonist": self.antagonist.snapshot().to_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with it."""
+        super().load_state_dict(state)
+        self.antagonist.restore(TensorDict(state["antagonist"], [1]))
