@@ -10,10 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.bins import BinCurriculum, along_axes, means_of_bins
+from proposer_rl.curricula.bins import BinCurriculum, Probes, along_axes, means_of_bins, tell_cost
+from proposer_rl.curricula.bins import Measure as Outcome
 from proposer_rl.curricula.contract import Batch
-from proposer_rl.curricula.probes import Measure as Outcome
-from proposer_rl.curricula.probes import Probes, tell_cost
 from proposer_rl.curricula.student import Student
 from proposer_rl.curricula.transport import (
     interim_target,

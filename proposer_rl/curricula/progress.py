@@ -9,9 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import BinCurriculum, means_of_bins
+from proposer_rl.curricula.bins import BinCurriculum, Measure, Probes, means_of_bins
 from proposer_rl.curricula.contract import Batch
-from proposer_rl.curricula.probes import Measure, Probes
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Decay, Share, checked
 from proposer_rl.streams import Streams

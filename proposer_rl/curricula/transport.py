@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from proposer_rl.curricula.bins import BinCurriculum
-from proposer_rl.curricula.probes import Measure, Probes
+from proposer_rl.curricula.bins import BinCurriculum, Measure, Probes
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, checked
 from proposer_rl.streams import Streams
