@@ -34,7 +34,7 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula.learnt import load_proposer
+from proposer_rl.curricula.proposer import load_proposer
 from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
 from proposer_rl.learning.settings import PPOSettings

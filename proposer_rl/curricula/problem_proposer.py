@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.learnt import learnt_proposer
+from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import load_agent, located
 from proposer_rl.learning.divergence import require_finite
