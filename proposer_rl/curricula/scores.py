@@ -59,6 +59,7 @@ from proposer_rl.task import Levels
 
 Source = Literal["episodes", "exact"]
 
+ASKS = {"gradient_norm": ("policy_gradient_norms",)}  # of a student, from episodes
 READS = {
     "learnability": ("success",),
     "return_variance": ("rollout",),
@@ -168,13 +169,14 @@ class Scorer:
         }[source]
         if score not in available:
             raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
-        self.asks: tuple[str, ...] = () if self.from_episodes else EXACT[score][0]
-        self.reads: tuple[str, ...] = ()
         if self.from_episodes:
-            self.asks = {"gradient_norm": ("policy_gradient_norms",)}.get(score, ())
-            self.reads = READS.get(score, ())
+            self.asks: tuple[str, ...] = ASKS.get(score, ())
+            self.reads: tuple[str, ...] = READS.get(score, ())
+            self.needs: tuple[str, ...] = ("play", *self.asks)
+        else:
+            self.asks, self.reads = EXACT[score][0], ()
+            self.needs = self.asks
         self.plays_for = tuple(entry for entry in self.reads if entry != "rollout")
-        self.needs = (*(("play",) if self.from_episodes else ()), *self.asks)
 
     def of_outcome(
         self,
