@@ -66,7 +66,7 @@ class BinCurriculum(Curriculum):
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels [K, n], drawn systematically from the shares."""
         self._take_in()
-        if not self.scores or self._proposed % self._every == 0:
+        if self._proposed % self._every == 0:
             self.score(student, count, streams)
         self._proposed += 1
         draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
@@ -163,10 +163,6 @@ class Probes:
 
     def performance(self, student: Student, streams: Sequence[Streams]) -> Tensor:
         """Mean performance of K students in each bin: float32 [K, N], on the CPU.
-
-        Args:
-            student: that is measured.
-            streams: of the proposal.
 
         Raises:
             NoSuccessError: if success is to be measured and the task tells none.

@@ -63,8 +63,12 @@ class SelectionCurriculum(Curriculum):
         self.scores = torch.zeros(0)  # float64 [K, keep]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n]: some of those kept, then new ones."""
-        if self.kept is None or self._proposed % self._every == 0:
+        """Levels [K, n]: some of those kept, then new ones.
+
+        Raises:
+            DivergedError: if fewer of the candidates have a score than are kept.
+        """
+        if self._proposed % self._every == 0:
             self._select(student, streams)
         self._proposed += 1
         fresh = round(self._new * count)
@@ -77,11 +81,7 @@ class SelectionCurriculum(Curriculum):
         return Batch(levels, TensorDict({}, (len(streams), count)))
 
     def _select(self, student: Student, streams: Sequence[Streams]) -> None:
-        """Keep the best of new candidates.
-
-        Raises:
-            DivergedError: if fewer have a score than are kept.
-        """
+        """Keep the best of new candidates."""
         levels = fresh_levels(self._new_levels, self._candidates, streams, "candidates")
         scored = self.scorer(student, levels, streams)
         known = int(scored.score.isfinite().sum(-1).min())
