@@ -65,7 +65,7 @@ class Modelled(Combinator):
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """What the curriculum proposes to a student of whom the model speaks."""
         self._take_in()
-        batch = self.parts[0].propose(_Answering(student, self._predict), count, streams)
+        batch = self.parts[0].propose(_answering(student, self._predict), count, streams)
         phi = self._phi(batch.levels)
         predicted = self._model.predict(phi)["success"]
         return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
@@ -85,7 +85,7 @@ class Modelled(Combinator):
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Improve the curriculum, by what the model says of the student."""
-        return super().improve(_Answering(student, self._predict), streams)
+        return super().improve(_answering(student, self._predict), streams)
 
     def log(self) -> dict[str, Any]:
         """Besides, how right the model was about the levels that came back, before it saw them.
@@ -140,17 +140,16 @@ class Modelled(Combinator):
         return phi
 
 
-class _Answering(Student):
+def _answering(student: Student, predict: Callable[[Levels], TensorDict]) -> Student:
     """A student whose performance a model tells; all else it does itself."""
-
-    def __init__(self, student: Student, predict: Callable[[Levels], TensorDict]) -> None:
-        own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
-        super().__init__(
-            gamma=student.gamma,
-            lmbda=student.lmbda,
-            batch_size=student.batch_size,
-            **{name: getattr(student, name) for name in own},
-            performance=lambda levels, generator: predict(levels),
-            exact_performance=predict,
-        )
-        self.spend = student.spend  # type: ignore[method-assign]
+    own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
+    answering = Student(
+        gamma=student.gamma,
+        lmbda=student.lmbda,
+        batch_size=student.batch_size,
+        **{name: getattr(student, name) for name in own},
+        performance=lambda levels, generator: predict(levels),
+        exact_performance=predict,
+    )
+    answering.spend = student.spend  # type: ignore[method-assign]
+    return answering
