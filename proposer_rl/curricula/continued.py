@@ -224,8 +224,7 @@ class _Outstanding:
         """Whether there is nothing left to be observed."""
         if self._places is None:
             return False
-        state = self.state[:, self._places]
-        return bool(((state == OBSERVED) | (state == GIVEN_UP)).any(0).all())
+        return bool((self.state[:, self._places] >= OBSERVED).any(0).all())
 
     def give_up(self, copy: int, place: int) -> None:
         """Leave a level out that is not over."""

@@ -120,8 +120,8 @@ class MixtureCurriculum(Curriculum):
         points = torch.stack(drawn)
         bins = nearest(points.flatten(0, 1), self.space.coordinates.double()).view(points.shape[:2])
         draws = [s.generator("levels") for s in streams]
-        make: Any = self.space.generate if self._rounded else getattr(self.space, "at")  # noqa: B009
-        levels = make(bins if self._rounded else points, draws)
+        space: Any = self.space  # only one of continuous parameters has a method `at`
+        levels = space.generate(bins, draws) if self._rounded else space.at(points, draws)
         notes = {"bins": bins, "points": points}
         if self._source == "exact":
             reached = student.performance(levels, streams[0].generator("performance"))["return"]

@@ -183,11 +183,11 @@ class OutcomeModel:
         }
         ages = torch.cat(
             [
-                torch.full_like(batch["return"], age / self._half_life)
-                for age, batch in enumerate(reversed(self._batches))
+                torch.full_like(batch["return"], (len(self._batches) - number) / self._half_life)
+                for number, batch in enumerate(self._batches, 1)
             ],
             1,
-        ).flip(1)
+        )
         weights = 0.5**ages
         middle, unit = _moments(entries["return"], weights)
         unit[unit == 0] = 1
