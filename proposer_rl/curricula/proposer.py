@@ -44,6 +44,8 @@ class ProposerCurriculum(LearnedCurriculum):
         trainer: how it learns; None to leave it as it is.
     """
 
+    remembers = ("_proposed", "_action")
+
     def __init__(
         self,
         agent: ActorCritic,
@@ -96,24 +98,20 @@ class ProposerCurriculum(LearnedCurriculum):
         return {} if self.trainer is None else learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the cycle's levels come from, how far it is, the action that holds; the agent."""
+        """Where the cycle's levels come from, and the agent, too."""
         agent = (
             agent_weights(self.agent) if self.trainer is None else self.trainer.learner.snapshot()
         )
-        return {
+        return super().state_dict() | {
             "streams": self.view.streams.address,
-            "proposed": self._proposed,
-            "action": self._action,
             "proposer": agent.to_dict(),
             "observed": self.agent.in_keys,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on within a cycle."""
+        super().load_state_dict(state)
         self.view.draw_levels(Streams(*state["streams"]))
-        self._proposed = int(state["proposed"])
-        action = state["action"]
-        self._action = None if action is None else action.to(self.view.task.device)
         agent = TensorDict(state["proposer"], batch_size=[])
         if self.trainer is None:
             load_agent(self.agent, agent)
