@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, of_kind
+from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, of_kind, packed
 from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
@@ -59,7 +59,7 @@ class SelectionCurriculum(Curriculum):
         self._new_levels, self.scorer = new_levels, scorer
         self._template = new_levels.sample(1, torch.Generator())[0]
         self._proposed = 0
-        self.kept: Levels | None = None  # [K, keep], by falling score
+        self.kept: Levels = self._template.expand(0, keep)  # [K, keep], by falling score
         self.scores = torch.zeros(0)  # float64 [K, keep]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -96,7 +96,7 @@ class SelectionCurriculum(Curriculum):
 
     def log(self) -> dict[str, Any]:
         """The scores of what is kept, and the first student's best levels."""
-        if self.kept is None:
+        if not len(self.kept):
             return {}
         return {
             "highest_score": self.scores[:, 0].tolist(),
@@ -107,11 +107,9 @@ class SelectionCurriculum(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """What is kept, too."""
-        kept = None if self.kept is None else self.kept.to_dict(convert_tensors=False)
-        return {**super().state_dict(), "kept": kept}
+        return super().state_dict() | {"kept": packed(self.kept)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with it."""
         super().load_state_dict(state)
-        kept = state["kept"]
-        self.kept = None if kept is None else of_kind(self._template, kept)
+        self.kept = of_kind(self._template, state["kept"])
