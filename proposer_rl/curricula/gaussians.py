@@ -107,11 +107,6 @@ class MixtureCurriculum(Curriculum):
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
-    @property
-    def episodes(self) -> int:
-        """Episodes H in the history of each student."""
-        return self._history["returns"].shape[1] if self._history else 0
-
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels [K, n] of the bins nearest to the points drawn."""
         self._take_in()
@@ -169,8 +164,9 @@ class MixtureCurriculum(Curriculum):
 
     def _fit(self, streams: Sequence[Streams]) -> None:
         """Fit new mixtures if it is time."""
-        due = self.episodes // self._refit > self._fitted // self._refit
-        if self.episodes < self._warmup or not due:
+        episodes = self._history["returns"].shape[1] if self._history else 0
+        due = episodes // self._refit > self._fitted // self._refit
+        if episodes < self._warmup or not due:
             return
         last = {name: entry[:, -self._refit :] for name, entry in self._history.items()}
         seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [K, refit, D + 1]
@@ -178,7 +174,7 @@ class MixtureCurriculum(Curriculum):
             fit(own, self._components, s.generator("mixture"))
             for own, s in zip(seen, streams, strict=True)
         ]
-        self._fitted = self.episodes
+        self._fitted = episodes
 
     def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
         """A batch of points for one student, float64 [n, D]."""

@@ -95,6 +95,7 @@ class ProblemProposer(Curriculum):
 
         Raises:
             ValueError: for several students: a Proposer learns from one.
+            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
@@ -151,11 +152,7 @@ class ProblemProposer(Curriculum):
         self._adam.load_state_dict(deepcopy(state["adam"]))
 
     def _learn(self, seen: TensorDict, played: TensorDict) -> None:
-        """A few steps on all draws: the clipped objective of each problem, with its advantage.
-
-        Raises:
-            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
-        """
+        """A few steps on all draws: the clipped objective of each problem, with its advantage."""
         steps = []
         for _ in range(self._settings.epochs):
             logits = self.agent(seen.copy())[self.agent.logits_key]  # [K, P, N]

@@ -325,12 +325,7 @@ class ReplayCurriculum(Curriculum):
         return self.scorer(student, moved(levels, self._device), streams, *purpose, before=before)
 
     def _expected(self, reached: Tensor) -> Tensor:
-        """The returns on levels when they were trained on last, float32 [K, n].
-
-        Args:
-            reached: the same, but minus infinity where they never were: there it becomes the mean
-                over the buffer.
-        """
+        """Returns [K, n] on levels when they were trained on last, or the mean over the buffer."""
         known = self.buffer["reached"]
         mean = known.where(known.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return reached.where(reached.isfinite(), mean.nan_to_num(-torch.inf))
@@ -366,12 +361,9 @@ class ReplayCurriculum(Curriculum):
             self._add(evidence["level"], scored, ~replayed, reached=reached)
 
     def _credit(self, score: Tensor, slots: Tensor, replayed: Tensor) -> None:
-        """Credit the levels that were trained on before with how far the present scores fell.
+        """Credit the levels trained on before with how far the scores [K, m] in these slots fell.
 
-        Args:
-            score: of the present ones until now, [K, m].
-            slots: where they are.
-            replayed: bool [K], of the students whose levels they are.
+        Only those of students whose levels were ``replayed``, bool [K].
         """
         fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
         now = {"slot": slots, "key": self.buffer["key"].gather(1, slots)}
