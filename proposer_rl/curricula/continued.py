@@ -65,7 +65,7 @@ class ContinuedLevels:
         self._proposed = 0
         self._waiting: list[deque[Place]] = [deque() for _ in range(copies)]
         self._levels = like[:1].expand(copies, count).clone()  # that are played, or set
-        self._playing = torch.full((copies, count, 2), -1)  # number of the batch, and place
+        self._playing: list[list[Place]] = [[(-1, -1)] * count for _ in range(copies)]
         self._over: dict[tuple[int, int], list[Place]] = defaultdict(list)
         self._most = count  # episodes of a student that ended in an update
         self._steps = torch.zeros(copies, count, dtype=torch.int64)  # of the present episodes
@@ -106,12 +106,10 @@ class ContinuedLevels:
         if self._episodes.fresh:
             self._forget()
         for copy, env in begins.nonzero().tolist():
-            number, place = self._playing[copy, env].tolist()
-            self._over[copy, env].append((number, place))
+            self._over[copy, env].append(self._playing[copy][env])
             if self._waiting[copy]:
-                number, place = self._waiting[copy].popleft()
+                number, place = self._playing[copy][env] = self._waiting[copy].popleft()
                 self._batches[number].state[copy, place] = BEGUN
-                self._playing[copy, env] = torch.tensor([number, place])
                 self._levels[copy, env] = self._batches[number].levels[copy, place]
         if self._episodes.fresh:
             self._over.clear()  # what had been played before has no end
@@ -119,7 +117,7 @@ class ContinuedLevels:
 
     def _forget(self) -> None:
         """Give up the episodes that have been broken off."""
-        for copy, row in enumerate(self._playing.tolist()):
+        for copy, row in enumerate(self._playing):
             for number, place in row:
                 if number in self._batches:
                     self._batches[number].give_up(copy, place)
@@ -163,7 +161,7 @@ class ContinuedLevels:
             "proposed": self._proposed,
             "waiting": [list(waiting) for waiting in self._waiting],
             "levels": packed(self._levels),
-            "playing": self._playing.clone(),
+            "playing": [list(row) for row in self._playing],
             "most": self._most,
             "steps": self._steps.clone(),
             "history": None if self._history is None else packed(self._history),
@@ -182,7 +180,8 @@ class ContinuedLevels:
         self._proposed, self._most = state["proposed"], state["most"]
         self._waiting = [deque(map(tuple, waiting)) for waiting in state["waiting"]]
         self._levels = _of_kind(self._levels, state["levels"])
-        self._playing, self._steps = state["playing"].clone(), state["steps"].clone()
+        self._playing = [[*map(tuple, row)] for row in state["playing"]]
+        self._steps = state["steps"].clone()
         self._batches = {
             number: _Outstanding.of_state(each, self._levels, device)
             for number, each in state["batches"].items()
