@@ -86,13 +86,10 @@ def logistic_ridge(
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Fit K linear regressions; all coefficients, float64 [K, F], are penalised.
+    """Fit K linear regressions to values, float64 [K, m]; else as :func:`logistic_ridge`.
 
-    Args:
-        features: float64 [K, m, F].
-        values: float64 [K, m].
-        weights: of the rows, not negative, float64 [K, m].
-        ridge: above 0.
+    Returns:
+        Coefficients, float64 [K, F], all of which are penalised.
     """
     weighted = features.mT * weights.unsqueeze(1)
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
@@ -189,8 +186,10 @@ class OutcomeModel:
             1,
         )
         weights = 0.5**ages
-        middle, unit = _moments(entries["return"], weights)
-        unit[unit == 0] = 1
+        share = weights / weights.sum(1, keepdim=True)
+        middle = (share * entries["return"]).sum(1, keepdim=True)
+        unit = (share * (entries["return"] - middle).square()).sum(1, keepdim=True).sqrt()
+        unit = unit.where(unit > EQUAL * (1 + middle.abs()), 1.0)  # returns that are all alike
         phi = torch.cat([-ages.unsqueeze(-1), entries["features"]], -1)
         returns = (entries["return"] - middle) / unit
         mean = linear_ridge(phi, returns, weights, self._ridge)
@@ -217,11 +216,3 @@ class _Fitted(NamedTuple):
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def _moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean and deviation, 0 where all is constant, along dimension 1, which stays."""
-    share = weights / weights.sum(1, keepdim=True)
-    mean = (share * values).sum(1, keepdim=True)
-    deviation = (share * (values - mean).square()).sum(1, keepdim=True).sqrt()
-    return mean, deviation.where(deviation > EQUAL * (1 + mean.abs()), 0.0)
