@@ -55,13 +55,7 @@ class ReplayRule:
 
 
 def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
-    """A buffer [K, N] without levels.
-
-    Args:
-        level: one, [], of the kind that it is to hold.
-        copies: K.
-        capacity: N.
-    """
+    """A buffer [copies, capacity] that is empty, for levels of the kind of the given one, []."""
     shape = (copies, capacity)
     numbers = ("touched", "clock", "key", "parent", "generation", "draws")
     return TensorDict(

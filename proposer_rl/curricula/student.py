@@ -165,12 +165,7 @@ ABILITIES = tuple(Student.__annotations__)
 
 
 def require(student: Student, needs: Iterable[str], who: str) -> None:
-    """Refuse a student that lacks something.
-
-    Args:
-        student: that is to be taught.
-        needs: names of methods.
-        who: needs them.
+    """Refuse a student that lacks a method which somebody needs who is named by ``who``.
 
     Raises:
         UnfitStudentError: naming the first that is missing, and why.
