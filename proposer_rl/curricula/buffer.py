@@ -196,17 +196,14 @@ def insert(
         count = torch.tensor([len(falling)])
         return shares_by_rank(torch.from_numpy(falling), count, rule).numpy()
 
+    by_rank = rule.prioritization == "rank"
     entries, fresh = dict(buffer.items()), dict(new.items())
     keys = level_keys(fresh["level"])
     none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
     for copy in _copies(wanted, len(keys)):
         score, best = _of_equals(keys[copy], fresh["score"][copy], fresh["best"][copy])
         given = _row(entries, copy), keys[copy].numpy(), score.numpy(), rule.staleness, weigh
-        if len(score) > rows.ONE_BY_ONE:
-            source, again = map(torch.from_numpy, rows.insert_at_once(*given))
-        else:
-            by_rank = rule.prioritization == "rank"
-            source, again = map(torch.from_numpy, rows.insert(*given, by_rank=by_rank))
+        source, again = map(torch.from_numpy, rows.insert(*given, by_rank))
         there = entries["best"][copy]
         there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
         slots = (source >= 0).nonzero().flatten()

@@ -110,7 +110,7 @@ class Ranks:
 def insert(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
 ) -> tuple[Places, Places]:
-    """Insert levels one after another into the slots of a row.
+    """Insert levels one after another into the slots of a row, or many of them at once.
 
     Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
 
@@ -126,6 +126,8 @@ def insert(
         Which new level has gone into each slot, int64 [N], -1 for none; and slots and levels of
         those that were there already, int64 [2, m].
     """
+    if len(keys) > ONE_BY_ONE:
+        return _insert_at_once(numbers, keys, scores, staleness, weigh)
     filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
     clock = int(numbers["clock"][0])
     place = dict(zip(key[filled].tolist(), filled.nonzero()[0].tolist(), strict=True))
@@ -158,10 +160,10 @@ def insert(
     return source, np.array(again, np.int64).reshape(-1, 2).T
 
 
-def insert_at_once(
+def _insert_at_once(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh
 ) -> tuple[Places, Places]:
-    """Insert many levels, the best first; what goes in and comes out is as of :func:`insert`."""
+    """Insert many levels, the best first."""
     filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
     clock, source = int(numbers["clock"][0]), np.full(len(filled), -1)
     numbers["clock"][:] = clock + len(keys)
