@@ -124,10 +124,9 @@ class Modelled(Combinator):
         if not (taken := self._inbox.take()):
             return
         evidence: Any = torch.cat(taken, 1)
-        outcome = {name: evidence[name] for name in evidence.keys()}
-        label = self._model.labels(outcome)
-        self._told = [*self._told, {"predicted": evidence["predicted"], "label": label}]
-        self._model.add(evidence["features"], outcome)
+        label = self._model.labels(evidence)
+        self._told.append({"predicted": evidence["predicted"], "label": label})
+        self._model.add(evidence["features"], evidence)
 
     def _predict(self, levels: Levels) -> TensorDict:
         return self._model.predict(self._phi(levels)).to(device_of(levels))
