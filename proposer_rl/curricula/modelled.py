@@ -41,7 +41,7 @@ class Modelled(Combinator):
         labels, ridge, half_life: see the model.
     """
 
-    remembers = ("_model", "_inbox", "_told")
+    remembers = ("_model", "_inbox", "_told", "_has_taken")
 
     @checked
     def __init__(
@@ -60,11 +60,13 @@ class Modelled(Combinator):
         self._features, self._labels = features, labels
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._inbox = Inbox()
+        self._has_taken = False  # whether anything since the last proposal, as logs make it
         self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """What the curriculum proposes to a student of whom the model speaks."""
         self._take_in()
+        self._has_taken = False
         batch = self.parts[0].propose(_answering(student, self._predict), count, streams)
         phi = self._phi(batch.levels)
         predicted = self._model.predict(phi)["success"]
@@ -126,7 +128,8 @@ class Modelled(Combinator):
         evidence: Any = torch.cat(taken, 1)
         label = self._model.labels(evidence)
         self._told.append({"predicted": evidence["predicted"], "label": label})
-        self._model.add(evidence["features"], evidence)
+        self._model.add(evidence["features"], evidence, as_old=self._has_taken)
+        self._has_taken = True
 
     def _predict(self, levels: Levels) -> TensorDict:
         return self._model.predict(self._phi(levels)).to(device_of(levels))

@@ -121,16 +121,19 @@ class OutcomeModel:
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
 
-    def add(self, features: Tensor, outcome: Mapping[str, Tensor]) -> None:
+    def add(self, features: Tensor, outcome: Mapping[str, Tensor], *, as_old: bool = False) -> None:
         """Take in a batch.
 
         Args:
             features: float64 [K, m, F]; a constant one is a further intercept.
             outcome: what it ``reads``, float64 [K, m].
+            as_old: whether it is as old as the batch before it, and a part of that.
         """
-        kept = {name: outcome[name] for name in self.reads}
-        self._batches = [*self._batches, {"features": features, **kept}]
-        self._batches = self._batches[-round(KEPT * self._half_life) :]
+        batch = {"features": features, **{name: outcome[name] for name in self.reads}}
+        if as_old:
+            *self._batches, before = self._batches
+            batch = {name: torch.cat([before[name], batch[name]], 1) for name in batch}
+        self._batches = [*self._batches, batch][-round(KEPT * self._half_life) :]
         self._worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
         self._fitted = None
 
