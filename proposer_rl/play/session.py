@@ -153,7 +153,7 @@ class Session:
             result = board.examine(learner.agent, question.solver, level, question.max_steps)
         return {"updates": updates, **result}
 
-    def levels(self, question: Source) -> dict[str, Any]:
+    def levels(self, question: Drawn | OfSet | OfCurriculum | OfFile) -> dict[str, Any]:
         """Levels to choose from: pictures, with drawings where the task has a board.
 
         Raises:
