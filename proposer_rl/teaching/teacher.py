@@ -25,9 +25,9 @@ from proposer_rl.task import Task
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
-from proposer_rl.teaching.segments import ended
+from proposer_rl.teaching.segments import LEVEL_ID, ended
 from proposer_rl.teaching.spaces import LevelSpace
-from proposer_rl.teaching.tickets import COUNTS, OUT, RESULTS, Block, Tickets, as_array
+from proposer_rl.teaching.tickets import COUNTS, OUT, OVER, RESULTS, Block, Tickets, as_array
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -118,7 +118,7 @@ class Teacher:
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._use(None, 0)
-        self._kept: TensorDictBase | None = None  # of episodes that have not ended, [n, L]
+        self._kept: TensorDictBase | None = None  # steps [L] of episodes that have not ended
         self._lock, self._process = RLock(), os.getpid()
         self._server: TeacherServer | None = None
 
@@ -214,14 +214,17 @@ class Teacher:
         """Nothing will come of these levels: episodes that were cut off.
 
         Args:
-            ids: the tickets; None for all that are out, as where a resumed loop begins anew.
+            ids: the tickets, of which some may be over; None for all that are out, as where a
+                resumed loop begins anew.
         """
         with self._here():
             if ids is None:
                 self._tickets.close_all()
                 self._whole.clear()
             else:
-                self._tickets.close(self._tickets.find(self._ids(ids)))
+                tickets = self._ids(ids)
+                going = self._tickets.states(tickets) != OVER
+                self._tickets.close(self._tickets.find(tickets[going]))
 
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
@@ -240,7 +243,11 @@ class Teacher:
         """
         with self._here():
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
-                tickets, whole, left = ended(outcome, self._kept)
+                kept = self._kept
+                if kept is not None:  # of episodes that were not cut off since
+                    states = self._tickets.states(self._ids(kept[LEVEL_ID].reshape(-1)))
+                    kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
+                tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
                     self._observe_rollout(tickets, whole)
                 self._kept = left
@@ -297,7 +304,8 @@ class Teacher:
             self._use(blocks.get(state["block"]), self._at)
             self._kept = None
             if kept := state["rollout"]:
-                self._kept = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
+                steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
+                self._kept = steps.flatten()
 
     def client(self) -> TeacherClient:
         """This teacher for another process, such as a worker of a collector.

@@ -62,6 +62,14 @@ class Tickets:
         self.next = block.end
         return block
 
+    def states(self, ids: Ids) -> NDArray[np.uint8]:
+        """What has become of tickets [n]; those that there never were wait."""
+        states = np.where((ids >= 0) & (ids < self.next), OVER, WAITS).astype(np.uint8)
+        for block in self.blocks:
+            inside = (ids >= block.start) & (ids < block.end)
+            states[inside] = block.state[ids[inside] - block.start]
+        return states
+
     def find(self, ids: Ids) -> Parts:
         """Where tickets [n] are that are out.
 

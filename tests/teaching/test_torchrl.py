@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors.utils import split_trajectories
 from torchrl.envs import Compose, ParallelEnv, RewardScaling, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
@@ -87,6 +88,47 @@ def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
         assert rollout["next", "done"].flatten().tolist() == [
             step == steps - 1 for step in range(len(rollout))
         ]
+
+
+@pytest.mark.parametrize("how", ["alternating", "one after another", "split"])
+def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> None:
+    """As of several workers that come by turns, or whose time is one line; or of trajectories."""
+    curriculum = Counting("rollout", "success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    workers = [
+        Collector(
+            taught(teacher, tell=False),
+            RandomPolicy(LevelsEnv().action_spec),
+            frames_per_batch=LEVELS * 3,
+            total_frames=-1,
+        )
+        for _ in range(2)
+    ]
+    for _ in range(6):
+        rollouts = [worker.rollout().clone() for worker in workers]
+        if how == "split":
+            rollouts = [split_trajectories(rollout) for rollout in rollouts]
+        for rollout in [torch.cat(rollouts, 1)] if how == "one after another" else rollouts:
+            teacher.observe(rollout)
+    for worker in workers:
+        worker.shutdown()
+    check(curriculum.seen)
+    assert len(curriculum.seen) > 16
+    for number, rollout in curriculum.rollouts.items():
+        steps = int(length(number))
+        assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
+        assert rollout["is_step"].sum() == steps
+
+
+def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
+    """Every call resets all environments, also those whose episodes have been observed."""
+    curriculum = Counting("rollout", "success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    env = taught(teacher, tell=False).append_transform(StepCounter(2))
+    for _ in range(4):
+        teacher.observe(env.rollout(10))
+    assert len(curriculum.seen) == 4 * LEVELS
+    assert all(total == 2 * number for number, (total, _) in curriculum.seen.items())
 
 
 def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
