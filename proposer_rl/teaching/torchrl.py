@@ -19,6 +19,19 @@ from proposer_rl.teaching.teacher import Success, Teacher
 NONE = -1  # the identity of no level
 
 
+class _Played:
+    """The levels [n] that the environments of a batch play, and what has come of them so far."""
+
+    ids: Tensor  # int64 [n]
+    out: Tensor  # whether they still are, bool [n]
+    returns: Tensor
+    steps: Tensor
+    succeeded: Tensor
+    knows: bool  # whether there is such a thing
+    levels: Any = None  # [n], in one row
+    asked = False
+
+
 class LevelTransform(Transform):
     """Asks for a level at every reset, also of some environments of a batch; tells at every end.
 
@@ -42,13 +55,6 @@ class LevelTransform(Transform):
         ArgumentError: if the teacher is of several students, or reads rollouts and is to be told.
     """
 
-    _ids: Tensor  # int64 [n], of the levels that are played
-    _out: Tensor  # whether they still are, bool [n]
-    _returns: Tensor
-    _steps: Tensor
-    _succeeded: Tensor
-    _knows: bool  # whether there is such a thing
-
     def __init__(
         self,
         teacher: Teacher | TeacherClient,
@@ -67,8 +73,12 @@ class LevelTransform(Transform):
             )
         self._teacher, self._set_level = teacher, set_level
         self._rule, self._tells = success, tell
-        self._levels: Any = None  # [n], in one row
-        self._asked = False
+
+    @property
+    def _now(self) -> _Played:
+        # The environment's: of a transform that another one steps through TorchRL makes a clone.
+        played: dict[int, _Played] = vars(self.parent.base_env).setdefault("_played", {})
+        return played.setdefault(id(self._teacher), _Played())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add ``level_id``."""
@@ -78,73 +88,76 @@ class LevelTransform(Transform):
         return observation_spec
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
-        if not self._asked:  # an environment with a state comes here twice
-            self._asked = True
+        now = self._now
+        if not now.asked:  # an environment with a state comes here twice
+            now.asked = True
             self._begin(tensordict)
         return tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self._asked = False
+        self._now.asked = False
         return self._marked(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        after = next_tensordict
-        self._returns += after["reward"].reshape(-1)
-        self._steps += 1
+        after, now = next_tensordict, self._now
+        now.returns += after["reward"].reshape(-1)
+        now.steps += 1
         success = self._success(after)
-        self._knows = success is not None
+        now.knows = success is not None
         if success is not None:
-            self._succeeded = success.reshape(-1).clone()  # it is written to
-        self._end(after["done"].reshape(-1) & self._out)
+            now.succeeded = success.reshape(-1).clone()  # it is written to
+        self._end(after["done"].reshape(-1) & now.out)
         return self._marked(after)
 
     def _begin(self, tensordict: TensorDictBase | None) -> None:
         """Give levels to environments that are reset."""
-        env = self.parent.base_env
+        env, now = self.parent.base_env, self._now
         count = env.batch_size.numel()
         device = env.device or torch.device("cpu")
         key = env.reset_keys[0]
         mask = None if tensordict is None else tensordict.get(key, None)
-        if mask is None or self._levels is None:
+        if mask is None or now.levels is None:
             self._start(count, device)
             which = torch.arange(count, device=device)
         else:
             # What has not ended here ended by a transform behind this one.
-            self._end(mask.reshape(-1) & self._out)
+            self._end(mask.reshape(-1) & now.out)
             which = mask.reshape(-1).nonzero().squeeze(-1)
         ids, levels = self._teacher.ask(len(which))
         levels = levels.to(device)
-        if self._levels is None:
-            self._levels = levels.clone()
-        self._levels[which] = levels
-        self._ids[which], self._out[which] = ids.to(device), True
-        self._returns[which], self._steps[which], self._succeeded[which] = 0, 0, False
+        if now.levels is None:
+            now.levels = levels.clone()
+        now.levels[which] = levels
+        now.ids[which], now.out[which] = ids.to(device), True
+        now.returns[which], now.steps[which], now.succeeded[which] = 0, 0, False
         batch = env.batch_size
-        played = self._levels.unflatten(0, batch) if batch else self._levels[0]
+        played = now.levels.unflatten(0, batch) if batch else now.levels[0]
         self._set_level(env, played.clone())
 
     def _start(self, count: int, device: torch.device) -> None:
-        if self._levels is not None and bool(self._out.any()):
-            self._teacher.drop(self._ids[self._out])
-        self._ids = torch.full((count,), NONE, device=device)
-        self._returns = torch.zeros(count, dtype=torch.float64, device=device)
-        self._steps = torch.zeros(count, dtype=torch.int64, device=device)
-        self._out = torch.zeros(count, dtype=torch.bool, device=device)
-        self._succeeded = torch.zeros_like(self._out)
+        now = self._now
+        if now.levels is not None and bool(now.out.any()):
+            self._teacher.drop(now.ids[now.out])
+        now.ids = torch.full((count,), NONE, device=device)
+        now.returns = torch.zeros(count, dtype=torch.float64, device=device)
+        now.steps = torch.zeros(count, dtype=torch.int64, device=device)
+        now.out = torch.zeros(count, dtype=torch.bool, device=device)
+        now.succeeded = torch.zeros_like(now.out)
 
     def _end(self, ended: Tensor) -> None:
         """Tell what came of episodes, bool [n]."""
+        now = self._now
         which = ended.nonzero().squeeze(-1)  # waits for the device once, where each mask would
         if self._tells and len(which):
             self._teacher.tell(
-                self._ids[which],
-                self._returns[which],
-                self._succeeded[which] if self._knows else None,
-                steps=self._steps[which],
+                now.ids[which],
+                now.returns[which],
+                now.succeeded[which] if now.knows else None,
+                steps=now.steps[which],
             )
-        self._out = self._out & ~ended
+        now.out = now.out & ~ended
 
     def _success(self, after: TensorDictBase) -> Tensor | None:
         rule = self._rule
@@ -160,4 +173,4 @@ class LevelTransform(Transform):
         return None
 
     def _marked(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(LEVEL_ID, self._ids.reshape(*tensordict.batch_size, 1).clone())
+        return tensordict.set(LEVEL_ID, self._now.ids.reshape(*tensordict.batch_size, 1).clone())

@@ -10,7 +10,15 @@ import pytest
 import torch
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.utils import split_trajectories
-from torchrl.envs import Compose, ParallelEnv, RewardScaling, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    FrameSkipTransform,
+    ParallelEnv,
+    RewardScaling,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import proposer_rl as prl
@@ -131,6 +139,33 @@ def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
     assert all(total == 2 * number for number, (total, _) in curriculum.seen.items())
 
 
+@pytest.mark.parametrize("tell", [True, False])
+def test_transforms_that_step_by_themselves_may_stand_behind_it(tell: bool) -> None:
+    """They step through clones of those before them."""
+    curriculum = Counting("success", *([] if tell else ["rollout"]))
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    env = taught(teacher, tell=tell).append_transform(FrameSkipTransform(2))
+    rollout = env.rollout(16, break_when_any_done=False)
+    if tell:
+        teacher.propose(1)  # takes in what was told
+        check(curriculum.seen)
+    else:
+        teacher.observe(rollout)
+    assert len(curriculum.seen) == int(rollout["next", "done"].sum()) > LEVELS
+
+
+def test_a_clone_has_episodes_of_its_own_in_another_environment() -> None:
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    env = taught(teacher)
+    state = env.reset()
+    TransformedEnv(LevelsEnv(LEVELS), env.transform.clone()).rollout(2)
+    env.rollout(16, break_when_any_done=False, auto_reset=False, tensordict=state)
+    teacher.propose(1)  # takes in what was told
+    check(curriculum.seen)
+    assert {*range(LEVELS)} < curriculum.seen.keys()
+
+
 def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
     curriculum = Counting()
     teacher = prl.Teacher(curriculum, ITEMS, block=3)
@@ -210,7 +245,7 @@ def test_the_end_of_episodes_waits_for_the_device_once() -> None:
     env = taught(teacher)
     env.reset()
     ended = torch.tensor([True, False, True, False])
-    env.transform._knows = True
+    env.transform._now.knows = True
     with CountedReads() as reads:
         env.transform._end(ended)
         env.transform._end(torch.zeros_like(ended))
