@@ -42,7 +42,7 @@ def adapted(
         some = levels[0] if levels.ndim > 1 else levels
         some = some if device is None else moved(some, device)
         draws = [more[0][0]] if name == "play" else []
-        found = function(given(some), *draws)
+        found = function(given(some.clone()), *draws)  # which may change them
         if isinstance(found, TensorDictBase):
             return found if found.ndim > 2 else found.unsqueeze(0)
         if isinstance(found, dict):

@@ -335,7 +335,7 @@ class Teacher:
         self._at += 1
         block.state[ticket - block.start] = OUT
         if not self._rows:
-            each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU)]
+            each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU).clone()]
             self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
         return ticket, self._rows[ticket - block.start]
 
@@ -361,9 +361,9 @@ class Teacher:
         return self._tickets.add(batch)
 
     def _levels(self, block: Block) -> Any:
-        """The levels of a block, as the loop gets them, in a container of its own."""
-        levels = moved(block.batch.levels, self.device)
-        return self._given(levels[0] if self._alone else levels[:])
+        """The levels of a block, as the loop gets them, which may change them."""
+        levels = moved(block.batch.levels, self.device).clone()
+        return self._given(levels[0] if self._alone else levels)
 
     def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))

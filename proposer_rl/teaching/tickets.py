@@ -218,10 +218,10 @@ def as_array(
         ArgumentError: naming the argument, if it has another shape or is not finite.
     """
     if isinstance(value, Tensor):
-        value = value.detach().cpu()
+        value = value.detach().cpu().double()  # NumPy has no bfloat16
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # the last one of a gradient's tensors
         raise ArgumentError(f"{name}={value!r:.60}: must be numbers") from error
     if for_all and not array.ndim:
         array = np.full(shape, array)

@@ -220,3 +220,42 @@ def test_one_number_of_episodes_stands_for_all_tickets() -> None:
     teacher.tell(int(ids[2]), [5.0, 6.0], episodes=[7, 9])
     teacher.propose(1)
     assert seen == [[[[1, 2, 5], [3, 4, 6]], [[8, 8, 7], [8, 8, 9]], [[1] * 3] * 2]]
+
+
+@pytest.mark.parametrize("how", ["propose", "ask(n)", "ask()", "play"])
+def test_a_loop_may_change_the_levels_that_it_gets(how: str) -> None:
+    """As where it scales them in place: the curriculum remembers what it has proposed."""
+
+    def play(levels: torch.Tensor, generator: Any) -> dict[str, Any]:
+        return {"return": levels.fill_(9).sum(1)}
+
+    space = prl.LevelGenerator(lambda n, g: torch.rand(n, 3, generator=g))
+    if how == "play":
+        teacher = prl.Teacher(prl.curricula.robust_plr(capacity=8), space, play=play)
+    else:
+        recipe = prl.curricula.plr(capacity=8, fill=1.0, replay_probability=1.0)
+        teacher = prl.Teacher(recipe, space, block=8)
+        if how == "propose":
+            teacher.propose(8).fill_(9)
+            teacher.observe({"return": torch.arange(8)})
+        elif how == "ask(n)":
+            ids, levels = teacher.ask(8)
+            levels.fill_(9)
+            teacher.tell(ids, torch.arange(8))
+        else:
+            for i in range(8):
+                ticket, level = teacher.ask()
+                level.fill_(9)
+                teacher.tell(ticket, i)
+    assert (teacher.propose(8) < 1).all()
+
+
+def test_numbers_may_be_of_half_precision_and_have_no_gradient() -> None:
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS, block=2)
+    ids, _ = teacher.ask(2)
+    with pytest.raises(ArgumentError, match=r"return_=\[tensor.*: must be numbers"):
+        teacher.tell(ids, [torch.zeros((), requires_grad=True)] * 2)
+    teacher.tell(ids, torch.tensor([0.5, 2.0], dtype=torch.bfloat16, requires_grad=True))
+    teacher.propose(1)  # takes in what was told
+    assert [total for total, _ in curriculum.seen.values()] == [0.5, 2.0]
