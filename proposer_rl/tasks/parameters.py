@@ -152,8 +152,8 @@ def intervals(low: float, high: float, count: int = 1) -> Bins:
     Raises:
         ValueError: if the range is none.
     """
-    if not low < high:
-        raise ValueError(f"low={low} must be below high={high}")
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"low={low} must be below high={high}, and both finite")
     edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
     return Bins(edges[:-1], edges[1:])
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, SupportsFloat
 
 import gymnasium
+from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
@@ -71,7 +72,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             for name, path in self._how.items():
                 self._set(name, path)
         if isinstance(self._level, Mapping):
-            seed = self._level.get(SEED, seed)
+            seed = _plain(self._level.get(SEED, seed))
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, self._marked(info)
 
@@ -89,9 +90,12 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _set(self, name: str, path: str) -> None:
         """Set an attribute that the environment has."""
-        if name not in self._level:
-            raise ArgumentError(f"set.{name}: no parameter; there are: {', '.join(self._level)}")
-        env, value = self.env.unwrapped, self._level[name]
+        names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
+        if name not in names:
+            raise ArgumentError(
+                f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
+            )
+        env, value = self.env.unwrapped, _plain(self._level[name])
         within, _, last = path.rpartition(".")
         try:
             if isinstance(value, int | float) and not isinstance(value, bool):
@@ -118,3 +122,8 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 "'truncated', another entry of it, or a function"
             )
         return None
+
+
+def _plain(value: Any) -> Any:
+    """A number as Python has it; environments take no tensors."""
+    return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
+from operator import index
 from typing import Any, TypeVar
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Distribution, Levels, space_features
-from proposer_rl.tasks.parameters import Bins, ParameterSpace, intervals, points
+from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
 
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
@@ -98,6 +99,8 @@ class Parameters(LevelSpace, ParameterSpace):
     ) -> None:
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
+        if seeded and SEED in ranges:
+            raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict(bins) if isinstance(bins, Mapping) else dict.fromkeys(ranges, bins)
         _check_names("bins", counts, ranges)
         self._labels = {name: _labels(values) for name, values in ranges.items()}
@@ -141,8 +144,8 @@ class Parameters(LevelSpace, ParameterSpace):
             where = f"{key}.{name}"
             if labels is not None:
                 chosen = values if isinstance(values, list) else [values]
-                if not set(chosen) <= set(labels):
-                    raise ArgumentError(f"{where}={values!r}: must be among {labels}")
+                if any(value not in labels or chosen.count(value) > 1 for value in chosen):
+                    raise ArgumentError(f"{where}={values!r}: must be among {labels}, each once")
                 parts[name] = points(sorted(labels.index(value) for value in chosen))
                 continue
             values = [values] if isinstance(values, Real) else values
@@ -193,16 +196,19 @@ class Items(LevelSpace):
             raise ArgumentError(f"count={count}: must be at least 1")
         self.size = count
         self.axes = {"item": range(count)}
-        lines = torch.arange(count).unsqueeze(-1) if features is None else features
-        if len(lines) != count or lines.ndim != 2:
-            raise ArgumentError(f"features={list(lines.shape)}: must have a row for each item")
+        lines = torch.arange(count).unsqueeze(-1) if features is None else torch.as_tensor(features)
+        if lines.ndim != 2 or len(lines) != count or not lines.isfinite().all():
+            raise ArgumentError(
+                f"features={list(lines.shape)}: must have a row of finite numbers for each item"
+            )
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts = {}
-        for name, places in _distributions(target, named).items():
+        for name, given in _distributions(target, named).items():
+            places = [*map(index, given)]  # also of a tensor
             if not places or min(places) < 0 or max(places) >= count:
                 raise ArgumentError(f"{name}={places}: must be places from 0 to {count - 1}")
-            parts[name] = _SomeItems(torch.tensor(list(places)))
+            parts[name] = _SomeItems(torch.tensor(places))
         self.distributions = {"all": self, **parts}
 
     @property

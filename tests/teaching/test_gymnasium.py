@@ -11,8 +11,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
@@ -52,6 +54,19 @@ def test_the_level_is_in_the_environment_and_in_info() -> None:
     assert info["level"] == level
     assert env.reset()[1]["level_id"] == 1
     assert env.reset()[1]["level_id"] == 2  # what is cut off counts for nothing
+
+
+def test_numbers_of_a_generator_are_numbers_of_the_environment() -> None:
+    def draw(count: int, generator: Any) -> TensorDict:
+        gravity = torch.rand(count, generator=generator) + 5
+        return TensorDict({"gravity": gravity, "seed": torch.arange(count)}, [count])
+
+    teacher = prl.Teacher("domain_randomization", prl.LevelGenerator(draw))
+    env = prl.TaughtEnv(gymnasium.make("CartPole-v1"), teacher, {"gravity": "gravity"})
+    seen, info = env.reset()
+    assert env.unwrapped.gravity == float(info["level"]["gravity"])
+    assert type(env.unwrapped.gravity) is float
+    np.testing.assert_array_equal(seen, gymnasium.make("CartPole-v1").reset(seed=0)[0])
 
 
 def test_levels_may_be_options_of_a_reset() -> None:
@@ -148,6 +163,10 @@ def test_a_forked_teacher_is_refused() -> None:
         (lambda: cartpole({"gravity": "gravty"}).reset(), "set.gravity='gravty': CartPoleEnv has"),
         (lambda: cartpole({"gravity": "a.b"}).reset(), "set.gravity='a.b': CartPoleEnv has no"),
         (lambda: cartpole({"mass": "gravity"}).reset(), "set.mass: no parameter; there are: grav"),
+        (
+            lambda: prl.TaughtEnv(LevelEnv(), prl.Teacher(Counting(), ITEMS), {"g": "g"}).reset(),
+            "set.g: no parameter; there are: none",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(make: Any, message: str) -> None:

@@ -24,6 +24,7 @@ from proposer_rl.settings import ArgumentError
 from tests.curricula.test_contract import same
 from tests.tiny import TASK
 
+NAN = float("nan")
 SPACE = prl.Parameters(
     {"gravity": (5.0, 25.0), "walls": range(60), "ground": ["flat", "stairs"]},
     bins=4,
@@ -207,6 +208,30 @@ def test_many_parameters_have_one_bin_each() -> None:
     assert level.keys() == ranges.keys()
 
 
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: prl.Parameters({"g": (0, float("inf"))}), r"ranges.g=\(0, inf\): .* both finite"),
+        (lambda: prl.Parameters({"seed": (0, 1)}, seeded=True), "ranges.seed, seeded=True: a lev"),
+        (
+            lambda: prl.Parameters({"g": ["a", "b"]}, target={"g": ["a", "a"]}),
+            r"target.g=\['a', 'a'\]: must be among \['a', 'b'\], each once",
+        ),
+        (lambda: prl.Items(2, features=torch.tensor([[0.0], [NAN]])), r"features=\[2, 1\]: .*fin"),
+    ],
+)
+def test_what_is_no_space_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        make()
+
+
+def test_spaces_take_arrays_and_choices_of_any_kind() -> None:
+    items = prl.Items(3, features=np.eye(3), target=torch.tensor([1, 1, 2]))  # type: ignore[arg-type]
+    torch.testing.assert_close(items.target_shares, torch.tensor([0.0, 2 / 3, 1 / 3]))
+    lists = prl.Parameters({"size": [[1, 2], [3, 4]]}, target={"size": [[3, 4]]})
+    assert lists.target_shares.tolist() == [0, 1]
+
+
 def test_every_update_has_draws_of_its_own() -> None:
     """One ``Streams(0)`` at each update gives the same levels for ever; here there is none."""
     teacher = prl.Teacher(prl.curricula.domain_randomization(), SPACE)
@@ -268,7 +293,7 @@ def observe(teacher: prl.Teacher, **outcome: Any) -> None:
     teacher.observe(outcome)
 
 
-NAN, ZEROS = float("nan"), [0.0] * 4
+ZEROS = [0.0] * 4
 REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "a ticket that was never given": (lambda t: t.tell(99, 0.0, 1), "ids=99: is no ticket"),
     "a negative ticket": (lambda t: t.tell(-1, 0.0, 1), "ids=-1: is no ticket"),
