@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import AutoResetTransform, EnvBase, Transform, VecGymEnvTransform
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
@@ -138,6 +138,12 @@ class LevelTransform(Transform):
 
     def _start(self, count: int, device: torch.device) -> None:
         now = self._now
+        resets_itself = VecGymEnvTransform, AutoResetTransform
+        if any(isinstance(part, resets_itself) for part in self.parent.modules()):
+            raise ArgumentError(
+                "env: resets itself at an episode's end, before there is another level; give a "
+                "vector of Gymnasium autoreset_mode=AutoresetMode.DISABLED"
+            )
         if now.levels is not None and bool(now.out.any()):
             self._teacher.drop(now.ids[now.out])
         now.ids = torch.full((count,), NONE, device=device)

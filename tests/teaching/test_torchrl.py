@@ -6,13 +6,16 @@ import pickle
 from functools import partial
 from typing import Any
 
+import gymnasium
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.envs import (
     Compose,
     FrameSkipTransform,
+    GymWrapper,
     ParallelEnv,
     RewardScaling,
     SerialEnv,
@@ -212,6 +215,21 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
 def test_what_cannot_be_taught_is_refused(make: Any, message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         make()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_environments_that_reset_themselves_are_refused() -> None:
+    """They would begin each episode on the level of the one before."""
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+        vector = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")] * 2, autoreset_mode=mode)
+        teacher = prl.Teacher(Counting(), ITEMS)
+        transform = prl.LevelTransform(teacher, lambda env, levels: None)
+        env = TransformedEnv(GymWrapper(vector), transform)
+        if mode is AutoresetMode.DISABLED:
+            env.rollout(3)
+            continue
+        with pytest.raises(ArgumentError, match="env: resets itself at an episode's end"):
+            env.rollout(3)
 
 
 def test_success_is_asked_for() -> None:
