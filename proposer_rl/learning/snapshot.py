@@ -87,7 +87,7 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
         state["exp_avg"].copy_(entry["exp_avg"])
         state["exp_avg_sq"].copy_(entry["exp_avg_sq"])
         state["step"].copy_(entry["step"].flatten()[0])
-    return int(steps[0, 0])
+    return int(steps.max())  # of frozen parameters there are none
 
 
 def _batch(agent: ActorCritic) -> torch.Size:

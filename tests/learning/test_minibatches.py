@@ -128,6 +128,14 @@ def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
         assert torch.equal(entry["value"], before[name, "value"])
 
 
+def test_the_learning_rate_falls_on_where_the_first_parameters_are_frozen() -> None:
+    ppo = of_maze(replace(SETTINGS, anneal_updates=4), True)
+    next(ppo.agent.parameters()).requires_grad_(False)
+    ppo.update(generators())
+    ppo.restore(ppo.snapshot())
+    assert ppo.left == 0.75
+
+
 def test_the_clip_falls_with_the_learning_rate() -> None:
     settings = replace(SETTINGS, anneal_updates=4, clip_epsilon=0.01, learning_rate=0.1)
     annealed = of_maze(replace(settings, anneal_clip=True), True)
