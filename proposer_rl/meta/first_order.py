@@ -41,7 +41,7 @@ from typing import Literal, get_args
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import PPO
@@ -111,7 +111,7 @@ def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
         learner: whose agent the performance is of, and whose Adam says how steps are scaled.
         performance: of each Solver, float [K], with gradients towards the agent's parameters.
     """
-    parameters = dict(learner.agent.named_parameters())
+    parameters = trainable(learner.agent)
     gradients = torch.autograd.grad(
         performance.sum(), list(parameters.values()), allow_unused=True, materialize_grads=True
     )
@@ -123,6 +123,11 @@ def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
         moment = torch.where(step > 0, state[name, "exp_avg_sq"] / bias, torch.ones_like(gradient))
         direction[name] = gradient / (moment.sqrt() + learner.settings.adam_eps)
     return direction
+
+
+def trainable(agent: nn.Module) -> dict[str, nn.Parameter]:
+    """The parameters of an agent by their names, without those that are frozen."""
+    return {name: p for name, p in agent.named_parameters() if p.requires_grad}
 
 
 def scaled(direction: Direction) -> dict[str, Tensor]:
@@ -157,7 +162,7 @@ def root_mean_square(direction: Direction) -> Tensor:
 @contextmanager
 def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[None]:
     """K Solvers that stand ``step`` along a direction; afterwards they are bit by bit as before."""
-    parameters = dict(agent.named_parameters())
+    parameters = trainable(agent)
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
     try:
         with torch.no_grad():

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from proposer_rl.learning import PPO
 from proposer_rl.learning.snapshot import agent_values
-from proposer_rl.meta.first_order import squared_length, surrogate
+from proposer_rl.meta.first_order import squared_length, surrogate, trainable
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask, Levels, Task
@@ -90,7 +90,7 @@ class LevelGradients:
 
     def lengths(self, learner: PPO, value: Value, solvers: int, count: int) -> Tensor:
         """Of any value of a level, for K Solvers with n levels each: float [K, n]."""
-        parameters = dict(self._agent.named_parameters())
+        parameters = trainable(self._agent)
         parts = []
         for solver in range(solvers):
             self._become(learner, solver)

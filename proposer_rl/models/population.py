@@ -69,9 +69,15 @@ class Population(nn.Module):
         self.precision = precision
         self.cores = cores
         self.batched = batched
-        self.names = [name for name, _ in members[0].named_parameters()]
+        # Of each parameter every place: layers may share it.
+        places: dict[nn.Parameter, list[str]] = {}
+        for prefix, module in members[0].named_modules():
+            for name, parameter in module.named_parameters(prefix, False, False):
+                places.setdefault(parameter, []).append(name)
+        self.places = list(places.values())
+        self.names = [names[0] for names in self.places]
         self.stacked = nn.ParameterList(
-            nn.Parameter(torch.stack([p.detach() for p in parameters]))
+            nn.Parameter(torch.stack([p.detach() for p in parameters]), parameters[0].requires_grad)
             for parameters in zip(*(member.parameters() for member in members), strict=True)
         )
         # In a tuple, so that nn.Module does not register it: it lends its structure, no numbers.
@@ -103,7 +109,8 @@ class Population(nn.Module):
         self, network: nn.Module, parameters: Sequence[Tensor], inputs: Sequence[Tensor]
     ) -> tuple[Tensor, ...]:
         """Outputs of the network with these parameters."""
-        named = dict(zip(self.names, parameters, strict=True))
+        pairs = zip(self.places, parameters, strict=True)
+        named = {name: parameter for names, parameter in pairs for name in names}
         low, device = self.precision == "bf16", parameters[0].device.type
         with torch.autocast(device, torch.bfloat16) if low else nullcontext():
             outputs = functional_call(network, named, tuple(inputs), tie_weights=False)

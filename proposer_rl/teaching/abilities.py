@@ -13,7 +13,7 @@ from torch import Tensor
 from proposer_rl.curricula import Student
 from proposer_rl.curricula.batches import moved
 from proposer_rl.curricula.student import VALUE, advantages
-from proposer_rl.meta.first_order import Direction, alignment, over_steps
+from proposer_rl.meta.first_order import Direction, alignment, over_steps, trainable
 from proposer_rl.settings import ArgumentError
 
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
@@ -95,10 +95,12 @@ class ActorStudent(Student):
 
     def _sampled_direction(self, rollout: TensorDictBase, weights: Tensor) -> dict[str, Tensor]:
         advantage = self._advantage(rollout)
-        parameters = dict(self._actor.named_parameters())
+        parameters = trainable(self._actor)
         with torch.enable_grad():
             gained = self._gained(rollout, advantage) * weights.to(advantage)
-            gradients = torch.autograd.grad(gained.sum(), list(parameters.values()))
+            gradients = torch.autograd.grad(
+                gained.sum(), list(parameters.values()), allow_unused=True, materialize_grads=True
+            )
         return {  # of one student
             name: (gradient / self._scale(parameter)).unsqueeze(0)
             for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True)

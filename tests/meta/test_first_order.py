@@ -135,6 +135,22 @@ def test_the_direction_is_the_preconditioned_slope_of_the_targets_performance(me
             torch.testing.assert_close(entry[k], expected[name][k] / scale, rtol=1e-5, atol=1e-7)
 
 
+def test_the_direction_leaves_frozen_parameters_out() -> None:
+    levels = some_levels(2, 5)
+    ppo = learner(levels)
+    (weight, bias), whole = ppo.agent.named_parameters(), exact_direction(ppo, levels)
+    bias[1].requires_grad_(False)
+    found = exact_direction(ppo, levels)
+    assert [*found] == [weight[0]]
+    turned = nn.functional.cosine_similarity(*(x[weight[0]].flatten(1) for x in (found, whole)))
+    torch.testing.assert_close(turned, torch.ones_like(turned))
+    slope = alignment(ppo.agent, found, RATE, lambda: performance(ppo.agent, levels)["return"])
+    still = {**found, bias[0]: torch.zeros_like(bias[1])}
+    bias[1].requires_grad_(True)
+    same = alignment(ppo.agent, still, RATE, lambda: performance(ppo.agent, levels)["return"])
+    assert slope.equal(same)
+
+
 def test_before_the_first_step_it_is_the_gradients_direction() -> None:
     levels = some_levels(2, 5)
     ppo = learner(levels)

@@ -126,3 +126,22 @@ def test_the_uniform_policy_next_to_the_goal_in_closed_form() -> None:
     expected = 3 * slope**2 * sum((0.25 * ((a == 3) - 0.25)) ** 2 for a in range(4))
     found = LevelGradients(Precise()).of_returns(ppo, levels)
     assert found.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_frozen_parameters_add_nothing() -> None:
+    class Frozen(Precise):
+        """The same without their biases' training."""
+
+        def learner(self, streams: Sequence[Streams]) -> PPO:
+            ppo = super().learner(streams)
+            [*ppo.agent.parameters()][1].requires_grad_(False)
+            return ppo
+
+    levels = some_levels(2, 3)
+    found = LevelGradients(Frozen()).of_returns(ppo := Frozen().learner([Streams(0)] * 2), levels)
+    (weight, _), expected = ppo.agent.parameters(), torch.zeros(2, 3, dtype=torch.float64)
+    for k in range(2):
+        for i in range(3):
+            value = performance(ppo.agent, levels)["return"][k, i]
+            expected[k, i] = torch.autograd.grad(value, weight)[0].square().sum()
+    torch.testing.assert_close(found, expected)

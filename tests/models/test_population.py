@@ -52,6 +52,39 @@ def test_outputs_and_gradients_equal_those_of_networks_apart(copies: int, way: d
             torch.testing.assert_close(stacked.grad[k], parameter.grad, rtol=1e-4, atol=1e-6)
 
 
+class SharedAndFrozen(nn.Module):
+    """Two layers with one weight, the first of which keeps its bias."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.second, self.last = (nn.Linear(3, 3) for _ in range(3))
+        self.second.weight = self.first.weight
+        self.first.bias.requires_grad_(False)
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        return self.last(self.second(self.first(inputs).tanh()))
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("copies", [1, 3])
+def test_layers_may_share_parameters_and_leave_some_untrained(copies: int, way: dict) -> None:
+    torch.manual_seed(7)
+    networks = [SharedAndFrozen() for _ in range(copies)]
+    torch.manual_seed(7)
+    population = Population(SharedAndFrozen, copies, **way)
+    inputs = torch.rand(copies, 5, 3)
+    outputs = population(inputs)
+    outputs.square().sum().backward()
+    for k, network in enumerate(networks):
+        own = network(inputs[k])
+        torch.testing.assert_close(outputs[k], own)
+        own.square().sum().backward()
+        for stacked, parameter in zip(population.stacked, network.parameters(), strict=True):
+            assert stacked.requires_grad == parameter.requires_grad
+            if parameter.requires_grad:
+                torch.testing.assert_close(stacked.grad[k], parameter.grad)
+
+
 def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> None:
     population, planes = together(6, cores=4), torch.rand(6, 4, 3, 6, 6)
     runs = []

@@ -87,6 +87,19 @@ def test_direction_and_alignment_are_those_of_gradients_by_hand(adam: bool) -> N
     assert weight.equal(before)
 
 
+def test_parameters_that_are_frozen_or_of_another_head_do_not_matter() -> None:
+    taught, actor, _ = student(adam=False)
+    levels = SPACE.given(SPACE.sample(8, torch.Generator().manual_seed(0)))
+    rollout = play(actor, levels, torch.Generator().manual_seed(1)).unsqueeze(0)
+    (expected,) = taught.sampled_direction(rollout, torch.ones(1, 8)).values()
+    layer = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    layer.head, layer.frozen = nn.Linear(2, 1), nn.Linear(2, 1).requires_grad_(False)
+    found = taught.sampled_direction(rollout, torch.ones(1, 8))
+    assert [bool(entry.any()) for entry in found.values()] == [True, False, False]
+    assert next(iter(found.values())).equal(expected)
+    assert taught.sampled_alignment(found, rollout)["slope"].shape == (1, 8)
+
+
 def test_first_order_gain_finds_the_levels_of_the_target() -> None:
     taught, actor, _ = student(adam=True)
     recipe = prl.curricula.first_order_sampled(smoothing=0.5, exploration=0.2)
