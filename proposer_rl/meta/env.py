@@ -159,7 +159,7 @@ class SolverTrainingEnv(EnvBase):
         return self._reward(step), choices
 
     def _set_seed(self, seed: int | None) -> None:
-        self.streams = Streams(seed or 0)
+        self.streams, self._episode = Streams(seed or 0), -1
 
     def _performance(self) -> TensorDictBase:
         return self.view.performance(self.solvers.agent, self._episode, self._updates)

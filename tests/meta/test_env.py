@@ -132,6 +132,14 @@ def test_the_same_fork_and_actions_reproduce_an_episode_bit_for_bit() -> None:
     assert not torch.equal(one["next", "reward"], other["next", "reward"])
 
 
+def test_a_seed_makes_later_episodes_the_same() -> None:
+    env, rewards = meta_env(), []
+    for seed in (4, 4, 5):
+        env.set_seed(seed)
+        rewards.append(play(env, some_actions())["next", "reward"])
+    assert rewards[0].equal(rewards[1]) and not rewards[0].equal(rewards[2])
+
+
 def test_an_episode_that_was_broken_off_can_be_played_again() -> None:
     class Stop(Exception):
         """An interruption."""
