@@ -16,7 +16,7 @@ from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.learner import Learner
 from proposer_rl.meta.rewards import Reward, TrainingStep
 from proposer_rl.meta.view import SolverView
-from proposer_rl.settings import signed
+from proposer_rl.settings import ArgumentError, signed
 from proposer_rl.streams import Streams
 
 
@@ -53,6 +53,7 @@ class SolverTrainingEnv(EnvBase):
 
     Raises:
         ValueError: if the Solvers are no population, or a length is out of range.
+        ArgumentError: in a step, if the reward is not one number for each Solver.
     """
 
     def __init__(
@@ -156,7 +157,13 @@ class SolverTrainingEnv(EnvBase):
         if measure:
             self._seen = self._performance(), self.view.probe(self.solvers.agent).clone()
         step = TrainingStep(levels, update.rollout, self.solvers.agent, before, self._seen[0])
-        return self._reward(step), choices
+        reward = torch.as_tensor(self._reward(step))
+        if reward.shape != self.batch_size:
+            raise ArgumentError(
+                f"reward: must be a number for each Solver, of shape {list(self.batch_size)}, got "
+                f"shape {list(reward.shape)}"
+            )
+        return reward, choices
 
     def _set_seed(self, seed: int | None) -> None:
         self.streams, self._episode = Streams(seed or 0), -1

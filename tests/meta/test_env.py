@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -18,6 +20,7 @@ from proposer_rl.meta.rewards import (
     task_difficulty,
 )
 from proposer_rl.meta.view import SolverView
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
@@ -112,6 +115,13 @@ def test_rewards_sum_to_the_total_gain_on_the_one_validation_batch(reward: Rewar
     for name in ("return", "log_success"):  # both are told, whatever is paid
         torch.testing.assert_close(steps[name][:, 0, 0], before[name])
         torch.testing.assert_close(steps["next", name][:, -1, 0], after[name])
+
+
+@pytest.mark.parametrize("shape", [[], [K, 1], [K, P]])
+def test_a_reward_of_another_shape_is_refused(shape: list[int]) -> None:
+    message = rf"^reward: must be a number for each Solver, of shape \[{K}\], got shape "
+    with pytest.raises(ArgumentError, match=message + re.escape(str(shape))):
+        played(meta_env(lambda _: torch.zeros(shape)))
 
 
 def test_all_copies_start_as_the_forked_solver() -> None:
