@@ -163,17 +163,18 @@ class _OnCores(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         needs = ctx.needs_input_grad[3:]
+        again = torch._C._autograd._get_current_graph_task_keep_graph()  # retain_graph
 
         def one(k: int) -> tuple[Tensor, ...]:
             outputs, leaves = ctx.graphs[k]
             wanted = [leaf for leaf, need in zip(leaves, needs, strict=True) if need]
             slopes = [g[k] for g in gradients]
             # A parameter that the network does not use has a gradient of zero.
-            return torch.autograd.grad(outputs, wanted, slopes, materialize_grads=True)
+            return torch.autograd.grad(outputs, wanted, slopes, again, materialize_grads=True)
 
         results = zip(*ctx.pool.map(one, range(len(ctx.graphs))), strict=True)
         stacked = iter([torch.stack(slices) for slices in results])
-        ctx.graphs = None
+        ctx.graphs = ctx.graphs if again else None
         return None, None, None, *(next(stacked) if need else None for need in needs)
 
 

@@ -97,6 +97,20 @@ def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> No
         assert all(torch.equal(one, other) for one, other in zip(run, runs[0], strict=True))
 
 
+@pytest.mark.parametrize("way", WAYS)
+def test_gradients_can_be_taken_one_after_another(way: dict) -> None:
+    population, planes = together(3, **way), torch.rand(3, 4, 3, 6, 6)
+    policy, value = population(planes)
+    policy.sum().backward(retain_graph=True)
+    value.sum().backward()
+    apart = [parameter.grad for parameter in population.stacked]
+    population.zero_grad()
+    policy, value = population(planes)
+    (policy.sum() + value.sum()).backward()
+    for parameter, gradient in zip(population.stacked, apart, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-4)
+
+
 def test_the_number_of_cores_changes_no_bit() -> None:
     def trained(cores: int) -> list[torch.Tensor]:
         population, planes = together(5, cores=cores), torch.rand(5, 4, 3, 6, 6)
