@@ -211,11 +211,11 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
 
 
 def _policy(cell_logits: Tensor, greedy: bool = False) -> Tensor:
-    """Action probabilities ``[*B, 4, H, W]``; of a policy that samples as precise as its logits."""
+    """Action probabilities ``[*B, 4, H, W]``, as precise as the logits."""
+    precise = torch.promote_types(cell_logits.dtype, torch.float32)
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)
-        return torch.zeros(cell_logits.shape, device=best.device).scatter_(-3, best, 1.0)
-    precise = torch.promote_types(cell_logits.dtype, torch.float32)
+        return torch.zeros_like(cell_logits, dtype=precise).scatter_(-3, best, 1.0)
     return cell_logits.softmax(-3, dtype=precise)
 
 
