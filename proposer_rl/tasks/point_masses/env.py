@@ -80,7 +80,16 @@ class PointMassEnv(EnvBase):
         self.set_levels(levels)
 
     def set_levels(self, levels: TensorDictBase) -> None:
-        """Play these levels [*B]; each mass from its next reset on."""
+        """Play these levels [*B]; each mass from its next reset on.
+
+        Raises:
+            ValueError: if they are of another batch shape.
+        """
+        if levels.batch_size != self.batch_size:
+            raise ValueError(
+                f"levels must keep the environment's batch shape {list(self.batch_size)}, "
+                f"got {list(levels.batch_size)}"
+            )
         self._first[..., -len(LEVEL) :] = torch.stack([levels[n].float() for n in LEVEL], -1)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -190,3 +190,10 @@ class DownOrAside(nn.Module):
 
     def forward(self, tensordict: TensorDict) -> TensorDict:
         return tensordict.set("action", torch.rand(*tensordict.batch_size, 2) * 2 - 1.6)
+
+
+def test_levels_of_another_shape_are_refused() -> None:
+    env = PointMassEnv(gates((2.0, 3.0, 1.0), (0.0, 3.0, 1.0)))
+    message = r"^levels must keep the environment's batch shape \[2\], got \[1\]$"
+    with pytest.raises(ValueError, match=message):
+        env.set_levels(gates((2.0, 3.0, 1.0)))
