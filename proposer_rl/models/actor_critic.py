@@ -139,7 +139,10 @@ class ActorCritic(TensorDictModuleBase):
     def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
         """This actor-critic as a TorchRL policy, for collectors and losses of other code.
 
-        An environment around which an agent with memory acts needs its :meth:`primer`.
+        An environment around which an agent with memory acts needs its :meth:`primer`. The critic
+        of a loss is the agent itself. TorchRL's ``GAE`` takes ``value_network=None``: the values of
+        this policy stand in a rollout, and ``agent(rollout["next"])`` writes those after each step.
+        As its network an agent would run under ``vmap``, or remember one episode in the next.
 
         Args:
             sample: whether actions are drawn where nothing else is said, as in ``env.rollout``;

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
 from proposer_rl.models import (
     ActorCritic,
@@ -21,7 +23,7 @@ from proposer_rl.models import (
 )
 from proposer_rl.models.memory import MEMORY
 from proposer_rl.streams import Streams
-from tests.tiny import tiny_view_task
+from tests.tiny import TASK, tiny_view_task
 
 K, N, T, F, M, A = 3, 4, 9, 5, 6, 2
 
@@ -166,3 +168,27 @@ def test_with_its_primer_it_remembers_in_rollouts_and_collectors_of_torchrl() ->
     assert (rollout["action"] != rollout["logits"].argmax(-1)).any()
     greedy = env.rollout(3, actor(), break_when_any_done=False)
     assert (greedy["action"] == greedy["logits"].argmax(-1)).all()
+
+
+@pytest.mark.parametrize("task", [TASK, tiny_view_task()], ids=["maps", "memory"])
+def test_advantages_and_losses_of_torchrl_take_it(task: Any) -> None:
+    """Values after each step are those of its own episode, also where that was cut off."""
+    agent = (solvers := task.learner([Streams(0, k) for k in range(2)])).agent
+    env = TransformedEnv(solvers.env, agent.primer()) if agent.memory else solvers.env
+    with torch.no_grad():
+        rollout = env.rollout(20, agent.actor(sample=True), break_when_any_done=False)
+        agent(rollout["next"])
+    values, after = (part["state_value"].squeeze(-1) for part in (rollout, rollout["next"]))
+    done = rollout["next", "done"].squeeze(-1)
+    torch.testing.assert_close(after[..., :-1][~done[..., :-1]], values[..., 1:][~done[..., :-1]])
+    end = int(done[0, 0].byte().argmax())
+    last = rollout["next"][..., end : end + 1].select(*agent.in_keys)
+    whole = torch.cat([rollout[..., : end + 1].select(*agent.in_keys), last], -1)
+    with set_recurrent_mode(True), torch.no_grad():
+        torch.testing.assert_close(agent(whole)["state_value"][0, 0, -1, 0], after[0, 0, end])
+    GAE(gamma=0.9, lmbda=0.9, value_network=None)(rollout)
+    with set_recurrent_mode(True):
+        losses = ClipPPOLoss(agent.actor(), agent)(rollout)
+    sum(losses[name] for name in losses.keys() if name.startswith("loss_")).backward()
+    assert all(parameter.grad.any() for parameter in agent.parameters())
+    assert abs(float(losses["kl_approx"])) < 1e-5
