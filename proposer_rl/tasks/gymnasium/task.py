@@ -19,7 +19,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    FrameSkipTransform,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
 
 from proposer_rl.extras import install_command
 from proposer_rl.learning import in_first_episode
@@ -178,9 +187,8 @@ class GymnasiumTask(Task):
         """The same environments for the same number of levels, played once."""
         shape = levels.batch_size
         if shape not in self._envs:
-            kept = [one for one in self._transforms if "reward" not in one.out_keys]
             self._envs[shape] = self._env(
-                levels, kept, vectorization=self._vectorization, once=True
+                levels, self._unpaid(), vectorization=self._vectorization, once=True
             )
         self._envs[shape].set_levels(levels)
         return self._envs[shape]
@@ -234,6 +242,9 @@ class GymnasiumTask(Task):
         first = plays(self.evaluated_on["target"][:1])[0]
         return Camera(self._make, self._parameters, first)
 
+    def _unpaid(self) -> list[Transform]:
+        return [one for one in self._transforms if "reward" not in one.out_keys]
+
     def _env(self, levels: TensorDictBase, transforms: list[Transform], **how: Any) -> EnvBase:
         env = GymnasiumEnv(
             levels,
@@ -251,13 +262,17 @@ class GymnasiumTask(Task):
         Raises:
             ValueError: naming the key, where there is no network for them.
         """
+        # Whatever a transform may raise.
+        fails = Exception if self._transforms else (RuntimeError, KeyError)
         try:
             env = self._env(level, self._transforms)
             shown, acts = env.observation_spec[0], env.full_action_spec["action"][0]
             env.close()
             seen = {name: spec for name, spec in shown.items() if name not in FLAGS}
-            SolverNetwork(list(seen.values()), acts, self._network)
-        except (RuntimeError, KeyError) as error:
+            network = SolverNetwork(list(seen.values()), acts, self._network)
+            if self._transforms:
+                self._try_transforms(level, network, list(seen))
+        except fails as error:
             kind = "transforms" if self._transforms else "network"
             raise ValueError(f"{kind}: {told(error)}") from error
         for name in ("channels", "image"):
@@ -266,12 +281,29 @@ class GymnasiumTask(Task):
                 raise ValueError(f"network.{name}={given}: is of images, of which none is seen")
         return seen, acts
 
+    @torch.no_grad()
+    def _try_transforms(self, level: TensorDictBase, network: nn.Module, seen: list[str]) -> None:
+        """Play a level twice, side by side but not in step, to the end of an episode."""
+        self._unpaid()
+        env = self._env(torch.stack([level, level], 1), self._transforms)
+        action = env.full_action_spec["action"].zero()
+        first = torch.tensor([[[True], [False]]], device=env.device)
+        _, state = env.step_and_maybe_reset(env.reset().set("action", action))
+        state = env.reset(state.set("_reset", first))
+        for _ in range(self.max_steps):
+            network(*(state[name] for name in seen))
+            stepped, state = env.step_and_maybe_reset(state.set("action", action))
+            state.select(*FLAGS)
+            if stepped["next", "done"].any():
+                break
+        env.close()
+
 
 def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
     """The transforms one by one, also those of a Compose.
 
     Raises:
-        ValueError: for what is none, or keeps running statistics.
+        ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
     """
     for one in transforms:
         if isinstance(one, Compose):
@@ -281,6 +313,16 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
                 f"transforms: {type(one).__name__}: it keeps running statistics, of which training "
                 "and evaluations would have their own. What all environments share is normalised "
                 "by PPO's normalize_observations and normalize_rewards"
+            )
+        elif isinstance(one, FrameSkipTransform):
+            raise ValueError(
+                "transforms: FrameSkipTransform: it steps on beyond an episode's end; a wrapper of "
+                "wrappers can take several steps at once"
+            )
+        elif isinstance(one, StepCounter) and one.max_steps is not None:
+            raise ValueError(
+                f"transforms: StepCounter: max_steps={one.max_steps}: the environment would not "
+                "see such an end, nor say whether it is a success; set max_steps of the task"
             )
         elif isinstance(one, Transform):
             yield one

@@ -16,10 +16,16 @@ from tensordict import TensorDict
 from torchrl.envs import (
     CatFrames,
     Compose,
+    EndOfLifeTransform,
+    ExcludeTransform,
+    FrameSkipTransform,
+    InitTracker,
+    NoopResetEnv,
     ObservationNorm,
     RewardClipping,
     RewardScaling,
     RewardSum,
+    SelectTransform,
     StepCounter,
     UnaryTransform,
     VecNorm,
@@ -567,7 +573,7 @@ def test_transforms_change_what_is_seen_and_leave_measured_returns_alone() -> No
     [
         [Compose(Compose(RewardClipping(-0.1, 0.1)), StepCounter())],
         [RewardSum()],
-        [CatFrames(N=3, dim=-1, in_keys=["observation"])],
+        [CatFrames(N=3, dim=-1, in_keys=["observation"], padding="constant")],
         [UnaryTransform(["observation"], ["observation"], fn=lambda seen: 2 * seen)],
     ],
     ids=lambda transforms: type(transforms[0]).__name__,
@@ -597,9 +603,20 @@ def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
             "VecNorm: it keeps running statistics",
         ),
         (lambda: VecNormV2(in_keys=["observation"]), "VecNormV2: it keeps running statistics"),
+        (lambda: FrameSkipTransform(2), "FrameSkipTransform: it steps on beyond an episode's end"),
+        (lambda: StepCounter(max_steps=4), "StepCounter: max_steps=4: .* set max_steps of the"),
+        # TorchRL's does not take it that only some of a batch of two dimensions begin.
+        (lambda: CatFrames(N=3, dim=-1, in_keys=["observation"]), "RuntimeError: shape mismatch"),
+        (lambda: SelectTransform("observation"), 'KeyError: .*"success" not found'),
+        (lambda: ExcludeTransform("observation"), "ValueError: .* non-empty list"),
+        (lambda: InitTracker(), "NotImplementedError: class InitTracker"),
+        (lambda: NoopResetEnv(2), "ValueError: .* NoopResetEnv"),
+        (lambda: EndOfLifeTransform(), "IndexError"),
     ],
 )
-def test_what_is_no_transform_or_one_with_a_memory_is_refused(make: Any, message: str) -> None:
+def test_transforms_that_do_not_work_are_refused_before_anything_is_trained(
+    make: Any, message: str
+) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # TorchRL's: VecNorm is to become VecNormV2
         transform = make()
