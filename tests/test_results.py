@@ -178,3 +178,26 @@ def test_the_prose_has_the_numbers_and_verdicts_of_the_tables(
         one_sided = ("[−" in match[0]) == (", −" in match[0])
         if one_sided and {row["verdict"] for row in compared} == {UNDECIDED}:
             assert re.search("decided|not told|not distinguishable|no significant", around), around
+
+
+def test_numbers_without_an_interval_are_those_of_the_tables() -> None:
+    """Medians of too few seeds, the dearest scores from episodes, and how often Student covers."""
+    text = {
+        name: (ROOT / f"docs/explanation/{name}.md").read_text(encoding="utf-8")
+        for name in ("results", "outcome_model", "measurement")
+    }
+    (section,) = re.findall(r"## At the paper's scale\n(.*?)\n##", text["results"], re.DOTALL)
+    ends = {
+        row["method"]: f"{float(row['ID success after 750 updates']):.3f}"
+        for row in tables("paper")["methods"]
+    }
+    assert {method: end for end, method in re.findall(r"(0\.\d+) \(`(\w+)`\)", section)} == ends
+    dearest = max(
+        float(row[FRAMES]) / float(row["frames (M)"]) for row in tables("sampled")["methods"]
+    )
+    assert f"cost up to {dearest - 1:.0f} times the Solver's own frames" in text["outcome_model"]
+    intervals = (ROOT / "results/intervals.md").read_text(encoding="utf-8")
+    (covered,) = re.findall(r"one run in five fails \| 5 \| (0\.\d+)", intervals)
+    assert (
+        f"Student's interval covers {float(covered):.0%}".replace("%", " %") in text["measurement"]
+    )
