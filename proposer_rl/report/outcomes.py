@@ -125,8 +125,8 @@ def group_table(study: Study) -> Table:
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
         "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
         "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
-        "success; both where the runs have single levels. P(better): that a run of the method "
-        f"has the higher {primary(study).name}. {INTERVALS}"
+        "success; both of those runs alone that have single levels. P(better): that a run of the "
+        f"method has the higher {primary(study).name}. {INTERVALS}"
     )
     return Table("methods", "Methods", note, rows)
 
