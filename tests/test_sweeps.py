@@ -56,6 +56,8 @@ def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
             assert row == pytest.approx(other, abs=1e-6)
     summary = json.loads(Path("together/summary.json").read_text())
     assert summary["seeds"] == [2, 0] and len(summary["updates_to_threshold"]) == 2
+    alone = json.loads(Path("0/summary.json").read_text())
+    assert summary["solver_parameters"] == alone["solver_parameters"]
 
 
 @pytest.mark.parametrize(

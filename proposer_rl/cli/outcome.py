@@ -51,7 +51,7 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "about": _about(config),
         "overrides": overrides(),
         "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
-        "solver_parameters": parameters,
+        "solver_parameters": parameters // len(config.seeds),
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": torch.get_num_threads(),
