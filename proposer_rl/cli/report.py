@@ -22,8 +22,8 @@ examples:
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
-Runs that were measured on different levels come in sections of their own. Unfinished runs are in
-the figures as far as they got, not in the comparisons, and the report says so."""
+Runs that were measured on different levels come in sections of their own. Runs shorter than most of
+the finished ones are named; they are in the figures as far as they got, not in the comparisons."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

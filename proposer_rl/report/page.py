@@ -231,6 +231,6 @@ def section(study: Study, figures: str) -> str:
 
 def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:
     """Parts of a page, and how it is made."""
-    left_out = "\n".join(f"- Left out: {escape_markdown(note)}" for note in notes)
+    left_out = "\n".join(f"- {escape_markdown(note)}" for note in notes)
     made = f"The whole report is written by\n\n```bash\n{command}\n```"
     return "\n\n".join(filter(None, [*parts, left_out, made])) + "\n"

@@ -11,7 +11,7 @@ from proposer_rl.report.charts import charts
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.measures import COSTS
 from proposer_rl.report.outcomes import comparison_table, group_table
-from proposer_rl.report.page import commands, incomplete
+from proposer_rl.report.page import commands, document, incomplete
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from research.ranking import ranking, spread
@@ -85,6 +85,7 @@ def test_proposers_that_differ_in_their_seed_make_a_group(tmp_path: Path) -> Non
     members = [sorted(run.folder.name for run in group.runs) for group in study.groups]
     assert sorted(members) == [["a", "b"], ["d"], ["e", "g"], ["f"]]
     assert notes == ["left out: c: the same settings and seed as a"]
+    assert document([], "bin/report", notes).lower().count("left out") == 1
 
 
 def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> None:
