@@ -279,6 +279,7 @@ class Teacher:
         with self._here():
             kept = self._kept
             return {
+                "students": self.students,
                 "curriculum": self.curriculum.state_dict(),
                 "tickets": self._tickets.state_dict(),
                 "proposals": self._proposals,
@@ -291,9 +292,15 @@ class Teacher:
             }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is."""
+        """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
+
+        Raises:
+            ArgumentError: if it is of another number of students.
+        """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
+            if state["students"] != self.students:
+                raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
             source: Any = self.space.space
             like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
@@ -371,8 +378,8 @@ class Teacher:
             name: as_array(_argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
             for name, value in told.items()
         }
-        if "success" in arrays:
-            _check_share(arrays["success"])
+        for name, array in arrays.items():
+            _check_values(name, array)
         self._tickets.tell(self._tickets.find(ids), arrays)
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
@@ -449,15 +456,23 @@ def _number(name: str, value: Any) -> float:
         raise ArgumentError(f"{_argument(name)}={value!r:.60}: must be a number") from error
     if not number - number == 0:
         raise ArgumentError(f"{_argument(name)}={number}: must be finite")
-    if name == "success" and not 0 <= number <= 1:
-        _check_share(np.array([number]))
+    # Arrays take a while to make; few numbers need one.
+    if name in COUNTS or (name == "success" and not 0 <= number <= 1):
+        _check_values(name, np.array([number]))
     return number
 
 
-def _check_share(success: NDArray[np.float64]) -> None:
-    outside = success[(success < 0) | (success > 1)]
-    if outside.size:
-        raise ArgumentError(f"success={outside[0]:g}: must be from 0 to 1")
+def _check_values(name: str, array: NDArray[np.float64]) -> None:
+    if name == "success":
+        wrong, allowed = array[(array < 0) | (array > 1)], "from 0 to 1"
+    elif name in COUNTS:
+        least = int(name == "episodes")
+        wrong = array[(array < least) | (array % 1 != 0)]
+        allowed = f"a whole number, at least {least}"
+    else:
+        return
+    if wrong.size:
+        raise ArgumentError(f"{name}={wrong[0]:g}: must be {allowed}")
 
 
 def _argument(name: str) -> str:

@@ -305,6 +305,15 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "no number": (lambda t: t.tell(0, "much", 1), "return_='much': must be a number"),
     "no numbers": (lambda t: t.tell([0, 1], ["a", "b"], [1, 1]), "return_=.*: must be numbers"),
     "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum reads it; tell it"),
+    "no episodes": (lambda t: t.tell(0, 1.0, 1, episodes=0), "episodes=0: must be a whole number"),
+    "half a step": (
+        lambda t: t.tell([0, 1], [1.0] * 2, [1] * 2, steps=1.5),
+        "steps=1.5: must be a whole number, at least 0",
+    ),
+    "a state of other students": (
+        lambda t: t.load_state_dict(prl.Teacher("plr", SPACE, students=2).state_dict()),
+        "state: of 2 students, not 1",
+    ),
     "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7: must be from 0 to 1"),
     "too few": (
         lambda t: t.tell([0, 1, 2], [0.0, 1.0], [1, 0, 0]),

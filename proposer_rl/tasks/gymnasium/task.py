@@ -284,7 +284,7 @@ class GymnasiumTask(Task):
     @torch.no_grad()
     def _try_transforms(self, level: TensorDictBase, network: nn.Module, seen: list[str]) -> None:
         """Play a level twice, side by side but not in step, to the end of an episode."""
-        self._unpaid()
+        self._unpaid()  # asks each for its keys, as an evaluation will
         env = self._env(torch.stack([level, level], 1), self._transforms)
         action = env.full_action_spec["action"].zero()
         first = torch.tensor([[[True], [False]]], device=env.device)
