@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,8 @@ TASKS = {
     "compiled_bf16": [*SMOKE, COMPILED, "precision=bf16"],
     "compiled_view_maze": ["task=view_maze_smoke", *QUIET, "schedule.updates=4", COMPILED],
 }
-SEVERAL = ["perf_gain", "domain_randomization", "first_order_gain", "model_transport"]
+MODELLED = ["plr", "model_transport"]
+SEVERAL = ["perf_gain", "domain_randomization", "first_order_gain", *MODELLED]
 
 
 def experiment(folder: Path, *overrides: str, signals: StopSignals | None = None) -> Experiment:
@@ -140,11 +142,17 @@ def test_what_is_measured_is_what_the_cpu_measures(full_precision: None) -> None
         torch.testing.assert_close(found[1][key], value, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", SEVERAL)
+@pytest.mark.parametrize(
+    ("task", "method"),
+    [
+        *product(["maze"], SEVERAL),
+        *product(["view_maze", "point_mass", "cartpole_normalized", "minigrid"], MODELLED),
+    ],
+)
 def test_the_same_command_gives_the_same_bytes_also_after_a_stop(
-    method: str, tmp_path: Path
+    task: str, method: str, tmp_path: Path
 ) -> None:
-    given = [f"+method={method}", *SMOKE]
+    given = [f"+method={method}", *TASKS[task]]
     experiment(tmp_path / "one", *given).run()
     with pytest.raises(Interrupted):
         experiment(tmp_path / "other", *given, signals=StopAt(3)).run()

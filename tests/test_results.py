@@ -122,7 +122,7 @@ PROSE = {
     "docs/explanation/outcome_model.md#Results": 11,
     "docs/explanation/proposer.md#Results": 3,
     "docs/explanation/replay.md": 10,
-    "docs/explanation/results.md": 2,
+    "docs/explanation/results.md": 4,
     "docs/how_to/reuse_a_proposer.md": 2,
 }
 NUMBER = r"[−]?\d*\.\d+"
