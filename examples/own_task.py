@@ -31,17 +31,17 @@ class Sledges(EnvBase):
         self.levels = levels.float()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
-        return self._state(self.levels["distance"], torch.zeros(self.batch_size))
+        return self._state(self.levels["distance"], torch.zeros(self.batch_size), self.levels["wind"])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         left, speed, wind = tensordict["observation"].unbind(-1)
         speed = speed + 0.2 * (tensordict["action"] - 1) - 0.1 * wind
-        state = self._state(left - speed, speed)
+        state = self._state(left - speed, speed, wind)
         return state.set("reward", state["terminated"].float() - 0.01)
 
-    def _state(self, left: Tensor, speed: Tensor) -> TensorDict:
+    def _state(self, left: Tensor, speed: Tensor, wind: Tensor) -> TensorDict:
         there = ((left.abs() < 0.3) & (speed.abs() < 0.3)).unsqueeze(-1)
-        seen = torch.stack([left, speed, self.levels["wind"]], -1)
+        seen = torch.stack([left, speed, wind], -1)
         return TensorDict({"observation": seen, "terminated": there}, self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:

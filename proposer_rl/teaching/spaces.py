@@ -296,7 +296,7 @@ class LevelGenerator(LevelSpace):
             "Parameters, Items or a task"
         )
 
-    size = coordinates = generate = axes
+    size = coordinates = generate = target_shares = axes
 
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:

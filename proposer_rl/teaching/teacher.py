@@ -295,12 +295,14 @@ class Teacher:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
         Raises:
-            ArgumentError: if it is of another number of students.
+            ArgumentError: if it is of another number of students, or of another curriculum.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
+            if strange := state["curriculum"].keys() ^ self.curriculum.state_dict().keys():
+                raise ArgumentError(f"state: of another curriculum, by its {min(strange)!r}")
             source: Any = self.space.space
             like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
