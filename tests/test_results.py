@@ -206,7 +206,7 @@ def test_numbers_without_an_interval_are_those_of_the_tables() -> None:
     )
 
 
-@pytest.mark.parametrize("study", ["medium", "paper"])
+@pytest.mark.parametrize("study", ["curricula", "medium", "paper", "paper_480"])
 def test_a_run_of_today_is_of_the_same_variant_as_the_published_ones(study: str) -> None:
     """With a key more or less it would stand beside them, and be compared with them."""
     (found,), _ = read_studies([ROOT / "results" / study], None)
