@@ -64,25 +64,31 @@ def logistic_ridge(
     """
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
 
-    def loss(beta: Tensor) -> Tensor:
+    def at(beta: Tensor) -> tuple[Tensor, Tensor]:
+        """Log odds [K, m], and the loss [K]."""
         z = _times(features, beta)
         misfit = torch.nn.functional.softplus(z) - labels * z
-        return (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
+        return z, (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
 
     def curvature(p: Tensor) -> Tensor:
         return features.mT @ (features * (weights * p * (1 - p)).unsqueeze(-1)) + prior
 
     beta = features.new_zeros(len(features), features.shape[-1])
+    z, now = at(beta)
     for _ in range(STEPS):
-        p = _times(features, beta).sigmoid()
+        p = z.sigmoid()
         slope = _times(features.mT, weights * (p - labels)) + ridge * beta
-        step, now = torch.linalg.solve(curvature(p), slope), loss(beta)
-        for _ in range(HALVINGS):
-            step = torch.where((loss(beta - step) > now).unsqueeze(-1), step / 2, step)
-        beta = beta - step
+        step = torch.linalg.solve(curvature(p), slope)
+        for halvings in range(HALVINGS + 1):
+            z, then = at(beta - step)
+            worse = then > now
+            if halvings == HALVINGS or not worse.any():
+                break
+            step = torch.where(worse.unsqueeze(-1), step / 2, step)
+        beta, now = beta - step, then
         if bool((step.abs() < CLOSE).all()):
             break
-    return beta, torch.linalg.inv(curvature(_times(features, beta).sigmoid()))
+    return beta, torch.linalg.inv(curvature(z.sigmoid()))
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
