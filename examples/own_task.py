@@ -31,7 +31,8 @@ class Sledges(EnvBase):
         self.levels = levels.float()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
-        return self._state(self.levels["distance"], torch.zeros(self.batch_size), self.levels["wind"])
+        left, wind = self.levels["distance"], self.levels["wind"]
+        return self._state(left, torch.zeros_like(left), wind)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         left, speed, wind = tensordict["observation"].unbind(-1)

@@ -26,6 +26,7 @@ from proposer_rl.curricula import (
     ReplayCurriculum,
     ReplayRule,
     SampledFirstOrderCurriculum,
+    SampledFirstOrderProposer,
     SamplingCurriculum,
     Schedule,
     Scorer,
@@ -158,15 +159,20 @@ def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curr
 
     @_takes_numbers_of(make)
     def factory(run: Components, /, **numbers: Any) -> Curriculum:
-        if "target_shares" in parts and not isinstance(run.task, LocatedTarget):
-            raise TypeError(
-                f"this curriculum goes by where the target lies: {type(run.task).__name__} must "
-                "define target_shares, the target as shares of the space's bins"
-            )
+        if "target_shares" in parts:
+            _require_target_shares(run.task)
         return make(*(getattr(run.task, part) for part in parts), **numbers)
 
     factory.__doc__ = f"Make a :class:`~{make.__module__}.{make.__qualname__}` for the run's task."
     return factory
+
+
+def _require_target_shares(task: Task) -> None:
+    if not isinstance(task, LocatedTarget):
+        raise TypeError(
+            f"this curriculum goes by where the target lies: {type(task).__name__} must "
+            "define target_shares, the target as shares of the space's bins"
+        )
 
 
 target = _of_task(SamplingCurriculum, "target")
@@ -340,6 +346,30 @@ def first_order_proposer(
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
     return FirstOrderProposer(*policy, probe_levels=components.proposer.probe_levels, **numbers)
+
+
+@_takes_numbers_of(SampledFirstOrderProposer, given="probe_levels")
+def first_order_proposer_sampled(
+    components: Components,
+    epochs: Count,
+    learning_rate: Positive,
+    entropy_coeff: NotNegative,
+    checkpoint: str | None = None,
+    **numbers: Any,
+) -> SampledFirstOrderProposer:
+    """The same from the Solver's own training episodes, without an oracle.
+
+    The arguments are those of :func:`first_order_proposer`; ``numbers`` those of
+    :class:`SampledFirstOrderProposer`.
+
+    Raises:
+        TypeError: if the task does not say where its target lies.
+    """
+    task: Any = components.task
+    _require_target_shares(task)
+    policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
+    probes = components.proposer.probe_levels
+    return SampledFirstOrderProposer(*policy, task.target_shares, probe_levels=probes, **numbers)
 
 
 def paired(

@@ -39,6 +39,7 @@ CALLED = {
     "modelled": ["+method=regret", "+source=model", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
+    "proposer": ["+method=first_order_proposer_sampled", *QUIET],
     "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],
     "choices": ["+method=plr", *CHOICES, *FEW],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
@@ -80,9 +81,10 @@ def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_run_is_resumed_there(run_there: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["first_order_sampled", "first_order_proposer_sampled"])
+def test_a_run_is_resumed_there(method: str, run_there: Run, tmp_path: Path) -> None:
     """In the middle of episodes: levels, memories and gradients come from a checkpoint."""
-    given = ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED]
+    given = [f"+method={method}", "task=cartpole", *TINY, *FEW, *NORMALIZED]
     given += ["task.network.memory=4", "solver.ppo.anneal_updates=6"]
     assert run_there(tmp_path / "resumed", *given) == ""
     for folder in ("resumed", "whole"):

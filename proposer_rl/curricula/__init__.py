@@ -39,6 +39,9 @@ from proposer_rl.curricula.modelled import Modelled as Modelled
 from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
 from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
+from proposer_rl.curricula.problem_proposer import (
+    SampledFirstOrderProposer as SampledFirstOrderProposer,
+)
 from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer

@@ -206,18 +206,9 @@ class SampledFirstOrderCurriculum(_AlignedBins):
 
     def learn(self, evidence: TensorDict) -> None:
         """Score the bins that were trained on."""
-        aligned, score = evidence["slope"], self.scores["score"]
-        if "drift" in evidence.keys():
-            steps = evidence["steps"]
-            count = steps.sum(-1, keepdim=True)
-            mean, square = (
-                (evidence[key] * steps).sum(-1, keepdim=True) / count
-                for key in ("advantage", "square")
-            )
-            variance = (square - mean.square()).clamp_min(0) * count / (count - 1).clamp_min(1)
-            spread = variance.sqrt().clamp_min(1e-6)
-            aligned = (aligned - mean * evidence["drift"]) / spread
-        means, counts = means_of_bins(evidence["bins"], aligned.to(score), score.shape[-1])
+        score = self.scores["score"]
+        aligned = alignments(evidence).to(score)
+        means, counts = means_of_bins(evidence["bins"], aligned, score.shape[-1])
         averaged = self.smoothing * score + (1 - self.smoothing) * means
         self.scores = {**self.scores, "score": torch.where(counts > 0, averaged, score)}
 
@@ -225,3 +216,21 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         """Of the bins in the next batch, float [K, N]."""
         shares = super().shares()
         return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
+
+
+def alignments(evidence: TensorDict) -> Tensor:
+    """Of the levels of a batch [K, m], with advantages as training has them, by its evidence.
+
+    Args:
+        evidence: of a :class:`SampledFirstOrderCurriculum`.
+    """
+    aligned: Tensor = evidence["slope"]
+    if "drift" not in evidence.keys():
+        return aligned
+    steps = evidence["steps"]
+    count = steps.sum(-1, keepdim=True)
+    mean, square = (
+        (evidence[key] * steps).sum(-1, keepdim=True) / count for key in ("advantage", "square")
+    )
+    variance = (square - mean.square()).clamp_min(0) * count / (count - 1).clamp_min(1)
+    return (aligned - mean * evidence["drift"]) / variance.sqrt().clamp_min(1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,8 +13,10 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.bins import Measure as Outcome
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
+from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import load_agent, located
@@ -22,7 +24,7 @@ from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import Measure
 from proposer_rl.models import ActorCritic, draw
-from proposer_rl.settings import Count, Positive, checked
+from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
 
@@ -33,8 +35,7 @@ class ProblemProposer(Curriculum):
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
     gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7),
-    with no critic. The rewards are known before anybody trains: where the levels are filtered, the
-    policy learns from all that it drew.
+    with no critic.
 
     Args:
         space: that has the bins.
@@ -50,7 +51,7 @@ class ProblemProposer(Curriculum):
     """
 
     needs: tuple[str, ...] = ("probe",)
-    remembers = ("_metrics", "_counts", "_inbox")
+    remembers: ClassVar[tuple[str, ...]] = ("_metrics", "_counts", "_inbox")
 
     def __init__(
         self,
@@ -82,21 +83,10 @@ class ProblemProposer(Curriculum):
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
-    @abstractmethod
-    def reward(
-        self, student: Student, levels: Levels, stream: Streams
-    ) -> tuple[Tensor, dict[str, float]]:
-        """Of each of the levels [1, E], on which nobody has trained: float [1, E]; and metrics."""
-
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n] of the policy's draws, from all of which it has learnt already.
-
-        The policy draws P problems at once: as many times as it takes for n.
-
-        Raises:
-            ValueError: for several students: a Proposer learns from one.
-            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
-        """
+    def _draw(
+        self, student: Student, count: int, streams: Sequence[Streams]
+    ) -> tuple[TensorDict, TensorDict, Tensor, Levels]:
+        """What the policy sees, its choices [times, 1, P], their bins and levels [1, times * P]."""
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
         (stream,), agent = streams, self.agent
@@ -110,19 +100,9 @@ class ProblemProposer(Curriculum):
             choices = draw(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
         bins = choices.view(1, -1).cpu()  # [1, times * P]
+        drawn = {agent.action_key: choices, agent.log_prob_key: log_prob}
         levels = self.space.generate(bins, [stream.generator("levels")])
-        reward, metrics = self.reward(student, levels, stream)
-        played = TensorDict(
-            {
-                agent.action_key: choices,
-                agent.log_prob_key: log_prob,
-                "advantage": reward.view(*choices.shape, 1),
-            },
-            choices.shape,
-        )
-        self._learn(seen, played)
-        self._metrics |= metrics
-        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
+        return seen, TensorDict(drawn, choices.shape), bins, levels
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Count the levels."""
@@ -151,11 +131,13 @@ class ProblemProposer(Curriculum):
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
 
-    def _learn(self, seen: TensorDict, played: TensorDict) -> None:
-        """A few steps on all draws: the clipped objective of each problem, with its advantage."""
+    def _learn(
+        self, seen: TensorDict, played: TensorDict, problems: Tensor | slice = slice(None)
+    ) -> None:
+        """A few steps on draws [times, 1, m] of problems [m]: the clipped objective of each."""
         steps = []
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key]  # [K, P, N]
+            logits = self.agent(seen.copy())[self.agent.logits_key][:, problems]  # [K, m, N]
             everywhere = logits.expand(len(played), -1, -1, -1)
             losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
@@ -172,7 +154,32 @@ class ProblemProposer(Curriculum):
         }
 
 
-class FirstOrderProposer(ProblemProposer):
+class _RewardedAtOnce(ProblemProposer):
+    """Learns from all that it drew before anybody trains, also where levels are filtered."""
+
+    @abstractmethod
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Of each of the levels [1, E], on which nobody has trained: float [1, E]; and metrics."""
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [1, n] of the policy's draws, from all of which it has learnt already.
+
+        The policy draws P problems at once: as many times as it takes for n.
+
+        Raises:
+            ValueError: for several students: a Proposer learns from one.
+            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
+        """
+        seen, drawn, bins, levels = self._draw(student, count, streams)
+        reward, metrics = self.reward(student, levels, streams[0])
+        self._learn(seen, drawn.set("advantage", reward.view(*drawn.shape, 1)))
+        self._metrics |= metrics
+        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
+
+
+class FirstOrderProposer(_RewardedAtOnce):
     """A problem's reward is its alignment with the target direction.
 
     Args:
@@ -215,7 +222,99 @@ class FirstOrderProposer(ProblemProposer):
         }
 
 
-class PairedProposer(ProblemProposer):
+class SampledFirstOrderProposer(ProblemProposer):
+    """A problem's reward is its training episodes' alignment with an interim target's direction.
+
+    Both are of the student's own episodes, and nothing is played for them
+    (:class:`~proposer_rl.curricula.first_order.SampledFirstOrderCurriculum`). So the reward comes
+    after the training: the policy learns when all of a batch has come back, or 32 newer ones have
+    been proposed; of filtered levels, from those that were trained on.
+
+    Args:
+        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        target_shares: the target as shares of the bins, float [N].
+        delta: least performance of a bin that the interim target lies on.
+        probes: levels of each bin by which performance is told.
+        measure: of performance, ``"success"`` or ``"return"``.
+        smoothing: share of the old in the direction's average.
+    """
+
+    needs = ("probe", *SampledFirstOrderCurriculum.needs)
+    reads = ("rollout",)
+    remembers = (*ProblemProposer.remembers, "_credit", "_drawn")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution,
+        agent: ActorCritic,
+        settings: PPOSettings,
+        target_shares: Tensor,
+        *,
+        probe_levels: int = 16,
+        delta: float = 0.2,
+        probes: Count = 4,
+        measure: Outcome = "success",
+        smoothing: Decay = 0.9,
+    ) -> None:
+        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
+        self._credit = SampledFirstOrderCurriculum(
+            space, target_shares, delta=delta, probes=probes, measure=measure, smoothing=smoothing
+        )
+        self._drawn: dict[int, dict[str, Tensor]] = {}  # by the batch: what was seen, and choices
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Levels [1, n], when the policy has learnt from the batches that came back.
+
+        Raises:
+            ValueError: for several students.
+            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
+        """
+        self._learn_of_episodes()
+        seen, drawn, bins, levels = self._draw(student, count, streams)
+        self._credit.score(student, count, streams)
+        which = torch.arange(count).unsqueeze(0)
+        batch = self._inbox.batch(levels[:, :count], bins=bins[:, :count], which=which)
+        number = int(batch.notes["number"][0, 0])
+        waiting = {k: v for k, v in self._drawn.items() if k > number - PATIENCE}
+        self._drawn = {**waiting, number: {**dict(seen.items()), **dict(drawn.items())}}
+        return batch
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Count the levels, and put their alignments aside."""
+        super().observe(student, batch, outcome)
+        if evidence := self._credit.evidence(student, batch, outcome):
+            self._inbox.put(batch, which=batch.notes["which"], **evidence)
+
+    def _learn_of_episodes(self) -> None:
+        """From what came of the levels that were trained on, batch by batch."""
+        for evidence in self._inbox.take(whole=True):
+            kept = self._drawn.pop(int(evidence["number"][0, 0]), None)
+            if kept is None:
+                continue
+            # What a checkpoint holds is on the CPU.
+            device = self._parameters[0].device
+            probes, which = kept["probes"].to(device), evidence["which"][0].to(device)
+            keys = self.agent.action_key, self.agent.log_prob_key
+            choices, log_prob = (kept[key].to(device) for key in keys)
+            reward = alignments(evidence).to(log_prob)
+            drawn = dict(
+                zip(keys, (choices.view(-1)[which], log_prob.view(-1)[which]), strict=True)
+            )
+            played = TensorDict({**drawn, "advantage": reward.view(-1, 1)}, [len(which)])
+            self._learn(
+                TensorDict({"probes": probes}, [1]),
+                played[None, None],
+                which % choices.shape[2],
+            )
+            self._metrics |= {
+                "alignment": float(reward.mean()),
+                "alignment_sd": float(reward.std(correction=0)),
+            }
+
+
+class PairedProposer(_RewardedAtOnce):
     """A problem's reward is what another student, the antagonist, gets more on it.
 
     PAIRED (Dennis et al. 2020, arXiv 2012.02096, algorithm 1): protagonist and antagonist train on

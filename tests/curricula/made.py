@@ -21,6 +21,7 @@ from proposer_rl.curricula import (
     ReplayCurriculum,
     ReplayRule,
     SampledFirstOrderCurriculum,
+    SampledFirstOrderProposer,
     SamplingCurriculum,
     Schedule,
     Scorer,
@@ -86,6 +87,12 @@ def paired(streams: Streams | None = None) -> PairedProposer:
 def first_order_proposer() -> FirstOrderProposer:
     return FirstOrderProposer(
         SPACE, TARGET, problem_agent(), SETTINGS, probe_levels=2, target_levels=3
+    )
+
+
+def sampled_proposer() -> SampledFirstOrderProposer:
+    return SampledFirstOrderProposer(
+        SPACE, TARGET, problem_agent(), SETTINGS, TASK.target_shares, probe_levels=2
     )
 
 
@@ -183,6 +190,8 @@ LEARNED: dict[str, Make] = {
     "filtered perf_gain": lambda: filtered(learnt()),
     "frozen": frozen,
     "first_order_proposer": first_order_proposer,
+    "first_order_proposer, sampled": sampled_proposer,
+    "filtered first_order_proposer, sampled": lambda: modelled(filtered(sampled_proposer())),
     "paired": paired,
     "filtered paired": lambda: filtered(paired(), times=2),
 }

@@ -11,7 +11,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from proposer_rl.curricula import Filtered, FirstOrderProposer, Student
+from proposer_rl.curricula import (
+    Curriculum,
+    Filtered,
+    FirstOrderProposer,
+    SampledFirstOrderProposer,
+    Student,
+)
 from proposer_rl.learning import DivergedError
 from proposer_rl.learning.ppo import PPOSettings
 from proposer_rl.models import (
@@ -142,3 +148,79 @@ def test_several_solvers_are_refused() -> None:
     task = Seen(2, WANTED)
     with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
         proposer(task).propose(Student(), P, [Streams(0), Streams(1)])
+
+
+def sampled(**settings: Any) -> SampledFirstOrderProposer:
+    """On bins in a row."""
+    task = Seen(1, WANTED)
+    task.space.coordinates = torch.arange(float(BINS)).unsqueeze(1)
+    chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
+    ppo, even = PPOSettings(**chosen), torch.ones(BINS)
+    return SampledFirstOrderProposer(
+        task.space, task.target, agent(), ppo, even, probe_levels=2, probes=1, measure="return"
+    )
+
+
+# Every level's episodes are aligned as its bin is wanted.
+TAUGHT = Student(
+    probe=lambda levels: torch.ones(1, len(levels), 3),
+    performance=lambda levels, generator: TensorDict({"return": 0.0 * levels}, levels.shape),
+    sampled_direction=lambda rollout, weights: {"weight": torch.ones(1, 1)},
+    sampled_alignment=lambda direction, rollout: TensorDict(
+        {"slope": torch.tensor(WANTED)[rollout["bin"]]}, rollout.batch_size
+    ),
+)
+
+
+def trained(curriculum: Curriculum, update: int) -> Tensor:
+    batch = curriculum.propose(TAUGHT, P, [Streams(0, update)])
+    shape = batch.levels.shape
+    told = {name: torch.ones(shape) for name in ("return", "success", "steps")}
+    rollout = TensorDict({"bin": batch.levels}, shape)
+    curriculum.observe(TAUGHT, batch, TensorDict({**told, "rollout": rollout}, shape))
+    return batch.levels
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_every_problem_that_was_trained_on_is_credited_with_its_episodes(times: int) -> None:
+    curriculum = sampled(epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
+    expected = copy.deepcopy(curriculum.agent)
+    scores = torch.arange(float(times * P)).unsqueeze(0)
+    whole = (
+        curriculum
+        if times == 1
+        else Filtered(curriculum, GivenScores(scores), times=times, temperature=1e-3)
+    )
+    trained(whole, 0)  # there is no direction yet
+    levels = trained(whole, 1)
+    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
+    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
+        assert torch.equal(found, wanted)
+    trained(whole, 2)
+
+    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
+    noise = torch.rand(times, 1, P, generator=Streams(0, 1).generator("choices"))
+    choices = draw(policy, noise)[-1, 0]  # of the scores above those of the last are the highest
+    assert sorted(levels[0].tolist()) == sorted(choices.tolist())
+    paid = torch.tensor(WANTED)[choices]
+    advantage = (paid - paid.mean()) / paid.std()
+    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
+    by_hand = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
+    loss.backward()
+    by_hand.step()
+    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_it_learns_from_episodes_what_the_target_needs() -> None:
+    curriculum = sampled()
+    levels = [trained(curriculum, update) for update in range(60)]
+    assert (levels[-1] == 2).float().mean() > 0.8
+    assert curriculum.log()["alignment"] > 0.7
+
+
+def test_batches_that_never_come_back_are_given_up() -> None:
+    curriculum = sampled()
+    for update in range(40):
+        curriculum.propose(TAUGHT, P, [Streams(0, update)])
+    assert len(curriculum.state_dict()["drawn"]) <= 32

@@ -425,7 +425,11 @@ def test_what_is_missing_of_a_student_is_named(name: str) -> None:
         prl.Teacher(getattr(prl.curricula, name)(), SPACE)
 
 
-@pytest.mark.parametrize("name", ["perf_gain", "task_difficulty", "paired", "first_order_proposer"])
+OF_TASKS = ["perf_gain", "task_difficulty", "paired"]
+OF_TASKS += ["first_order_proposer", "first_order_proposer_sampled"]
+
+
+@pytest.mark.parametrize("name", OF_TASKS)
 def test_what_a_space_lacks_is_named(name: str) -> None:
     with pytest.raises(ArgumentError, match=f"curriculum={name}: needs .* of a task"):
         prl.Teacher(getattr(prl.curricula, name)(), SPACE)
