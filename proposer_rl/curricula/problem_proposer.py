@@ -227,8 +227,10 @@ class SampledFirstOrderProposer(ProblemProposer):
 
     Both are of the student's own episodes, and nothing is played for them
     (:class:`~proposer_rl.curricula.first_order.SampledFirstOrderCurriculum`). So the reward comes
-    after the training: the policy learns when all of a batch has come back, or 32 newer ones have
-    been proposed; of filtered levels, from those that were trained on.
+    after the training: before it proposes again the policy learns from all that came back, of
+    filtered levels from those that were trained on. Of a batch, the levels that come in between two
+    proposals are compared; what is still out when 32 newer batches have been proposed counts no
+    more.
 
     Args:
         space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
@@ -265,7 +267,7 @@ class SampledFirstOrderProposer(ProblemProposer):
         self._drawn: dict[int, dict[str, Tensor]] = {}  # by the batch: what was seen, and choices
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n], when the policy has learnt from the batches that came back.
+        """Levels [1, n], when the policy has learnt from those that came back.
 
         Raises:
             ValueError: for several students.
@@ -288,26 +290,19 @@ class SampledFirstOrderProposer(ProblemProposer):
             self._inbox.put(batch, which=batch.notes["which"], **evidence)
 
     def _learn_of_episodes(self) -> None:
-        """From what came of the levels that were trained on, batch by batch."""
-        for evidence in self._inbox.take(whole=True):
-            kept = self._drawn.pop(int(evidence["number"][0, 0]), None)
-            if kept is None:
+        """From the levels that came back, with those of the same batch that did so beside them."""
+        device = self._parameters[0].device  # what a checkpoint holds is on the CPU
+        for evidence in self._inbox.take():
+            drawn = self._drawn.get(int(evidence["number"][0, 0]))
+            if drawn is None or evidence.shape[1] < 2:  # one cannot be better than the others
                 continue
-            # What a checkpoint holds is on the CPU.
-            device = self._parameters[0].device
-            probes, which = kept["probes"].to(device), evidence["which"][0].to(device)
-            keys = self.agent.action_key, self.agent.log_prob_key
-            choices, log_prob = (kept[key].to(device) for key in keys)
-            reward = alignments(evidence).to(log_prob)
-            drawn = dict(
-                zip(keys, (choices.view(-1)[which], log_prob.view(-1)[which]), strict=True)
-            )
-            played = TensorDict({**drawn, "advantage": reward.view(-1, 1)}, [len(which)])
-            self._learn(
-                TensorDict({"probes": probes}, [1]),
-                played[None, None],
-                which % choices.shape[2],
-            )
+            here = {key: entry.to(device) for key, entry in drawn.items()}
+            seen = TensorDict({"probes": here.pop("probes")}, [1])
+            problems = next(iter(here.values())).shape[2]
+            reward, which = alignments(evidence).to(device), evidence["which"][0].to(device)
+            played = {key: entry.view(1, 1, -1)[..., which] for key, entry in here.items()}
+            played["advantage"] = reward.float().view(1, 1, -1, 1)
+            self._learn(seen, TensorDict(played, [1, 1, len(which)]), which % problems)
             self._metrics |= {
                 "alignment": float(reward.mean()),
                 "alignment_sd": float(reward.std(correction=0)),

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from proposer_rl.curricula import (
+    Batch,
     Curriculum,
     Filtered,
     FirstOrderProposer,
@@ -62,6 +63,23 @@ def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
     )
 
 
+def step_by_hand(
+    expected: ActorCritic, policy: torch.distributions.Categorical, choices: Tensor
+) -> None:
+    """Adam's first, on the objective of draws [..., P] that are paid as their bins are wanted."""
+    paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
+    advantage = (paid - paid.mean()) / paid.std()
+    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
+    adam = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
+    loss.backward()
+    adam.step()
+
+
+def assert_same_weights(found: ActorCritic, expected: ActorCritic) -> None:
+    for one, other in zip(found.parameters(), expected.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("paid", "told"),
     [(torch.inf, "copy 0: reward is"), (1e38, "loss_objective of gradient step 0")],
@@ -108,14 +126,8 @@ def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     choices = draw(policy, noise)  # [times, 1, P]
     # Of the scores above those of the last are the highest.
     assert sorted(batch.levels[0].tolist()) == sorted(choices[-1, 0].tolist())
-    paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
-    advantage = (paid - paid.mean()) / paid.std()
-    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
-    by_hand = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
-    loss.backward()
-    by_hand.step()
-    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
-        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    step_by_hand(expected, policy, choices)
+    assert_same_weights(curriculum.agent, expected)
 
 
 def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
@@ -174,11 +186,15 @@ TAUGHT = Student(
 
 def trained(curriculum: Curriculum, update: int) -> Tensor:
     batch = curriculum.propose(TAUGHT, P, [Streams(0, update)])
+    observed(curriculum, batch)
+    return batch.levels
+
+
+def observed(curriculum: Curriculum, batch: Batch) -> None:
     shape = batch.levels.shape
     told = {name: torch.ones(shape) for name in ("return", "success", "steps")}
     rollout = TensorDict({"bin": batch.levels}, shape)
     curriculum.observe(TAUGHT, batch, TensorDict({**told, "rollout": rollout}, shape))
-    return batch.levels
 
 
 @pytest.mark.parametrize("times", [1, 3])
@@ -193,23 +209,16 @@ def test_every_problem_that_was_trained_on_is_credited_with_its_episodes(times: 
     )
     trained(whole, 0)  # there is no direction yet
     levels = trained(whole, 1)
-    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
-    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
-        assert torch.equal(found, wanted)
+    assert_same_weights(curriculum.agent, expected)
     trained(whole, 2)
 
+    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
     noise = torch.rand(times, 1, P, generator=Streams(0, 1).generator("choices"))
     choices = draw(policy, noise)[-1, 0]  # of the scores above those of the last are the highest
     assert sorted(levels[0].tolist()) == sorted(choices.tolist())
-    paid = torch.tensor(WANTED)[choices]
-    advantage = (paid - paid.mean()) / paid.std()
-    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
-    by_hand = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
-    loss.backward()
-    by_hand.step()
-    for found, wanted in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
-        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    step_by_hand(expected, policy, choices)
+    assert_same_weights(curriculum.agent, expected)
 
 
 def test_it_learns_from_episodes_what_the_target_needs() -> None:
@@ -217,6 +226,20 @@ def test_it_learns_from_episodes_what_the_target_needs() -> None:
     levels = [trained(curriculum, update) for update in range(60)]
     assert (levels[-1] == 2).float().mean() > 0.8
     assert curriculum.log()["alignment"] > 0.7
+
+
+def test_parts_of_a_batch_teach_when_they_come_in() -> None:
+    """One level alone does not: there is nothing that it is better than."""
+    curriculum = sampled()
+    trained(curriculum, 0)
+    batch = curriculum.propose(TAUGHT, P, [Streams(0, 1)])
+    weights = copy.deepcopy(curriculum.agent)
+    for update, part in enumerate((slice(0, 1), slice(1, P)), 2):
+        observed(curriculum, Batch(batch.levels[:, part], batch.notes[:, part]))
+        assert_same_weights(curriculum.agent, weights)
+        curriculum.propose(TAUGHT, P, [Streams(0, update)])
+    with pytest.raises(AssertionError):
+        assert_same_weights(curriculum.agent, weights)
 
 
 def test_batches_that_never_come_back_are_given_up() -> None:
