@@ -25,6 +25,7 @@ from tests.tiny import TASK, composed, sledges, tiny_view_task
 ASKS_THE_MODEL_ALONE = [
     ["+method=model_transport", "+scale=smoke"],
     ["+method=first_order_sampled", "+scale=smoke"],
+    ["+method=first_order_proposer_sampled", "+scale=smoke"],
     ["+method=domain_randomization", "+scale=smoke", "+filter=model"],
     ["+method=learning_progress", "+scale=smoke", "+source=model"],
     ["+method=ncc", "+scale=smoke", "+source=model"],
