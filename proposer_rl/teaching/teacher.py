@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cached_property, partial
 from operator import index
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
@@ -21,8 +21,9 @@ from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.recipes import Recipe
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import Levels, Task
 from proposer_rl.teaching.abilities import adapted
+from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import LEVEL_ID, ended
@@ -101,7 +102,7 @@ class Teacher:
     ) -> None:
         self.space, self.device, self.block = space, torch.device(device), block
         self._seeds = [_whole("seed", seed) + copy for copy in range(students)]
-        self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
+        self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
         self.student = student or Student(
@@ -279,6 +280,7 @@ class Teacher:
         with self._here():
             kept = self._kept
             return {
+                "of": self._of,
                 "students": self.students,
                 "curriculum": self.curriculum.state_dict(),
                 "tickets": self._tickets.state_dict(),
@@ -295,18 +297,17 @@ class Teacher:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
         Raises:
-            ArgumentError: if it is of another number of students, or of another curriculum.
+            ArgumentError: if it is of another space, curriculum, setting of it or number of
+                students, naming what differs; then nothing has changed.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
+            for what, now in self._of.items():
+                require_same(what, state["of"][what], now)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
-            if strange := state["curriculum"].keys() ^ self.curriculum.state_dict().keys():
-                raise ArgumentError(f"state: of another curriculum, by its {min(strange)!r}")
-            source: Any = self.space.space
-            like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
-            self._tickets.load_state_dict(state["tickets"], like)
+            self._tickets.load_state_dict(state["tickets"], self._like)
             self._proposals, self._at = state["proposals"], state["at"]
             self._whole = list(state["proposed"])
             blocks = {block.start: block for block in self._tickets.blocks}
@@ -315,6 +316,17 @@ class Teacher:
             if kept := state["rollout"]:
                 steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
                 self._kept = steps.flatten()
+
+    @cached_property
+    def _like(self) -> Levels:
+        """A level of the kind."""
+        source: Any = self.space.space
+        return source.sample(1, torch.Generator())[0]
+
+    @cached_property
+    def _of(self) -> dict[str, Any]:
+        """What its state is of."""
+        return {"space": of_levels(self.space, self._like), "curriculum": self._made_of}
 
     def client(self) -> TeacherClient:
         """This teacher for another process, such as a worker of a collector.
