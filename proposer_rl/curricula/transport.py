@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOST_BINS = 4096
+MOST_MOVED = 256  # bins of a program; a step on 250 items takes 14 s, on a grid of 400 bins a minute
 NOTHING = 1e-6  # a share that is rounding of the solver's
 SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself
 
@@ -49,7 +50,7 @@ class TransportCurriculum(BinCurriculum):
             in all bins of the target; then of the share of the target where it still is.
 
     Raises:
-        ArgumentError: if there is not one share for each bin.
+        ArgumentError: if there is not one share for each bin, or there are too many bins.
     """
 
     shown = ("performance",)
@@ -69,6 +70,12 @@ class TransportCurriculum(BinCurriculum):
         measure: Measure = "success",
         exploration: Share = 0.0,
     ) -> None:
+        if space.size > MOST_MOVED:
+            raise ArgumentError(
+                f"space: {space.size:,} bins: optimal transport takes minutes on more than "
+                f"{MOST_MOVED}; give fewer bins or items, or take domain_randomization with "
+                "filter=model, which has no limit"
+            )
         super().__init__(space, every=every)
         self._exploration = exploration
         self._delta, self._epsilon = delta, epsilon
