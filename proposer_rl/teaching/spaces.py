@@ -84,6 +84,9 @@ class Parameters(LevelSpace, ParameterSpace):
         named: further distributions like ``target``, by name, for hand-designed curricula.
         seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
 
+    Attributes:
+        labels: of each parameter, by name: its values, where they are texts; else None.
+
     Raises:
         ArgumentError: naming the parameter, for what is no range or lies outside of it.
 
@@ -109,9 +112,9 @@ class Parameters(LevelSpace, ParameterSpace):
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict(bins) if isinstance(bins, Mapping) else dict.fromkeys(ranges, bins)
         _check_names("bins", counts, ranges)
-        self._labels = {name: _labels(values) for name, values in ranges.items()}
+        self.labels = {name: _labels(values) for name, values in ranges.items()}
         parts = {
-            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self._labels[name])
+            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self.labels[name])
             for name, values in ranges.items()
         }
         try:
@@ -152,7 +155,7 @@ class Parameters(LevelSpace, ParameterSpace):
         """Each parameter's values as a text."""
         found = {}
         for name, part in parts.items():
-            labels, values = self._labels[name], part.low.tolist()
+            labels, values = self.labels[name], part.low.tolist()
             if labels is not None:
                 values = [str(labels[place]) for place in values]
             ends = part.low[0].item(), part.high[-1].item()
@@ -164,7 +167,7 @@ class Parameters(LevelSpace, ParameterSpace):
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Levels [n] as dicts of numbers and texts."""
         columns = {str(name): entry.tolist() for name, entry in levels.items()}
-        for name, labels in self._labels.items():
+        for name, labels in self.labels.items():
             if labels is not None:
                 columns[name] = [labels[place] for place in columns[name]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
@@ -174,7 +177,7 @@ class Parameters(LevelSpace, ParameterSpace):
         _check_names(key, ranges, self.bins)
         parts = dict(self.bins)
         for name, values in ranges.items():
-            whole, labels = self.bins[name], self._labels[name]
+            whole, labels = self.bins[name], self.labels[name]
             where = f"{key}.{name}"
             if labels is not None:
                 chosen = values if isinstance(values, list) else [values]

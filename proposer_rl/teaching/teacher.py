@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from operator import index
+from pathlib import Path
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
 
@@ -19,6 +21,7 @@ from torch.utils._pytree import tree_map_only
 from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.recipes import Recipe
+from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
@@ -28,6 +31,7 @@ from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import LEVEL_ID, ended
 from proposer_rl.teaching.spaces import LevelSpace
+from proposer_rl.teaching.tally import Tally
 from proposer_rl.teaching.tickets import COUNTS, OUT, OVER, RESULTS, Block, Tickets, as_array
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
@@ -82,6 +86,7 @@ class Teacher:
 
     _block: Block | None  # that tickets are handed out from
     _at: int  # the next of them
+    _counted: int  # the next that the log has not counted
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
@@ -115,9 +120,10 @@ class Teacher:
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
         self._given, self._rows_of = given, getattr(space, "rows", list)
         self._success = success
-        self._tickets = Tickets()
+        self._tickets, self._tally = Tickets(), Tally(space)
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
+        self._block, self._counted = None, 0
         self._use(None, 0)
         self._kept: TensorDictBase | None = None  # steps [L] of episodes that have not ended
         self._lock, self._process = RLock(), os.getpid()
@@ -139,6 +145,7 @@ class Teacher:
             block = self._next(_whole("n", n, 1))
             block.state[:] = OUT
             self._whole.append(block.start)
+            self._tally.count(block.batch.levels)
             return self._levels(block)
 
     def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
@@ -208,6 +215,7 @@ class Teacher:
             if self._alone and isinstance(ids, int):
                 numbers = {name: _number(name, value) for name, value in told.items()}
                 self._tickets.tell_one(ids, numbers)
+                self._tally.told(1, numbers["return"], numbers.get("success"))
             else:
                 self._tell(self._ids(ids), told)
 
@@ -219,6 +227,7 @@ class Teacher:
                 resumed loop begins anew.
         """
         with self._here():
+            before = self._tickets.out
             if ids is None:
                 self._tickets.close_all()
                 self._whole.clear()
@@ -226,6 +235,7 @@ class Teacher:
                 tickets = self._ids(ids)
                 going = self._tickets.states(tickets) != OVER
                 self._tickets.close(self._tickets.find(tickets[going]))
+            self._tally.dropped(before - self._tickets.out)
 
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
@@ -267,13 +277,29 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
-    def log(self) -> dict[str, Any]:
-        """What the curriculum has to tell since the last call; empty if there is nothing.
+    def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
+        """What happened since the last call, and what the curriculum has to tell of it.
 
-        What was told since the last proposal is not in it, so that logs change no curriculum.
+        For every curriculum: how many levels were ``proposed``, ``told`` and ``dropped``, and are
+        ``out`` now; ``mean_return`` and ``mean_success`` of what was told, None where nothing was;
+        and ``drawn``, how many of the proposed levels there were in each bin of each parameter.
+        The curriculum's own entries are in the table of the methods. In them is not what was told
+        since the last proposal, so that logs change no curriculum.
+
+        Args:
+            file: JSON Lines to which it is added as a line, without levels, for ``bin/report``.
+
+        Raises:
+            StorageError: if the file cannot be written.
         """
         with self._here():
-            return self.curriculum.log()
+            self._count()
+            told = {**self.curriculum.log(), **self._tally.read(self._tickets.out)}
+            if file is not None:
+                kept = {name: value for name, value in told.items() if name != "levels"}
+                with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
+                    lines.write(json.dumps(kept) + "\n")
+            return told
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed loop needs, tickets that are out included."""
@@ -311,6 +337,7 @@ class Teacher:
             self._proposals, self._at = state["proposals"], state["at"]
             self._whole = list(state["proposed"])
             blocks = {block.start: block for block in self._tickets.blocks}
+            self._block, self._tally = None, Tally(self.space)
             self._use(blocks.get(state["block"]), self._at)
             self._kept = None
             if kept := state["rollout"]:
@@ -370,8 +397,17 @@ class Teacher:
 
     def _use(self, block: Block | None, at: int) -> None:
         """Hand out tickets of a block from one on."""
-        self._block, self._at = block, at
+        self._count()
+        self._block, self._at, self._counted = block, at, at
         self._rows, self._moved = [], None
+
+    def _count(self) -> None:
+        """Count for the log what of the block was handed out."""
+        block = self._block
+        if block is not None and self._at > self._counted:
+            some = slice(self._counted - block.start, self._at - block.start)
+            self._tally.count(block.batch.levels[:, some])
+            self._counted = self._at
 
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
@@ -395,6 +431,7 @@ class Teacher:
         for name, array in arrays.items():
             _check_values(name, array)
         self._tickets.tell(self._tickets.find(ids), arrays)
+        self._tally.told(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
         """Observe a rollout [K, n, T], or [n, T] of one student: each row is of one ticket."""
@@ -417,13 +454,16 @@ class Teacher:
         outcome = outcome_of(rollout)
         if not known:
             outcome = outcome.exclude("success")
-        for name in ("return", "success") if known else ("return",):
-            as_array(name, outcome[name], tuple(outcome.batch_size))
+        numbers = {
+            name: as_array(name, outcome[name], tuple(outcome.batch_size))
+            for name in (("return", "success") if known else ("return",))
+        }
         for block, which, place in parts:
             rows = torch.from_numpy(which).to(outcome["return"].device)
             batch = block.batch[:, torch.from_numpy(place)]
             self.curriculum.observe(self.student, batch, outcome[:, rows])
         self._tickets.close(parts)
+        self._tally.told(len(ids), numbers["return"], numbers.get("success"))
 
     def _require_success(self, known: bool, how: str) -> None:
         if "success" in self.reads and not known:

@@ -55,6 +55,11 @@ class Tickets:
         self.told = False  # whether anything has been since the last collection
         self.scored: bool | None = None  # whether with a score; None where nothing was told yet
 
+    @property
+    def out(self) -> int:
+        """How many are out."""
+        return sum(int((block.state == OUT).sum()) for block in self.blocks)
+
     def add(self, batch: Batch) -> Block:
         """Number the levels of a batch."""
         block = Block(self.next, batch)
