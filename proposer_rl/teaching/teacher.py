@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from operator import index
 from pathlib import Path
 from threading import RLock
@@ -20,6 +20,7 @@ from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
+from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked
@@ -32,7 +33,7 @@ from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import LEVEL_ID, ended
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tally import Tally
-from proposer_rl.teaching.tickets import COUNTS, OUT, OVER, RESULTS, Block, Tickets, as_array
+from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -120,7 +121,8 @@ class Teacher:
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
         self._given, self._rows_of = given, getattr(space, "rows", list)
         self._success = success
-        self._tickets, self._tally = Tickets(), Tally(space)
+        self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
+        self._scored: bool | None = None  # whether results come with a score; None before any
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._block, self._counted = None, 0
@@ -168,7 +170,7 @@ class Teacher:
                 block, start = self._current(left), self._at
                 self._at = end = min(start + left, block.end)
                 which = slice(start - block.start, end - block.start)
-                block.state[which] = OUT
+                block.state[:, which] = OUT
                 ids.append(torch.arange(start, end, device=self.device))
                 if self._moved is None:
                     self._moved = self._levels(block)
@@ -214,7 +216,9 @@ class Teacher:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
                 numbers = {name: _number(name, value) for name, value in told.items()}
-                self._tickets.tell_one(ids, numbers)
+                self._check_score(told)
+                self._ledger.tell_one(ids, numbers)
+                self._scored = "score" in told
                 self._tally.told(1, numbers["return"], numbers.get("success"))
             else:
                 self._tell(self._ids(ids), told)
@@ -227,15 +231,15 @@ class Teacher:
                 resumed loop begins anew.
         """
         with self._here():
-            before = self._tickets.out
+            before = self._ledger.out
             if ids is None:
-                self._tickets.close_all()
+                self._ledger.drop_all()
                 self._whole.clear()
             else:
                 tickets = self._ids(ids)
-                going = self._tickets.states(tickets) != OVER
-                self._tickets.close(self._tickets.find(tickets[going]))
-            self._tally.dropped(before - self._tickets.out)
+                going = self._ledger.states(tickets) != OVER
+                self._ledger.drop(self._ledger.find(tickets[going]))
+            self._tally.dropped(before - self._ledger.out)
 
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
@@ -256,7 +260,7 @@ class Teacher:
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
                 if kept is not None:  # of episodes that were not cut off since
-                    states = self._tickets.states(self._ids(kept[LEVEL_ID].reshape(-1)))
+                    states = self._ledger.states(self._ids(kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
@@ -294,7 +298,7 @@ class Teacher:
         """
         with self._here():
             self._count()
-            told = {**self.curriculum.log(), **self._tally.read(self._tickets.out)}
+            told = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
             if file is not None:
                 kept = {name: value for name, value in told.items() if name != "levels"}
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
@@ -309,7 +313,8 @@ class Teacher:
                 "of": self._of,
                 "students": self.students,
                 "curriculum": self.curriculum.state_dict(),
-                "tickets": self._tickets.state_dict(),
+                "ledger": self._ledger.state_dict(),
+                "scored": self._scored,
                 "proposals": self._proposals,
                 "proposed": list(self._whole),
                 "block": None if self._block is None else self._block.start,
@@ -333,10 +338,11 @@ class Teacher:
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
             self.curriculum.load_state_dict(state["curriculum"])
-            self._tickets.load_state_dict(state["tickets"], self._like)
+            self._ledger.load_state_dict(state["ledger"], self._like)
+            self._scored = state["scored"]
             self._proposals, self._at = state["proposals"], state["at"]
             self._whole = list(state["proposed"])
-            blocks = {block.start: block for block in self._tickets.blocks}
+            blocks = {block.start: block for block in self._ledger.blocks}
             self._block, self._tally = None, Tally(self.space)
             self._use(blocks.get(state["block"]), self._at)
             self._kept = None
@@ -381,7 +387,7 @@ class Teacher:
     def _one(self) -> tuple[int, Any]:
         block, ticket = self._current(1), self._at
         self._at += 1
-        block.state[ticket - block.start] = OUT
+        block.state[:, ticket - block.start] = OUT
         if not self._rows:
             each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU).clone()]
             self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
@@ -411,11 +417,12 @@ class Teacher:
 
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
-        self._tickets.collect(partial(self.curriculum.observe, self.student))
+        for told, results in self._ledger.take():
+            self.curriculum.observe(self.student, told, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
         self._proposals += 1
-        return self._tickets.add(batch)
+        return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
         """The levels of a block, as the loop gets them, which may change them."""
@@ -430,7 +437,9 @@ class Teacher:
         }
         for name, array in arrays.items():
             _check_values(name, array)
-        self._tickets.tell(self._tickets.find(ids), arrays)
+        self._check_score(told)
+        self._ledger.tell(self._ledger.find(ids), arrays)
+        self._scored = "score" in told
         self._tally.told(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
@@ -442,7 +451,7 @@ class Teacher:
                 f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
                 f"{len(ids)} levels of {self.students} student(s)"
             )
-        parts = self._tickets.find(ids)
+        parts = self._ledger.find(ids)
         rollout, after = rollout.copy(), rollout["next"].copy()
         known = "success" in after.keys()
         if not known and self._success is not None:
@@ -462,8 +471,13 @@ class Teacher:
             rows = torch.from_numpy(which).to(outcome["return"].device)
             batch = block.batch[:, torch.from_numpy(place)]
             self.curriculum.observe(self.student, batch, outcome[:, rows])
-        self._tickets.close(parts)
+        self._ledger.drop(parts)
         self._tally.told(len(ids), numbers["return"], numbers.get("success"))
+
+    def _check_score(self, told: Mapping[str, Any]) -> None:
+        if self._scored not in (None, "score" in told):
+            how = "missing: other levels were told with one" if self._scored else "others had none"
+            raise ArgumentError(f"score: {how}; give it for all or for none")
 
     def _require_success(self, known: bool, how: str) -> None:
         if "success" in self.reads and not known:
@@ -471,7 +485,7 @@ class Teacher:
 
     def _proposed(self) -> NDArray[np.int64]:
         """The tickets of the one batch that is out."""
-        whole = [block for block in self._tickets.blocks if block.start in self._whole]
+        whole = [block for block in self._ledger.blocks if block.start in self._whole]
         out = [block for block in whole if (block.state == OUT).any()]
         if len(out) != 1:
             how = f"{len(out)} batches are out" if out else "nothing is out"
