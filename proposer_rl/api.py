@@ -39,7 +39,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import Recipe, override_value, recipe_function
+from proposer_rl.recipes import Recipe, filter_content, override_value, recipe_function
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -192,7 +192,7 @@ def train(
         scale: how much is computed, for tasks that have scales: ``"smoke"``, ``"quick"``,
             ``"medium"`` or ``"paper"``; None for the task's own numbers.
         filter: of the proposed levels: ``"learnability"`` or another name in ``conf/filter``, or
-            its settings; None for what the curriculum has by default.
+            its settings, those of its model included; None for what the curriculum has by default.
         updates: of the Solver; None for the task's or scale's number.
         seed: of every random draw.
         folder: where the files go; None for a new one below ``outputs/``.
@@ -220,7 +220,7 @@ def train(
         overrides.append(f"+scale={scale}")
     if isinstance(filter, str):
         overrides.append(f"+filter={filter}")
-    given = {**({} if not isinstance(filter, Mapping) else {"filter": filter}), **(settings or {})}
+    given = {**(filter_content(filter) if isinstance(filter, Mapping) else {}), **(settings or {})}
     overrides += [f"++{name}={override_value(value)}" for name, value in given.items()]
     overrides.append(f"seed={override_value(seed)}")
     overrides.append(f"compute.progress={override_value(progress)}")

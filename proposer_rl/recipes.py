@@ -21,8 +21,8 @@ CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.par
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
 CONSTANTS = {"null", "true", "false", "nan", "inf"}
 MISSING = "???"  # in a file: to be given
-KEYS = {"task": "task", "method": "curriculum"}
-"""Where the settings of a group's files stand in the configuration."""
+KEYS = {"task": ("task",), "method": ("curriculum", "model")}
+"""Below which keys of the configuration the settings of a group's files stand."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,32 @@ class Recipe:
         if self.target is not None:
             return ["~task"] if self.group == "task" else []
         group = "task" if self.group == "task" else "+method"
-        key = KEYS[self.group]
-        given = [f"++{key}.{name}={override_value(v)}" for name, v in self.settings.items()]
+        given = [
+            f"++{key}.{name}={override_value(value)}"
+            for key, settings in self.by_key().items()
+            for name, value in settings.items()
+        ]
         return [f"{group}={self.name}", *given]
+
+    def by_key(self) -> dict[str, dict[str, Any]]:
+        """The settings by the key that they stand below: the first below which the file has them."""
+        known = {self._key: {}} if self.target else _by_key(self.group, self.name)
+        found: dict[str, dict[str, Any]] = {}
+        for name, value in self.settings.items():
+            key = next((key for key, there in known.items() if name in there), self._key)
+            found.setdefault(key, {})[name] = value
+        return found
 
     def own(self) -> dict[str, Any]:
         """The part of the configuration that no file has: one's own task or curriculum."""
         if self.target is None:
             return {}
         named = {"method": self.name} if self.group == "method" else {}
-        return {**named, KEYS[self.group]: {"_target_": self.target, **self.settings}}
+        return {**named, self._key: {"_target_": self.target, **self.settings}}
+
+    @property
+    def _key(self) -> str:
+        return KEYS[self.group][0]
 
 
 def own_recipe(
@@ -95,7 +111,9 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     if name not in available(group):
         known = ", ".join(available(group))
         raise AttributeError(f"there is no {name!r}; there are: {known}")
-    settings = file_content(f"{group}/{name}")[KEYS[group]]
+    settings: dict[str, Any] = {}
+    for more in _by_key(group, name).values():
+        settings = {**more, **settings}
     del settings["_target_"]
     parameters = [
         inspect.Parameter(
@@ -117,6 +135,35 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     make.__doc__ = f"{about}\n\nThe settings are those of conf/{group}/{name}.yaml."
     make.__signature__ = inspect.Signature(parameters, return_annotation=Recipe)  # type: ignore[attr-defined]
     return make
+
+
+def filter_content(filter: Mapping[str, Any] | str) -> dict[str, Any]:
+    """What a filter sets below the keys ``filter`` and ``model``.
+
+    Args:
+        filter: a name in ``conf/filter``, or settings; with any of a model's, such as ``labels``,
+            the rest is as in ``conf/filter/model.yaml``.
+
+    Raises:
+        ArgumentError: if there is no such file.
+    """
+    keys = ("filter", "model")
+    if isinstance(filter, str):
+        if filter not in available("filter"):
+            raise _refusal(f"filter={filter!r}: must be one of {available('filter')}")
+        content = file_content(f"filter/{filter}")
+        return {key: content[key] for key in keys if key in content}
+    known = file_content("filter/model")
+    own = {name: value for name, value in filter.items() if name in known["model"]}
+    rest = {name: value for name, value in filter.items() if name not in own}
+    if not own:
+        return {"filter": rest}
+    return {"filter": known["filter"] | rest, "model": known["model"] | own}
+
+
+def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
+    content = file_content(f"{group}/{name}")
+    return {key: content.get(key) or {} for key in KEYS[group]}
 
 
 def override_value(value: Any) -> str:

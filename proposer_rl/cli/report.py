@@ -19,6 +19,7 @@ examples:
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
   bin/report outputs results/medium        your runs beside published ones
+  bin/report plr.jsonl uniform.jsonl       logs of teachers, teacher.log(file), to teachers.html
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -35,6 +36,11 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
     from proposer_rl.report.records import printable
 
+    if all(path.suffix == ".jsonl" for path in options.folder):
+        from proposer_rl.report.teachers import write_teachers
+
+        print(printable(f"Report: {write_teachers(options.folder, options.output)}"))
+        return
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
     from proposer_rl.report.build import write_report
 
@@ -57,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth"
+        "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth; or logs of teachers"
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"

@@ -13,7 +13,7 @@ when the last of them is over; levels that one of them did not come to are left 
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -22,18 +22,14 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
 from proposer_rl.curricula.contract import Batch, Curriculum, outcome_of
+from proposer_rl.curricula.ledger import Ledger
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
-WAITING, BEGUN, ENDED, OBSERVED, GIVEN_UP = range(5)
-
 GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
 """Needs of a curriculum that reads what a policy has seen off rollouts."""
-
-Place = tuple[int, int]
-"""Of a level: the number of its batch, and where it stands in it."""
 
 Played = tuple[Levels, TensorDictBase]
 """Levels [K, m], and a rollout [K, m, T] of an episode on each."""
@@ -61,12 +57,11 @@ class ContinuedLevels:
         self._episodes = learner.collector.episodes
         self._episodes.next_levels = self._next_levels
         copies, count = learner.env.batch_size
-        self._batches: dict[int, _Outstanding] = {}
-        self._proposed = 0
-        self._waiting: list[deque[Place]] = [deque() for _ in range(copies)]
+        self._ledger = Ledger({"episode": object})
+        self._waiting: list[deque[int]] = [deque() for _ in range(copies)]  # ids of each student
         self._levels = like[:1].expand(copies, count).clone()  # that are played, or set
-        self._playing: list[list[Place]] = [[(-1, -1)] * count for _ in range(copies)]
-        self._over: dict[tuple[int, int], list[Place]] = defaultdict(list)
+        self._playing = [[-1] * count for _ in range(copies)]
+        self._over: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._most = count  # episodes of a student that ended in an update
         self._steps = torch.zeros(copies, count, dtype=torch.int64)  # of the present episodes
         self._history: TensorDictBase | None = None  # [K, P, H], which ends with the last update
@@ -82,8 +77,10 @@ class ContinuedLevels:
         update = self._learner.update([stream.generator("actions") for stream in streams])
         self._learner.check()
         self._cut(update.rollout)
-        credits = [credit for each in self._batches.values() for credit in each.settled()]
-        self._batches = {n: each for n, each in self._batches.items() if not each.over}
+        credits = [
+            (batch, outcome_of_episodes(results["episode"].tolist()))
+            for batch, results in self._ledger.take(settled=True)
+        ]
         if credits:
             batch, outcome = credits[-1]
             self._shown = batch.levels, outcome["rollout"]
@@ -93,13 +90,11 @@ class ContinuedLevels:
         count = self._steps.shape[1]
         wanted = count + self._most - min(map(len, self._waiting))
         batch = self._curriculum.propose(self._student, max(wanted, 1), streams)
-        self._batches[self._proposed] = _Outstanding(batch.levels, batch)
+        block = self._ledger.add(batch)
         for copy, waiting in enumerate(self._waiting):
             while len(waiting) > count:
-                number, place = waiting.popleft()
-                self._batches[number].state[copy, place] = GIVEN_UP
-            waiting.extend((self._proposed, place) for place in range(batch.count))
-        self._proposed += 1
+                self._ledger.drop_one(waiting.popleft(), copy)
+            waiting.extend(range(block.start, block.end))
 
     def _next_levels(self, begins: Tensor) -> Levels:
         """What is played from now on where episodes begin, bool [K, P]."""
@@ -108,9 +103,8 @@ class ContinuedLevels:
         for copy, env in begins.nonzero().tolist():
             self._over[copy, env].append(self._playing[copy][env])
             if self._waiting[copy]:
-                number, place = self._playing[copy][env] = self._waiting[copy].popleft()
-                self._batches[number].state[copy, place] = BEGUN
-                self._levels[copy, env] = self._batches[number].levels[copy, place]
+                id = self._playing[copy][env] = self._waiting[copy].popleft()
+                self._levels[copy, env] = self._ledger.hand_out(id, copy)
         if self._episodes.fresh:
             self._over.clear()  # what had been played before has no end
         return self._levels
@@ -118,9 +112,8 @@ class ContinuedLevels:
     def _forget(self) -> None:
         """Give up the episodes that have been broken off."""
         for copy, row in enumerate(self._playing):
-            for number, place in row:
-                if number in self._batches:
-                    self._batches[number].give_up(copy, place)
+            for id in row:
+                self._ledger.drop_one(id, copy)
         self._history, self._steps = None, torch.zeros_like(self._steps)
 
     def _cut(self, rollout: TensorDictBase) -> None:
@@ -134,12 +127,12 @@ class ContinuedLevels:
         begun = before - self._steps
         ends = rollout["next", "done"].squeeze(-1).nonzero()
         for copy, env, step in ends.tolist():
-            number, place = self._over[copy, env].pop(0)
+            id = self._over[copy, env].pop(0)
             end = before + step + 1
             episode = history[copy, env, int(begun[copy, env]) : end]
             begun[copy, env] = end
-            if number in self._batches:
-                self._batches[number].end(copy, place, episode)
+            if self._ledger.is_out(id, copy):  # further episodes on a level do not count
+                self._ledger.tell_one(id, {"episode": episode.clone()}, copy)
         self._most = int(ends[:, 0].bincount(minlength=1).max())
         self._steps = length - begun
         self._history = history[:, :, length - int(self._steps.max()) :].clone()
@@ -158,7 +151,6 @@ class ContinuedLevels:
         memory = self._learner.collector.memory
         discounted = self._learner.statistics.discounted
         return {
-            "proposed": self._proposed,
             "waiting": [list(waiting) for waiting in self._waiting],
             "levels": packed(self._levels),
             "playing": [list(row) for row in self._playing],
@@ -168,7 +160,7 @@ class ContinuedLevels:
             "memory": None if memory is None else packed(memory),
             "discounted": None if discounted is None else discounted.clone(),
             "shown": None if self._shown is None else [*map(packed, self._shown)],
-            "batches": {number: each.state_dict() for number, each in self._batches.items()},
+            "ledger": self._ledger.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -177,15 +169,12 @@ class ContinuedLevels:
         Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
         """
         device = self._learner.env.device
-        self._proposed, self._most = state["proposed"], state["most"]
-        self._waiting = [deque(map(tuple, waiting)) for waiting in state["waiting"]]
+        self._most = state["most"]
+        self._waiting = [deque(waiting) for waiting in state["waiting"]]
         self._levels = _of_kind(self._levels, state["levels"])
-        self._playing = [[*map(tuple, row)] for row in state["playing"]]
+        self._playing = [list(row) for row in state["playing"]]
         self._steps = state["steps"].clone()
-        self._batches = {
-            number: _Outstanding.of_state(each, self._levels, device)
-            for number, each in state["batches"].items()
-        }
+        self._ledger.load_state_dict(state["ledger"], self._levels, device)
         self._history = self._shown = None
         if state["shown"] is not None:
             levels, episodes = state["shown"]
@@ -201,82 +190,6 @@ class ContinuedLevels:
         if state["memory"] is not None:
             memory = TensorDict.from_dict(state["memory"], batch_dims=2)
             self._learner.collector.memory = memory.to(device)
-
-
-class _Outstanding:
-    """A proposed batch some of whose levels have not been observed yet.
-
-    Attributes:
-        levels: as they were proposed, [K, n].
-        state: of each, int64 [K, n].
-    """
-
-    def __init__(self, levels: Levels, batch: Batch) -> None:
-        self.levels = levels
-        self.state = torch.full(levels.shape[:2], WAITING)
-        self._batch = batch  # or what of it is played
-        self._places: Tensor | None = None  # int64 [m], of the levels that the batch is kept to
-        self._played: dict[tuple[int, int], TensorDictBase] = {}
-
-    @property
-    def over(self) -> bool:
-        """Whether there is nothing left to be observed."""
-        if self._places is None:
-            return False
-        return bool((self.state[:, self._places] >= OBSERVED).any(0).all())
-
-    def give_up(self, copy: int, place: int) -> None:
-        """Leave a level out that is not over."""
-        if self.state[copy, place] <= BEGUN:
-            self.state[copy, place] = GIVEN_UP
-
-    def end(self, copy: int, place: int, episode: TensorDictBase) -> None:
-        """Take the first episode [T] on a level; further ones do not count."""
-        if self.state[copy, place] == BEGUN:
-            self.state[copy, place] = ENDED
-            self._played[copy, place] = episode.clone()
-
-    def settled(self) -> Iterator[Credit]:
-        """The part of it that has become known, if there is one."""
-        if bool((self.state == WAITING).any()):
-            return
-        copies = len(self.state)
-        if self._places is None:
-            self._places = (self.state != GIVEN_UP).all(0).nonzero().flatten()
-            self._batch = self._batch.keep(self._places.expand(copies, -1))
-        ready = (self.state[:, self._places] == ENDED).all(0).nonzero().flatten()
-        if not len(ready):
-            return
-        places = self._places[ready].tolist()
-        self.state[:, places] = OBSERVED
-        episodes = [[self._played.pop((copy, p)) for p in places] for copy in range(copies)]
-        yield self._batch[:, ready], outcome_of_episodes(episodes)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "levels": packed(self.levels),
-            "notes": packed(self._batch.notes),
-            "state": self.state.clone(),
-            "places": None if self._places is None else self._places.clone(),
-            "played": [[*place, packed(episode)] for place, episode in self._played.items()],
-        }
-
-    @classmethod
-    def of_state(
-        cls, state: Mapping[str, Any], like: Levels, device: torch.device | None
-    ) -> _Outstanding:
-        """What :meth:`state_dict` returned, with levels of a kind and episodes on a device."""
-        levels = _of_kind(like, state["levels"])
-        places = state["places"]
-        kept = levels if places is None else levels[:, places]
-        notes = TensorDict.from_dict(state["notes"], batch_size=kept.shape[:2])
-        each = cls(levels, Batch(kept, notes))
-        each.state, each._places = state["state"].clone(), places
-        each._played = {
-            (copy, place): TensorDict.from_dict(episode, batch_dims=1).to(device)
-            for copy, place, episode in state["played"]
-        }
-        return each
 
 
 def _of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:

@@ -18,6 +18,8 @@ T steps, N bins. A loop that trains one student has K = 1.
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -46,16 +48,19 @@ class Batch:
 
     Attributes:
         levels: [K, n], on the device of the task.
-        notes: a tensordict [K, n] on the CPU, by which the curriculum recognises the levels again.
+        notes: a tensordict [K, n] on the CPU, by which the curriculum recognises the levels again;
+            None for none.
 
     Raises:
         ValueError: if there is not one note for each level.
     """
 
     levels: Levels
-    notes: TensorDictBase
+    notes: TensorDictBase = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        if self.notes is None:
+            object.__setattr__(self, "notes", TensorDict({}, self.levels.shape[:2]))
         if self.levels.shape[:2] != self.notes.batch_size:
             raise ValueError(
                 f"levels {list(self.levels.shape[:2])} and notes {list(self.notes.batch_size)} of "
@@ -163,6 +168,7 @@ class Curriculum:
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
+        _warn_of_nothing(type(self))
         return {name.strip("_"): saved(getattr(self, name)) for name in self.remembers}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -321,6 +327,20 @@ class Inbox:
         """Go on with them."""
         self._next = int(state["next"])
         self._parts = [unpacked(part, self._like) for part in state["parts"]]
+
+
+@functools.cache
+def _warn_of_nothing(kind: type[Curriculum]) -> None:
+    """Warn of a class that observes, and does not say what is to be saved of that."""
+    said = kind.state_dict is not Curriculum.state_dict or any(
+        "remembers" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
+    )
+    if kind.observe is not Curriculum.observe and not said:
+        warnings.warn(
+            f"{kind.__name__} observes, but a resumed run begins anew: name the attributes that are "
+            "to be saved, remembers = (...), or () for none",
+            stacklevel=3,
+        )
 
 
 def _places(own: Tensor) -> dict[str, Tensor]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -23,6 +24,9 @@ Features = Callable[[Levels], Tensor]
 """What a model knows of levels [K, n] by themselves: float [K, n, F], each about -1 to 1."""
 
 ANSWERED = ("performance", "exact_performance")
+FIRST = 128  # levels that came back first, by which it is judged what the labels say
+ALIKE = 0.95  # share of them with one label, beyond which that is nearly nothing
+WRONG = 0.1  # share of them that were told another success, beyond which it should be read
 PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
 
 
@@ -62,6 +66,7 @@ class Modelled(Combinator):
         self._inbox = Inbox()
         self._has_taken = False  # whether anything since the last proposal, as logs make it
         self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
+        self._first: list[Tensor] | None = []  # that came back, [2, K, n]; None once judged
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """What the curriculum proposes to a student of whom the model speaks."""
@@ -84,6 +89,13 @@ class Modelled(Combinator):
         reached = {name: outcome[name].double() for name in self._model.reads}
         self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
         self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
+        if self._first is not None and self._labels == "above_worst":
+            self._judge(outcome)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with it; what comes back next is not the first any more."""
+        super().load_state_dict(state)
+        self._first = None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
         """Improve the curriculum, by what the model says of the student."""
@@ -120,6 +132,29 @@ class Modelled(Combinator):
                 "reached": means[1],
             },
         }
+
+    def _judge(self, outcome: TensorDictBase) -> None:
+        """Warn where the first levels that come back show that their labels say little."""
+        returns = outcome["return"].double().cpu()
+        success = outcome.get("success", torch.full_like(returns, torch.nan)).double().cpu()
+        self._first = [*(self._first or []), torch.stack([returns, success])]
+        first = torch.cat(self._first, -1)  # [2, K, m]
+        if first.shape[-1] < FIRST:
+            return
+        self._first = None
+        label = OutcomeModel(labels="above_worst").labels({"return": first[0]})
+        wrong = (first[1] - label).abs().nanmean()  # NaN where none was told
+        found = f"labels=above_worst: {float(label.mean()):.0%} of the first returns are that"
+        if wrong > WRONG:
+            warnings.warn(
+                f"{found}, and not the success that was told, which labels=success reads",
+                stacklevel=2,
+            )
+        elif wrong.isnan() and label.mean() > ALIKE:
+            warnings.warn(
+                f"{found}, so that the labels say nearly nothing; give labels=success, and tell it",
+                stacklevel=2,
+            )
 
     def _take_in(self) -> None:
         """Take in what came back since the last proposal, of whichever batches: it has one age."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tensordict import TensorDict
-
 from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.student import Student
@@ -26,4 +24,4 @@ class SamplingCurriculum(Curriculum):
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Draws of the distribution, each student's from its own streams."""
         levels = fresh_levels(self._distribution, count, streams, "levels")
-        return Batch(levels, TensorDict({}, (len(streams), count)))
+        return Batch(levels)

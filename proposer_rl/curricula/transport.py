@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOST_BINS = 4096
+# Of a program, for steps of about ten seconds: 250 items in a row take as long as a grid of 8³ bins.
+MOST_IN_A_ROW, MOST_OF_A_GRID = 256, 512
 NOTHING = 1e-6  # a share that is rounding of the solver's
 SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself
 
@@ -49,7 +51,7 @@ class TransportCurriculum(BinCurriculum):
             in all bins of the target; then of the share of the target where it still is.
 
     Raises:
-        ArgumentError: if there is not one share for each bin.
+        ArgumentError: if there is not one share for each bin, or there are too many bins.
     """
 
     shown = ("performance",)
@@ -69,6 +71,13 @@ class TransportCurriculum(BinCurriculum):
         measure: Measure = "success",
         exploration: Share = 0.0,
     ) -> None:
+        most = MOST_IN_A_ROW if len(space.axes) == 1 else MOST_OF_A_GRID
+        if space.size > most:
+            raise ArgumentError(
+                f"space: {space.size:,} bins: optimal transport takes minutes on more than {most}; "
+                "give fewer bins or items, or take domain_randomization with filter=model, which "
+                "has no limit"
+            )
         super().__init__(space, every=every)
         self._exploration = exploration
         self._delta, self._epsilon = delta, epsilon

@@ -326,6 +326,15 @@ class Task(ABC):
         return self.exact_performance
 
     @property
+    def description(self) -> dict[str, Any]:
+        """What states of curricula are compared by, for JSON: the space's axes, and names."""
+        return {
+            "kind": type(self).__qualname__,
+            "axes": {name: list(values) for name, values in self.space.axes.items()},
+            "distributions": list(self.distributions),
+        }
+
+    @property
     def about(self) -> dict[str, str]:
         """Texts about the task, by their labels."""
         names = ", ".join(self.evaluated_on)

@@ -12,10 +12,12 @@ from typing import Any
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, filtered, modelled
-from proposer_rl.recipes import Recipe, available, file_content, recipe_function, yaml_file
+from proposer_rl.recipes import Recipe, file_content, filter_content, recipe_function, yaml_file
 from proposer_rl.settings import ArgumentError, arguments
+from proposer_rl.teaching.identity import of_classes, plain
 
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # to another setting, as the files have them
+AROUND = ("filter", "model")  # what a curriculum is put into
 
 
 def make_curriculum(
@@ -23,40 +25,57 @@ def make_curriculum(
     space: Any,
     filter: Mapping[str, Any] | str | None,
     seeds: Sequence[int],
-) -> Curriculum:
-    """The curriculum on the levels of a space or task; by name with the filter of its file."""
-    asked: Mapping[str, Any] = {}
+) -> tuple[Curriculum, dict[str, Any]]:
+    """The curriculum on the levels of a space or task; by name with the filter of its file.
+
+    Returns:
+        The curriculum; its name or class and all settings that were said of it, for JSON.
+    """
+    asked: dict[str, Any] = {}
     if isinstance(curriculum, str):
         curriculum = recipe_function("method", curriculum)()
     if isinstance(curriculum, Recipe):
-        if curriculum.target is None:
-            asked = file_content(f"method/{curriculum.name}")
-        curriculum = _made(curriculum, asked.get("curriculum", {}), space, seeds)
+        file = {} if curriculum.target else file_content(f"method/{curriculum.name}")
+        asked = _merged({key: file[key] for key in AROUND if key in file}, curriculum.by_key())
+        named, settings = curriculum.name, _settings(curriculum, file)
+        curriculum = _made(curriculum, file, settings, space, seeds)
+    else:
+        named, settings = of_classes(curriculum), {}
     if isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(curriculum).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
-    if isinstance(filter, str):
-        if filter not in available("filter"):
-            raise ArgumentError(f"filter={filter!r}: must be one of {available('filter')}")
-        asked = file_content(f"filter/{filter}")
-    elif filter is not None:
-        asked = {"filter": filter}
-    if asked.get("filter") is not None:
-        curriculum = filtered(curriculum, **asked["filter"])
-    return modelled(curriculum, space, **asked["model"]) if "model" in asked else curriculum
+    if filter is not None:
+        asked = _merged(asked, filter_content(filter))
+    around = {key: asked[key] for key in AROUND if asked.get(key) is not None}
+    if "filter" in around:
+        curriculum = filtered(curriculum, **around["filter"])
+    if "model" in around:
+        curriculum = modelled(curriculum, space, **around["model"])
+    return curriculum, plain({"kind": named, **settings, **around})
 
 
-def _made(recipe: Recipe, named: Mapping[str, Any], space: Any, seeds: Sequence[int]) -> Curriculum:
-    """The curriculum, by its file's settings and the recipe's."""
-    train = yaml_file("train")
+def _settings(recipe: Recipe, file: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a curriculum itself: its file's, and over them the recipe's."""
     # What a file makes of a class of its own is the default of the function, too.
-    plain = {name: value for name, value in named.items() if not isinstance(value, Mapping)}
-    values = {name: _resolved(value, train) for name, value in plain.items()}
-    make: Callable[..., Any] = resolve_name(values.pop("_target_", recipe.target))
-    given = {**values, **recipe.settings}
-    read = arguments(make, given, [*inspect.signature(make).parameters][:1])
+    named = file.get("curriculum", {}).items()
+    there = {name: value for name, value in named if not isinstance(value, Mapping)}
+    there.pop("_target_", None)
+    train = yaml_file("train")
+    own = recipe.by_key().get("curriculum", {})
+    return {**{name: _resolved(value, train) for name, value in there.items()}, **own}
+
+
+def _made(
+    recipe: Recipe,
+    file: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    space: Any,
+    seeds: Sequence[int],
+) -> Curriculum:
+    make: Callable[..., Any] = resolve_name(recipe.target or file["curriculum"]["_target_"])
+    read = arguments(make, settings, [*inspect.signature(make).parameters][:1])
     try:
         made: Curriculum = make(Components(space, ProposerSettings(), seeds), **read)
     except AttributeError as error:
@@ -67,6 +86,14 @@ def _made(recipe: Recipe, named: Mapping[str, Any], space: Any, seeds: Sequence[
             "has not; give a task in its place"
         ) from error
     return made
+
+
+def _merged(settings: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by key, those of the second over those of the first; None in place of all."""
+    found = dict(settings)
+    for key, own in more.items():
+        found[key] = None if own is None else {**(found.get(key) or {}), **own}
+    return found
 
 
 def _resolved(value: Any, settings: Mapping[str, Any]) -> Any:

@@ -6,6 +6,7 @@ small edits. Inside, a level is a tensordict; what a loop gets is :meth:`LevelSp
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from operator import index
@@ -49,6 +50,11 @@ class LevelSpace:
             raise ArgumentError("target: missing: this curriculum needs a target of the space")
         return self.distributions["target"]
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """What states are compared by: nested dicts of numbers and texts, for JSON."""
+        return {"kind": type(self).__qualname__}
+
     def features(self, levels: Levels) -> Tensor:
         """What a model of outcomes knows of levels: float [*B, F]."""
         return space_features(self, levels)
@@ -78,6 +84,9 @@ class Parameters(LevelSpace, ParameterSpace):
         named: further distributions like ``target``, by name, for hand-designed curricula.
         seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
 
+    Attributes:
+        labels: of each parameter, by name: its values, where they are texts; else None.
+
     Raises:
         ArgumentError: naming the parameter, for what is no range or lies outside of it.
 
@@ -103,9 +112,9 @@ class Parameters(LevelSpace, ParameterSpace):
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict(bins) if isinstance(bins, Mapping) else dict.fromkeys(ranges, bins)
         _check_names("bins", counts, ranges)
-        self._labels = {name: _labels(values) for name, values in ranges.items()}
+        self.labels = {name: _labels(values) for name, values in ranges.items()}
         parts = {
-            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self._labels[name])
+            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self.labels[name])
             for name, values in ranges.items()
         }
         try:
@@ -115,10 +124,10 @@ class Parameters(LevelSpace, ParameterSpace):
                 f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
                 "bins=1, which suffices for curricula that need none"
             ) from error
-        further = {
-            name: ParameterSpace(self._part(name, part), seeded)
-            for name, part in _distributions(target, named).items()
+        self._parts = {
+            name: self._part(name, part) for name, part in _distributions(target, named).items()
         }
+        further = {name: ParameterSpace(part, seeded) for name, part in self._parts.items()}
         self.distributions = {"all": self, **further}
 
     @property
@@ -127,10 +136,38 @@ class Parameters(LevelSpace, ParameterSpace):
         target: Any = self.target
         return self.shares(target)
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """Its parameters, their bins, and the target and what else was named."""
+        named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
+        target = {"target": named.pop("target")} if "target" in named else {}
+        counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
+        return {
+            **super().description,
+            "ranges": self._said(self.bins),
+            "bins": counts,
+            "seeded": self._seeded,
+            **target,
+            "named": named,
+        }
+
+    def _said(self, parts: Mapping[str, Bins]) -> dict[str, str]:
+        """Each parameter's values as a text."""
+        found = {}
+        for name, part in parts.items():
+            labels, values = self.labels[name], part.low.tolist()
+            if labels is not None:
+                values = [str(labels[place]) for place in values]
+            ends = part.low[0].item(), part.high[-1].item()
+            low, high = (str(end).removesuffix(".0") for end in ends)
+            whole = "" if part.low.is_floating_point() else ", whole"
+            found[name] = f"{low} to {high}{whole}" if part.wide else str(values)
+        return found
+
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Levels [n] as dicts of numbers and texts."""
         columns = {str(name): entry.tolist() for name, entry in levels.items()}
-        for name, labels in self._labels.items():
+        for name, labels in self.labels.items():
             if labels is not None:
                 columns[name] = [labels[place] for place in columns[name]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
@@ -140,7 +177,7 @@ class Parameters(LevelSpace, ParameterSpace):
         _check_names(key, ranges, self.bins)
         parts = dict(self.bins)
         for name, values in ranges.items():
-            whole, labels = self.bins[name], self._labels[name]
+            whole, labels = self.bins[name], self.labels[name]
             where = f"{key}.{name}"
             if labels is not None:
                 chosen = values if isinstance(values, list) else [values]
@@ -203,12 +240,13 @@ class Items(LevelSpace):
             )
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
-        parts = {}
+        parts: dict[str, _SomeItems] = {}
         for name, given in _distributions(target, named).items():
             places = [*map(index, given)]  # also of a tensor
             if not places or min(places) < 0 or max(places) >= count:
                 raise ArgumentError(f"{name}={places}: must be places from 0 to {count - 1}")
             parts[name] = _SomeItems(torch.tensor(places))
+        self._parts = parts
         self.distributions = {"all": self, **parts}
 
     @property
@@ -216,6 +254,18 @@ class Items(LevelSpace):
         """The target as shares of the items, float [N]."""
         places: Any = self.target
         return places.places.bincount(minlength=self.size) / len(places.places)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """How many, a hash of their features, and the places of the target."""
+        known = self.coordinates.contiguous().numpy().tobytes()
+        places = {name: one.places.tolist() for name, one in self._parts.items()}
+        return {
+            **super().description,
+            "count": self.size,
+            "features": hashlib.sha256(known).hexdigest()[:16],
+            **places,
+        }
 
     def locate(self, levels: TensorDictBase) -> Tensor:
         """Where items lie, float32 [*B, D]."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cached_property
 from operator import index
+from pathlib import Path
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
 
@@ -18,16 +20,20 @@ from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
+from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
 from proposer_rl.recipes import Recipe
+from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import Levels, Task
 from proposer_rl.teaching.abilities import adapted
+from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import LEVEL_ID, ended
 from proposer_rl.teaching.spaces import LevelSpace
-from proposer_rl.teaching.tickets import COUNTS, OUT, OVER, RESULTS, Block, Tickets, as_array
+from proposer_rl.teaching.tally import Tally
+from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -81,6 +87,7 @@ class Teacher:
 
     _block: Block | None  # that tickets are handed out from
     _at: int  # the next of them
+    _counted: int  # the next that the log has not counted
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
@@ -101,7 +108,7 @@ class Teacher:
     ) -> None:
         self.space, self.device, self.block = space, torch.device(device), block
         self._seeds = [_whole("seed", seed) + copy for copy in range(students)]
-        self.curriculum = make_curriculum(curriculum, space, filter, self._seeds)
+        self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
         self.student = student or Student(
@@ -114,9 +121,11 @@ class Teacher:
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
         self._given, self._rows_of = given, getattr(space, "rows", list)
         self._success = success
-        self._tickets = Tickets()
+        self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
+        self._scored: bool | None = None  # whether results come with a score; None before any
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
+        self._block, self._counted = None, 0
         self._use(None, 0)
         self._kept: TensorDictBase | None = None  # steps [L] of episodes that have not ended
         self._lock, self._process = RLock(), os.getpid()
@@ -138,6 +147,7 @@ class Teacher:
             block = self._next(_whole("n", n, 1))
             block.state[:] = OUT
             self._whole.append(block.start)
+            self._tally.count(block.batch.levels)
             return self._levels(block)
 
     def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
@@ -160,7 +170,7 @@ class Teacher:
                 block, start = self._current(left), self._at
                 self._at = end = min(start + left, block.end)
                 which = slice(start - block.start, end - block.start)
-                block.state[which] = OUT
+                block.state[:, which] = OUT
                 ids.append(torch.arange(start, end, device=self.device))
                 if self._moved is None:
                     self._moved = self._levels(block)
@@ -206,7 +216,10 @@ class Teacher:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
                 numbers = {name: _number(name, value) for name, value in told.items()}
-                self._tickets.tell_one(ids, numbers)
+                self._check_score(told)
+                self._ledger.tell_one(ids, numbers)
+                self._scored = "score" in told
+                self._tally.told(1, numbers["return"], numbers.get("success"))
             else:
                 self._tell(self._ids(ids), told)
 
@@ -218,13 +231,15 @@ class Teacher:
                 resumed loop begins anew.
         """
         with self._here():
+            before = self._ledger.out
             if ids is None:
-                self._tickets.close_all()
+                self._ledger.drop_all()
                 self._whole.clear()
             else:
                 tickets = self._ids(ids)
-                going = self._tickets.states(tickets) != OVER
-                self._tickets.close(self._tickets.find(tickets[going]))
+                going = self._ledger.states(tickets) != OVER
+                self._ledger.drop(self._ledger.find(tickets[going]))
+            self._tally.dropped(before - self._ledger.out)
 
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
@@ -245,7 +260,7 @@ class Teacher:
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
                 if kept is not None:  # of episodes that were not cut off since
-                    states = self._tickets.states(self._ids(kept[LEVEL_ID].reshape(-1)))
+                    states = self._ledger.states(self._ids(kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
@@ -266,22 +281,40 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
-    def log(self) -> dict[str, Any]:
-        """What the curriculum has to tell since the last call; empty if there is nothing.
+    def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
+        """What happened since the last call, and what the curriculum has to tell of it.
 
-        What was told since the last proposal is not in it, so that logs change no curriculum.
+        For every curriculum: how many levels were ``proposed``, ``told`` and ``dropped``, and are
+        ``out`` now; ``mean_return`` and ``mean_success`` of what was told, None where nothing was;
+        and ``drawn``, how many of the proposed levels there were in each bin of each parameter.
+        The curriculum's own entries are in the table of the methods. In them is not what was told
+        since the last proposal, so that logs change no curriculum.
+
+        Args:
+            file: JSON Lines to which it is added as a line, without levels, for ``bin/report``.
+
+        Raises:
+            StorageError: if the file cannot be written.
         """
         with self._here():
-            return self.curriculum.log()
+            self._count()
+            told = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
+            if file is not None:
+                kept = {name: value for name, value in told.items() if name != "levels"}
+                with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
+                    lines.write(json.dumps(kept) + "\n")
+            return told
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed loop needs, tickets that are out included."""
         with self._here():
             kept = self._kept
             return {
+                "of": self._of,
                 "students": self.students,
                 "curriculum": self.curriculum.state_dict(),
-                "tickets": self._tickets.state_dict(),
+                "ledger": self._ledger.state_dict(),
+                "scored": self._scored,
                 "proposals": self._proposals,
                 "proposed": list(self._whole),
                 "block": None if self._block is None else self._block.start,
@@ -295,26 +328,38 @@ class Teacher:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
         Raises:
-            ArgumentError: if it is of another number of students, or of another curriculum.
+            ArgumentError: if it is of another space, curriculum, setting of it or number of
+                students, naming what differs; then nothing has changed.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
+            for what, now in self._of.items():
+                require_same(what, state["of"][what], now)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
-            if strange := state["curriculum"].keys() ^ self.curriculum.state_dict().keys():
-                raise ArgumentError(f"state: of another curriculum, by its {min(strange)!r}")
-            source: Any = self.space.space
-            like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])
-            self._tickets.load_state_dict(state["tickets"], like)
+            self._ledger.load_state_dict(state["ledger"], self._like)
+            self._scored = state["scored"]
             self._proposals, self._at = state["proposals"], state["at"]
             self._whole = list(state["proposed"])
-            blocks = {block.start: block for block in self._tickets.blocks}
+            blocks = {block.start: block for block in self._ledger.blocks}
+            self._block, self._tally = None, Tally(self.space)
             self._use(blocks.get(state["block"]), self._at)
             self._kept = None
             if kept := state["rollout"]:
                 steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
                 self._kept = steps.flatten()
+
+    @cached_property
+    def _like(self) -> Levels:
+        """A level of the kind."""
+        source: Any = self.space.space
+        return source.sample(1, torch.Generator())[0]
+
+    @cached_property
+    def _of(self) -> dict[str, Any]:
+        """What its state is of."""
+        return {"space": of_levels(self.space, self._like), "curriculum": self._made_of}
 
     def client(self) -> TeacherClient:
         """This teacher for another process, such as a worker of a collector.
@@ -342,7 +387,7 @@ class Teacher:
     def _one(self) -> tuple[int, Any]:
         block, ticket = self._current(1), self._at
         self._at += 1
-        block.state[ticket - block.start] = OUT
+        block.state[:, ticket - block.start] = OUT
         if not self._rows:
             each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU).clone()]
             self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
@@ -358,16 +403,26 @@ class Teacher:
 
     def _use(self, block: Block | None, at: int) -> None:
         """Hand out tickets of a block from one on."""
-        self._block, self._at = block, at
+        self._count()
+        self._block, self._at, self._counted = block, at, at
         self._rows, self._moved = [], None
+
+    def _count(self) -> None:
+        """Count for the log what of the block was handed out."""
+        block = self._block
+        if block is not None and self._at > self._counted:
+            some = slice(self._counted - block.start, self._at - block.start)
+            self._tally.count(block.batch.levels[:, some])
+            self._counted = self._at
 
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
-        self._tickets.collect(partial(self.curriculum.observe, self.student))
+        for told, results in self._ledger.take():
+            self.curriculum.observe(self.student, told, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
         self._proposals += 1
-        return self._tickets.add(batch)
+        return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
         """The levels of a block, as the loop gets them, which may change them."""
@@ -382,7 +437,10 @@ class Teacher:
         }
         for name, array in arrays.items():
             _check_values(name, array)
-        self._tickets.tell(self._tickets.find(ids), arrays)
+        self._check_score(told)
+        self._ledger.tell(self._ledger.find(ids), arrays)
+        self._scored = "score" in told
+        self._tally.told(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
         """Observe a rollout [K, n, T], or [n, T] of one student: each row is of one ticket."""
@@ -393,7 +451,7 @@ class Teacher:
                 f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
                 f"{len(ids)} levels of {self.students} student(s)"
             )
-        parts = self._tickets.find(ids)
+        parts = self._ledger.find(ids)
         rollout, after = rollout.copy(), rollout["next"].copy()
         known = "success" in after.keys()
         if not known and self._success is not None:
@@ -405,13 +463,21 @@ class Teacher:
         outcome = outcome_of(rollout)
         if not known:
             outcome = outcome.exclude("success")
-        for name in ("return", "success") if known else ("return",):
-            as_array(name, outcome[name], tuple(outcome.batch_size))
+        numbers = {
+            name: as_array(name, outcome[name], tuple(outcome.batch_size))
+            for name in (("return", "success") if known else ("return",))
+        }
         for block, which, place in parts:
             rows = torch.from_numpy(which).to(outcome["return"].device)
             batch = block.batch[:, torch.from_numpy(place)]
             self.curriculum.observe(self.student, batch, outcome[:, rows])
-        self._tickets.close(parts)
+        self._ledger.drop(parts)
+        self._tally.told(len(ids), numbers["return"], numbers.get("success"))
+
+    def _check_score(self, told: Mapping[str, Any]) -> None:
+        if self._scored not in (None, "score" in told):
+            how = "missing: other levels were told with one" if self._scored else "others had none"
+            raise ArgumentError(f"score: {how}; give it for all or for none")
 
     def _require_success(self, known: bool, how: str) -> None:
         if "success" in self.reads and not known:
@@ -419,7 +485,7 @@ class Teacher:
 
     def _proposed(self) -> NDArray[np.int64]:
         """The tickets of the one batch that is out."""
-        whole = [block for block in self._tickets.blocks if block.start in self._whole]
+        whole = [block for block in self._ledger.blocks if block.start in self._whole]
         out = [block for block in whole if (block.state == OUT).any()]
         if len(out) != 1:
             how = f"{len(out)} batches are out" if out else "nothing is out"

@@ -110,7 +110,7 @@ def test_tickets_that_are_never_told_keep_their_own_blocks_alone() -> None:
     for _ in range(100):
         ids, levels = teacher.ask(16)
         teacher.tell(ids, levels.double())
-    blocks = teacher._tickets.blocks
+    blocks = teacher._ledger.blocks
     assert len(blocks) <= 3 and blocks[0].start == 0
     teacher.tell(lost[:2], [0.0, 1.0])  # one may still come back
     resumed = prl.Teacher(curriculum, ITEMS, block=16)
@@ -121,7 +121,7 @@ def test_tickets_that_are_never_told_keep_their_own_blocks_alone() -> None:
         with pytest.raises(ArgumentError, match="ids=3: is over"):
             resumed.tell(ticket, 0.0)
     resumed.ask(32)
-    assert all(block.start > 0 for block in resumed._tickets.blocks)
+    assert all(block.start > 0 for block in resumed._ledger.blocks)
     assert {n: total for n, (total, _) in curriculum.seen.items()} == {
         n: float(n) for n in range(1604) if n not in (2, 3)
     }

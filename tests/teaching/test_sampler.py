@@ -78,12 +78,12 @@ def test_what_was_out_may_be_told_after_a_resume_or_dropped() -> None:
     for again in (sampler.tell, lambda items, _: sampler.drop(items)):
         with pytest.raises(ArgumentError, match="items=3: is not out"):
             again([3] * 3, [1.0] * 3)
-    assert len(teacher._tickets.blocks) == 4
+    assert len(teacher._ledger.blocks) == 4
     sampler.drop()
     assert not sampler.state_dict()["out"]
     teacher.propose(1)
     assert curriculum.seen.keys() == {1, 2}
-    assert len(teacher._tickets.blocks) == 1  # that of this proposal
+    assert len(teacher._ledger.blocks) == 1  # that of this proposal
 
 
 def test_numbers_come_from_a_device_all_at_once() -> None:

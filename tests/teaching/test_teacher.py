@@ -115,7 +115,7 @@ def test_it_forgets_what_is_over() -> None:
     for _ in range(200):
         ids, _ = teacher.ask(40)
         teacher.tell(ids, torch.zeros(40), torch.zeros(40))
-    assert len(teacher._tickets.blocks) <= 4
+    assert len(teacher._ledger.blocks) <= 4
 
 
 FREE = {  # of what needs nothing of a learner, settings that are small

@@ -1,0 +1,293 @@
+"""One record of which levels are where: by rising id, each waiting, out, told or over."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+
+from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
+from proposer_rl.curricula.contract import Batch
+from proposer_rl.settings import ArgumentError
+from proposer_rl.task import Levels
+
+Ids = NDArray[np.int64]
+
+WAITING, OUT, TOLD, OVER = range(4)
+"""Proposed; handed out; with a result that has not been observed; observed or dropped."""
+STATES = ("has not been handed out", "", "has been told before", "is over")
+
+
+class Block:
+    """What a curriculum has proposed at once: levels [K, n] whose ids follow one another.
+
+    Attributes:
+        start, end: the first id, and the one after the last.
+        batch: as it was proposed; see :meth:`Ledger.take` for when it is cut down.
+        levels: those that were proposed, [K, n].
+        state: of each level for each student, uint8 [K, n].
+        results: by name, [K, n]; NaN or None where there is none yet.
+    """
+
+    def __init__(self, start: int, batch: Batch, kinds: Mapping[str, type]) -> None:
+        shape = batch.levels.shape[:2]
+        self.start, self.end = start, start + shape[1]
+        self.batch, self.levels = batch, batch.levels
+        self.state = np.full(shape, WAITING, np.uint8)
+        self.results: dict[str, NDArray[Any]] = {
+            name: np.full(shape, None if kind is object else np.nan, kind)
+            for name, kind in kinds.items()
+        }
+        self.places: Ids | None = None  # of the levels that the batch is cut down to
+
+
+class Found(NamedTuple):
+    """Some ids of one block.
+
+    Attributes:
+        block: theirs.
+        which: of the ids that were looked for, int64 [m].
+        place: where these stand in the block, int64 [m].
+    """
+
+    block: Block
+    which: Ids
+    place: Ids
+
+
+class Ledger:
+    """Levels that K students have not done with, in the order in which they were proposed.
+
+    Ids count the levels from 0 on; one id stands for the levels of all K students at a place. What
+    comes back in any order, in parts or never is observed in the order of the ids.
+
+    Args:
+        kinds: types of the results that are noted of a level, by name: ``float`` or ``object``.
+
+    Attributes:
+        next: the id of the next level.
+        blocks: those in which something is not over.
+        told: whether there is a result that :meth:`take` has not given.
+    """
+
+    def __init__(self, kinds: Mapping[str, type]) -> None:
+        self.next, self.told = 0, False
+        self.blocks: list[Block] = []
+        self._kinds = dict(kinds)
+
+    @property
+    def out(self) -> int:
+        """The number of ids that are out."""
+        return sum(int((block.state[0] == OUT).sum()) for block in self.blocks)
+
+    def add(self, batch: Batch) -> Block:
+        """Numbers the levels of a batch, which wait from now on."""
+        block = Block(self.next, batch, self._kinds)
+        self.blocks.append(block)
+        self.next = block.end
+        return block
+
+    def block_of(self, id: int) -> Block | None:
+        """Returns the block of an id; None where all of it is over or there never was one."""
+        number = bisect_right(self.blocks, id, key=attrgetter("start")) - 1
+        block = self.blocks[number] if number >= 0 else None
+        return block if block is not None and id < block.end else None
+
+    def states(self, ids: Ids) -> NDArray[np.uint8]:
+        """Returns the states of ids [n]; of those that there never were, that they wait."""
+        states = np.where((ids >= 0) & (ids < self.next), OVER, WAITING).astype(np.uint8)
+        for block in self.blocks:
+            inside = (ids >= block.start) & (ids < block.end)
+            states[inside] = block.state[0, ids[inside] - block.start]
+        return states
+
+    def find(self, ids: Ids) -> list[Found]:
+        """Returns where ids [n] are, all of which must be out.
+
+        Raises:
+            ArgumentError: for one that is not out, or stands there twice.
+        """
+        starts = np.array([block.start for block in self.blocks])
+        number = starts.searchsorted(ids, "right") - 1
+        parts = []
+        for each in np.unique(number).tolist():
+            which = np.flatnonzero(number == each)
+            if each < 0:
+                self._refuse(int(ids[which[0]]), OVER)
+            block = self.blocks[each]
+            place = ids[which] - block.start
+            # What is between blocks is over.
+            states = np.append(block.state[0], OVER).take(place, mode="clip")
+            wrong = np.flatnonzero(states != OUT)
+            if len(wrong):
+                self._refuse(int(ids[which[wrong[0]]]), states[wrong[0]])
+            parts.append(Found(block, which, place))
+        if len(ids) > 1 and (np.diff(ids) <= 0).any():  # else they rise
+            once, counts = np.unique(ids, return_counts=True)
+            if (counts > 1).any():
+                raise ArgumentError(f"ids={once[counts > 1][0]}: is there more than once")
+        return parts
+
+    def hand_out(self, id: int, student: int) -> Levels:
+        """Returns the level of a student that waits under an id, [], which is out from now on."""
+        block = self.block_of(id)
+        assert block is not None  # which are kept until they are over
+        block.state[student, id - block.start] = OUT
+        return block.levels[student, id - block.start]
+
+    def tell(self, parts: list[Found], results: Mapping[str, NDArray[Any]]) -> None:
+        """Notes results [K, n] of ids [n] that were found."""
+        for block, which, place in parts:
+            for name, result in results.items():
+                block.results[name][:, place] = result[:, which]
+            block.state[:, place] = TOLD
+        self.told = True
+
+    def tell_one(self, id: int, results: Mapping[str, Any], student: int = 0) -> None:
+        """Notes the results of one level of one student.
+
+        Raises:
+            ArgumentError: if it is not out.
+        """
+        block = self.block_of(id)
+        place = 0 if block is None else id - block.start
+        if block is None or block.state[student, place] != OUT:
+            self.find(np.array([id]))  # says what is wrong with it
+        assert block is not None
+        for name, result in results.items():
+            block.results[name][student, place] = result
+        block.state[student, place] = TOLD
+        self.told = True
+
+    def drop(self, parts: list[Found]) -> None:
+        """Notes that nothing more comes of ids that were found."""
+        for block, _, place in parts:
+            block.state[:, place] = OVER
+
+    def is_out(self, id: int, student: int) -> bool:
+        """Returns whether a level of a student is out."""
+        block = self.block_of(id)
+        return block is not None and bool(block.state[student, id - block.start] == OUT)
+
+    def drop_one(self, id: int, student: int) -> None:
+        """Notes that nothing comes of a level of one student, if nothing has."""
+        block = self.block_of(id)
+        if block is not None and block.state[student, id - block.start] <= OUT:
+            block.state[student, id - block.start] = OVER
+
+    def drop_all(self) -> None:
+        """Notes that nothing more comes of any that is out."""
+        for block in self.blocks:
+            block.state[block.state == OUT] = OVER
+
+    def take(self, settled: bool = False) -> Iterator[tuple[Batch, dict[str, NDArray[Any]]]]:
+        """Yields what has been told since the last time, block by block, and forgets what is over.
+
+        Args:
+            settled: whether a block is taken only when none of its levels waits. Its batch is then
+                cut down to those levels that no student has dropped, as if they alone had been
+                proposed.
+
+        Yields:
+            A part of a batch [K, m], and its results [K, m] by name.
+        """
+        for block in self.blocks if self.told or settled else ():
+            state = block.state
+            if settled and (state == WAITING).any():
+                continue
+            if settled and block.places is None:
+                block.places = np.flatnonzero((state != OVER).all(0))
+                kept = torch.from_numpy(block.places).expand(len(state), -1)
+                block.batch = block.batch.keep(kept)
+            ready = np.flatnonzero((state == TOLD).all(0))
+            if not len(ready):
+                continue
+            part = ready if block.places is None else block.places.searchsorted(ready)
+            whole = len(part) == block.batch.count
+            batch = block.batch if whole else block.batch[:, torch.from_numpy(part)]
+            yield batch, {name: result[:, ready] for name, result in block.results.items()}
+            state[:, ready] = OVER
+            for name, kind in self._kinds.items():
+                if kind is object:
+                    block.results[name][:, ready] = None
+        self.told = False
+        self.blocks = [b for b in self.blocks if not _is_over(b)]
+
+    def _refuse(self, id: int, state: int) -> NoReturn:
+        known = 0 <= id < self.next
+        reason = STATES[state] if known else "is no ticket of this teacher"
+        raise ArgumentError(f"ids={id}: {reason}")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all of it, with the levels that are not over."""
+        return {
+            "next": self.next,
+            "told": self.told,
+            "blocks": [
+                {
+                    "start": block.start,
+                    "levels": packed(block.levels),
+                    "notes": packed(block.batch.notes),
+                    "places": None if block.places is None else torch.tensor(block.places),
+                    "state": torch.tensor(block.state),
+                    "results": {name: _saved(result) for name, result in block.results.items()},
+                }
+                for block in self.blocks
+            ],
+        }
+
+    def load_state_dict(
+        self, state: Mapping[str, Any], like: Levels, device: torch.device | None = None
+    ) -> None:
+        """Puts back what :meth:`state_dict` returned.
+
+        Args:
+            state: whose tensors are on the CPU.
+            like: a level of the kind, where levels are to be.
+            device: where results that are tensordicts go.
+        """
+        self.blocks = []
+        for kept in state["blocks"]:
+            levels = moved(of_kind(like, kept["levels"]), device_of(like))
+            places = kept["places"]
+            some = levels if places is None else levels[:, places]
+            notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=some.shape[:2])
+            block = Block(kept["start"], Batch(levels, TensorDict({}, levels.shape[:2])), {})
+            block.batch = Batch(some, notes.clone())
+            block.places = None if places is None else places.numpy()
+            block.state = kept["state"].numpy().copy()
+            block.results = {
+                name: _restored(result, block.state.shape, device)
+                for name, result in kept["results"].items()
+            }
+            self.blocks.append(block)
+        self.next, self.told = state["next"], state["told"]
+
+
+def _is_over(block: Block) -> bool:
+    waits = bool((block.state == WAITING).any())
+    return not waits and bool((block.state == OVER).any(0).all())
+
+
+def _saved(result: NDArray[Any]) -> Any:
+    if result.dtype != object:
+        return torch.tensor(result)
+    entries = np.ndenumerate(result)
+    return [[*place, packed(entry)] for place, entry in entries if entry is not None]
+
+
+def _restored(saved: Any, shape: tuple[int, ...], device: torch.device | None) -> NDArray[Any]:
+    if not isinstance(saved, list):
+        restored: NDArray[Any] = saved.numpy().copy()
+        return restored
+    entries = np.full(shape, None, object)
+    for k, place, entry in saved:
+        episode: TensorDictBase = TensorDict.from_dict(entry, batch_dims=1)
+        entries[k, place] = episode.to(device)
+    return entries

@@ -1,0 +1,125 @@
+"""What a teacher's log says of every curriculum: levels that went out, and what came back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from proposer_rl.task import Levels
+from proposer_rl.teaching.spaces import Items
+from proposer_rl.tasks.parameters import Bins, ParameterSpace
+
+MOST_PARTS = 64  # of a data set, whose items are counted in
+MOST_BINS = 4096  # of a space that only tells coordinates, among which the nearest is searched
+
+
+class Tally:
+    """Counts of one teacher since the last time they were read.
+
+    Args:
+        space: of the levels, or a task.
+    """
+
+    def __init__(self, space: Any) -> None:
+        self._space = space.space
+        self._texts = _bin_texts(self._space)
+        self._clear()
+
+    def count(self, levels: Levels) -> None:
+        """Count levels [K, n] that went out."""
+        self._proposed += levels.shape[1]
+        for name, bins in _bins(self._space, levels).items() if self._texts else ():
+            self._drawn[name] += bins.flatten().bincount(minlength=len(self._texts[name]))
+
+    def told(self, tickets: int, returns: Any, success: Any = None) -> None:
+        """Count what came of so many tickets: numbers or arrays of them."""
+        self._told += tickets
+        for name, values in (("return", returns), ("success", success)):
+            if values is not None:
+                total, number = self._sums.get(name, (0.0, 0))
+                more = getattr(values, "size", 1)
+                added = float(values.sum()) if hasattr(values, "sum") else values
+                self._sums[name] = total + added, number + more
+
+    def dropped(self, tickets: int) -> None:
+        """Count tickets that nothing comes of."""
+        self._dropped += tickets
+
+    def read(self, out: int) -> dict[str, Any]:
+        """What was counted, for JSON; counts begin anew.
+
+        Args:
+            out: levels that are out now.
+        """
+        means = {name: total / number for name, (total, number) in self._sums.items()}
+        found = {
+            "proposed": self._proposed,
+            "told": self._told,
+            "dropped": self._dropped,
+            "out": out,
+            "mean_return": means.get("return"),
+            "mean_success": means.get("success"),
+            "drawn": {
+                name: dict(zip(self._texts[name], counts.tolist(), strict=True))
+                for name, counts in self._drawn.items()
+            },
+        }
+        self._clear()
+        return found
+
+    def _clear(self) -> None:
+        self._proposed = self._told = self._dropped = 0
+        self._sums: dict[str, tuple[float, int]] = {}
+        self._drawn = {
+            name: torch.zeros(len(texts), dtype=torch.int64) for name, texts in self._texts.items()
+        }
+
+
+def _bins(space: Any, levels: Levels) -> dict[str, Tensor]:
+    """The bin of each of levels [*B] along each axis, int64 [*B]."""
+    if isinstance(space, ParameterSpace):
+        return {
+            name: torch.bucketize(levels[name].cpu().double(), (part.high[:-1] + part.low[1:]) / 2)
+            for name, part in space.bins.items()
+        }
+    if isinstance(space, Items):
+        parts = _parts(space)
+        return {"item": (levels["item"].cpu() * parts // space.size).clamp(0, parts - 1)}
+    places, own = space.coordinates.double(), space.locate(levels).cpu().double()
+    nearest = torch.cdist(own.flatten(0, -2), places).argmin(-1)
+    sizes = [len(values) for values in space.axes.values()]
+    return dict(zip(space.axes, torch.unravel_index(nearest, sizes), strict=True))
+
+
+def _bin_texts(space: Any) -> dict[str, list[str]]:
+    """What each bin of each axis is called; empty where levels cannot be told apart by bins."""
+    if isinstance(space, ParameterSpace):
+        labels = getattr(space, "labels", {})
+        return {
+            name: _distinct(part) if labels.get(name) is None else [*map(str, labels[name])]
+            for name, part in space.bins.items()
+        }
+    if isinstance(space, Items):
+        parts = _parts(space)
+        ends = [-(-space.size * part // parts) for part in range(parts + 1)]
+        pairs = [(low, high - 1) for low, high in zip(ends, ends[1:], strict=False)]
+        return {"item": [f"{a}" if a == b else f"{a} to {b}" for a, b in pairs]}
+    if not hasattr(type(space), "locate") or space.size > MOST_BINS:
+        return {}
+    return {name: [f"{value:g}" for value in values] for name, values in space.axes.items()}
+
+
+def _distinct(part: Bins) -> list[str]:
+    """Texts of bins, in as many digits as tell them apart."""
+    ends = [*zip(part.low.tolist(), part.high.tolist(), strict=True)]
+    for digits in (4, 17):
+        texts = [f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}" for a, b in ends]
+        if len({*texts}) == len(texts):
+            break
+    return texts
+
+
+def _parts(space: Items) -> int:
+    return min(space.size, MOST_PARTS)
