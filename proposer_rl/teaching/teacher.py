@@ -328,10 +328,10 @@ class Teacher:
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
-            for what, now in self._of.items():
-                require_same(what, state["of"][what], now)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
+            for what, now in self._of.items():
+                require_same(what, state["of"][what], now)
             self.curriculum.load_state_dict(state["curriculum"])
             self._tickets.load_state_dict(state["tickets"], self._like)
             self._proposals, self._at = state["proposals"], state["at"]
