@@ -54,7 +54,7 @@ class Recipe:
         return [f"{group}={self.name}", *given]
 
     def by_key(self) -> dict[str, dict[str, Any]]:
-        """The settings by the key that they stand below: the first below which the file has them."""
+        """The settings by the keys that they stand below, the first that the file has them at."""
         known = {self._key: {}} if self.target else _by_key(self.group, self.name)
         found: dict[str, dict[str, Any]] = {}
         for name, value in self.settings.items():

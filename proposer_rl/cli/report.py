@@ -63,7 +63,10 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "folder", nargs="+", type=Path, help="a run's folder, or one with runs in it at any depth; or logs of teachers"
+        "folder",
+        nargs="+",
+        type=Path,
+        help="a run's folder, or one with runs in it at any depth; or logs of teachers",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"

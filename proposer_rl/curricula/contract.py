@@ -337,8 +337,8 @@ def _warn_of_nothing(kind: type[Curriculum]) -> None:
     )
     if kind.observe is not Curriculum.observe and not said:
         warnings.warn(
-            f"{kind.__name__} observes, but a resumed run begins anew: name the attributes that are "
-            "to be saved, remembers = (...), or () for none",
+            f"{kind.__name__} observes, but a resumed run begins anew: name the attributes to be "
+            "saved, remembers = (...), or () for none",
             stacklevel=3,
         )
 

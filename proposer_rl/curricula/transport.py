@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOST_BINS = 4096
-# Of a program, for steps of about ten seconds: 250 items in a row take as long as a grid of 8³ bins.
+# Of a program, for steps of about ten seconds: 250 items in a row take as long as 8³ bins.
 MOST_IN_A_ROW, MOST_OF_A_GRID = 256, 512
 NOTHING = 1e-6  # a share that is rounding of the solver's
 SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself

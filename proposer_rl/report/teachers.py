@@ -91,7 +91,7 @@ def read_log(file: Path) -> Log:
         entries = {
             name: np.array([_mean(row.get(name)) for row in rows])
             for name in names
-            if name != "drawn"
+            if name not in ("drawn", "histogram")  # the curriculum's own count of the former
         }
         drawn = {}
         for name in rows[0]["drawn"]:
@@ -127,7 +127,7 @@ def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
                 Drawing(
                     "drawn",
                     f"Levels that were proposed: {label}",
-                    "Shares of the bins of each parameter, from line to line; the darker, the more.",
+                    "Shares of the bins of each parameter, line by line; the darker, the more.",
                     maps[:MOST_PANELS],
                     3,
                 )

@@ -8,5 +8,6 @@ from proposer_rl.teaching.spaces import Items as Items
 from proposer_rl.teaching.spaces import LevelGenerator as LevelGenerator
 from proposer_rl.teaching.spaces import LevelSpace as LevelSpace
 from proposer_rl.teaching.spaces import Parameters as Parameters
+from proposer_rl.teaching.structured import MadeLevels as MadeLevels
 from proposer_rl.teaching.teacher import Teacher as Teacher
 from proposer_rl.teaching.torchrl import LevelTransform as LevelTransform

@@ -26,6 +26,8 @@ class TeacherCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         for name, value in self._teacher.log().items():
+            if isinstance(value, dict):  # by names of its own, as what was drawn
+                continue
             leaves = tree_leaves(value, is_leaf=lambda entry: not isinstance(entry, list))
             numbers = [float(entry) for entry in leaves if isinstance(entry, Real)]
             if numbers:

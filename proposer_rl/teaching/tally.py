@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from proposer_rl.task import Levels
-from proposer_rl.teaching.spaces import Items
 from proposer_rl.tasks.parameters import Bins, ParameterSpace
+from proposer_rl.teaching.spaces import Items
 
 MOST_PARTS = 64  # of a data set, whose items are counted in
 MOST_BINS = 4096  # of a space that only tells coordinates, among which the nearest is searched
@@ -104,7 +105,7 @@ def _bin_texts(space: Any) -> dict[str, list[str]]:
     if isinstance(space, Items):
         parts = _parts(space)
         ends = [-(-space.size * part // parts) for part in range(parts + 1)]
-        pairs = [(low, high - 1) for low, high in zip(ends, ends[1:], strict=False)]
+        pairs = [(low, high - 1) for low, high in pairwise(ends)]
         return {"item": [f"{a}" if a == b else f"{a} to {b}" for a, b in pairs]}
     if not hasattr(type(space), "locate") or space.size > MOST_BINS:
         return {}
@@ -115,7 +116,9 @@ def _distinct(part: Bins) -> list[str]:
     """Texts of bins, in as many digits as tell them apart."""
     ends = [*zip(part.low.tolist(), part.high.tolist(), strict=True)]
     for digits in (4, 17):
-        texts = [f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}" for a, b in ends]
+        texts = [
+            f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}" for a, b in ends
+        ]
         if len({*texts}) == len(texts):
             break
     return texts

@@ -333,10 +333,10 @@ class Teacher:
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
-            for what, now in self._of.items():
-                require_same(what, state["of"][what], now)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
+            for what, now in self._of.items():
+                require_same(what, state["of"][what], now)
             self.curriculum.load_state_dict(state["curriculum"])
             self._ledger.load_state_dict(state["ledger"], self._like)
             self._scored = state["scored"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -238,6 +239,29 @@ def test_levels_are_observed_once() -> None:
 def test_a_batch_has_a_note_for_each_level() -> None:
     with pytest.raises(ValueError, match="must have one shape"):
         Batch(torch.zeros(2, 3), TensorDict({}, [2, 4]))
+    assert Batch(torch.zeros(2, 3, 7)).notes.batch_size == (2, 3)
+
+
+def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
+    def observe(self: Any, student: Any, batch: Batch, outcome: TensorDictBase) -> None: ...
+
+    def kinds(**more: Any) -> list[type[Curriculum]]:
+        own = type("Own", (Curriculum,), {"observe": observe, **more})
+        return [own, type("Child", (own,), {})]
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for kind in (
+            *kinds(remembers=()),
+            *kinds(remembers=("needs",)),
+            *kinds(state_dict=lambda self: {}),
+            curricula.SamplingCurriculum,
+        ):
+            kind.__new__(kind).state_dict()
+        assert not said
+        for kind in kinds():
+            kind().state_dict(), kind().state_dict()
+    assert [str(one.message).partition(" ")[0] for one in said] == ["Own", "Child"]
 
 
 def test_an_inbox_hands_out_in_order_and_waits_for_what_is_incomplete() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,11 +11,13 @@ from typing import Any
 import pytest
 import torch
 
+from proposer_rl import curricula as recipes
 from proposer_rl.cli.build import build, parts
 from proposer_rl.curricula import Filtered, Modelled, SamplingCurriculum, Scorer, Student
 from proposer_rl.curricula.outcome_model import OutcomeModel
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.signals import StopSignals
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import space_features
 from proposer_rl.tasks.mazes.task import MazeTask
@@ -220,3 +224,35 @@ def test_a_maze_without_a_way_is_no_easy_one() -> None:
     level = TASK.space.generate(torch.tensor([[0]]), [Streams(0).generator()])[0, 0]
     level.walls[:] = True
     assert TASK.space.locate(level)[1] > 1
+
+
+LINE = Parameters({"x": (0.0, 1.0)}, bins=4)
+Q = torch.rand(160, generator=torch.Generator().manual_seed(0)) + 0.1
+LITTLE: dict[str, tuple[dict[str, Any], Any, Any, str | None]] = {
+    "dense": ({}, Q, None, "100%|99% of the first returns are that, so that the labels say nearly"),
+    "dense, told": ({}, Q, Q < 0.5, "not the success that was told, which labels=success reads"),
+    "read": ({"labels": "success"}, Q, Q < 0.5, None),
+    "alike": ({}, (Q < 0.5).float(), Q < 0.5, None),
+    "sparse": ({}, (Q < 0.5).float(), None, None),
+    "nearly all succeed": ({}, (Q > 0.13).float(), Q > 0.13, None),
+}
+
+
+@pytest.mark.parametrize("what", LITTLE)
+def test_labels_that_say_little_are_warned_of_once(what: str) -> None:
+    settings, returns, success, message = LITTLE[what]
+    curriculum = Modelled(SamplingCurriculum(LINE), LINE.features, **settings)
+    teacher = Teacher(curriculum, LINE)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(3):
+            ids, _ = teacher.ask(160)
+            teacher.tell(ids, returns, success)
+            teacher.propose(1)
+    assert len(said) == (message is not None)
+    assert message is None or re.search(message, str(said[0].message))
+
+
+def test_a_recipe_is_no_curriculum_that_something_is_made_of() -> None:
+    with pytest.raises(ArgumentError, match=r"curriculum=Recipe.*plr.*: must be a Curriculum"):
+        Modelled(recipes.plr(), LINE.features)  # type: ignore[arg-type]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import copy
 import io
+import json
 import pickle
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from hypothesis import given
 from hypothesis import settings as profile
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch.utils._pytree import tree_leaves
 
 import proposer_rl as prl
 from proposer_rl.curricula import Batch, Curriculum
@@ -44,6 +47,7 @@ class Spy(Curriculum):
     """Levels that are numbered, and all that is observed of them."""
 
     reads = ("success",)
+    remembers = ()
 
     def __init__(self) -> None:
         self.seen: dict[int, tuple[float, float]] = {}
@@ -179,10 +183,180 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
         assert same(plain(one), plain(other))
     assert same(whole.state_dict(), parts.state_dict())
     assert whole.log().keys() == parts.log().keys()
+    leaves = tree_leaves(whole.state_dict())  # which checkpoints of any library hold
+    assert {type(leaf) for leaf in leaves} <= {torch.Tensor, int, float, str, bool, type(None)}
 
 
 def plain(levels: Any) -> Any:
     return levels.to_dict() if hasattr(levels, "to_dict") else levels
+
+
+def ranges(**given: Any) -> prl.Parameters:
+    return prl.Parameters({"slope": (0.0, 8.0)}, **given)
+
+
+def drawn(shape: int) -> prl.LevelGenerator:
+    return prl.LevelGenerator(lambda n, g: torch.rand(n, shape, generator=g))
+
+
+OTHERS: dict[str, tuple[Any, Any, str]] = {
+    "a parameter more": (
+        ranges(),
+        prl.Parameters({"slope": (0.0, 8.0), "wind": range(9)}, bins=4),
+        "ranges.wind was missing, is 0 to 8, whole",
+    ),
+    "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was 0 to 8, is mis"),
+    "smaller": (
+        ranges(),
+        prl.Parameters({"slope": (0.0, 1.0)}),
+        "ranges.slope was 0 to 8, is 0 to 1",
+    ),
+    "a little smaller": (
+        ranges(),
+        prl.Parameters({"slope": (0.0, 7.9999999)}),
+        "is 0 to 7.9999999",
+    ),
+    "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
+    "other features": (
+        ITEMS,
+        prl.Items(100, features=torch.arange(200.0).view(100, 2) % 7),
+        "feat",
+    ),
+    "another target": (
+        prl.Items(9, target=[1]),
+        prl.Items(9, target=[2]),
+        r"target was \[1\], is \[2\]",
+    ),
+    "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
+    "another name": (
+        ranges(named={"easy": {"slope": 1}}),
+        ranges(named={"easy": {"slope": 2}}),
+        "named.easy.slope was .1",
+    ),
+    "another kind": (ITEMS, ranges(), "kind was Items, is Parameters$"),
+    "another order": (
+        prl.Parameters({"ground": ["flat", "stairs", "gap"]}),
+        prl.Parameters({"ground": ["gap", "flat", "stairs"]}),
+        r"ranges.ground was \['flat', 'stairs', 'gap'\], is \['gap', 'flat', 'stairs'\]",
+    ),
+    "whole": (
+        prl.Parameters({"n": range(11)}),
+        prl.Parameters({"n": (0, 10)}),
+        "0 to 10, whole, is 0",
+    ),
+    "other bins": (ranges(), ranges(bins=4), "bins.slope was 8, is 4"),
+    "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
+    "a shape": (
+        drawn(3),
+        drawn(4),
+        r"levels.level was torch.float32 \[3\], is torch.float32 \[4\]",
+    ),
+    "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
+}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+def test_a_state_of_another_space_is_refused_and_changes_nothing(what: str) -> None:
+    before, now, message = OTHERS[what]
+    state = prl.Teacher("plr", before, block=8)
+    state.ask(12)
+    teacher = prl.Teacher("plr", now, block=8)
+    teacher.ask(3)
+    kept = copy.deepcopy(teacher.state_dict())
+    with pytest.raises(ArgumentError, match=f"^state: of another space: .*{message}") as refused:
+        teacher.load_state_dict(state.state_dict())
+    assert "\n" not in str(refused.value) and same(kept, teacher.state_dict())
+    own = prl.Teacher("plr", now, block=8)
+    own.load_state_dict({**kept, "of": json.loads(json.dumps(kept["of"]))})
+    assert same(kept, own.state_dict())
+
+
+C = prl.curricula
+MODEL: Any = {"labels": "success"}
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "message"),
+    [
+        (C.plr(capacity=20), C.plr(capacity=40), "capacity was 20, is 40"),
+        (C.plr(), C.domain_randomization(), "kind was plr, is domain_randomization$"),
+        (
+            C.model_transport(),
+            C.model_transport(**MODEL),
+            "model.labels was above_worst, is success",
+        ),
+        (Spy(), C.plr(), "kind was Spy, is plr$"),
+    ],
+)
+def test_a_state_of_another_setting_is_refused(before: Any, now: Any, message: str) -> None:
+    state = prl.Teacher(before, SPACE).state_dict()
+    with pytest.raises(ArgumentError, match=f"^state: of another curriculum: {message}"):
+        prl.Teacher(now, SPACE).load_state_dict(state)
+    prl.Teacher("plr", SPACE).load_state_dict(prl.Teacher(C.plr(), SPACE).state_dict())
+
+
+LOGGED = ["proposed", "told", "dropped", "out", "mean_return", "mean_success", "drawn"]
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", ["domain_randomization", "plr"])
+def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_path: Path) -> None:
+    """Against counts of the levels themselves; and what a loop does without it, it does with it."""
+    teacher, silent = (prl.Teacher(name, SPACES[space](), block=8) for _ in range(2))
+    file, levels = tmp_path / "log.jsonl", []
+    for some in (teacher, silent):
+        ids, asked = some.ask(11)
+        ticket, _ = some.ask()
+        some.tell(ticket, 3.0)
+        some.tell(ids[:4], torch.arange(4.0), [1, 1, 0, 1])
+        some.drop(ids[4:6])
+        levels = [asked, some.propose(5)]
+        some.observe({"return": [1.0] * 5})
+        if some is teacher:
+            log = some.log(file)
+            assert [*log][-7:] == LOGGED
+    counted = {key: log[key] for key in LOGGED[:6]}
+    assert counted == {
+        **{"proposed": 17, "told": 10, "dropped": 2, "out": 5},
+        **{"mean_return": pytest.approx(1.4), "mean_success": 0.75},
+    }
+    assert all(sum(bins.values()) == 17 for bins in log["drawn"].values())
+    if space == "ranges":
+        gravity = np.concatenate([np.asarray(some["gravity"]) for some in levels])
+        bins = np.array(list(log["drawn"]["gravity"].values()))
+        rest = bins - np.histogram(gravity, [5, 10, 15, 20, 25])[0]
+        assert next(iter(log["drawn"]["gravity"])) == "5 to 10" and sorted(rest) == [0, 0, 0, 1]
+        assert list(log["drawn"]["ground"]) == ["flat", "stairs"]
+    empty = teacher.log(file)
+    assert (empty["proposed"], empty["mean_return"], empty["out"]) == (0, None, 5)
+    written = [json.loads(line) for line in file.read_text().splitlines()]
+    assert written == [{k: v for k, v in one.items() if k != "levels"} for one in (log, empty)]
+    assert same(plain(teacher.ask(20)[1]), plain(silent.ask(20)[1]))
+
+
+def hills(values: Any, generator: torch.Generator) -> torch.Tensor:
+    noise = torch.rand(len(values), 1, generator=generator, dtype=torch.float64)
+    return values["slope"].unsqueeze(-1) * torch.arange(3) + noise
+
+
+def test_made_levels_have_bins_a_target_and_edits() -> None:
+    space = prl.MadeLevels({"slope": (0.0, 8.0)}, hills, bins=4, target={"slope": (6.0, 8.0)})
+    assert space.target_shares.tolist() == [0, 0, 0, 1]
+    steep = prl.Teacher("target", space).propose(64)
+    assert steep.shape == (64, 3) and float((steep[:, 1] - steep[:, 0]).min()) >= 6
+    _, level = prl.Teacher("plr", space).ask()
+    assert level.shape == (3,)
+    g = [torch.Generator()]
+    old = space.generate(torch.tensor([[0, 3]]), g)
+    new = space.edit(old, 3, g)
+    for one in (old, new, space.at(torch.tensor([[[0.5], [-1.0]]]), g)):
+        torch.testing.assert_close(one["level"][..., 2] - one["level"][..., 1], one["slope"])
+    assert (old["slope"] != new["slope"]).all()
+    few = prl.MadeLevels({"slope": (0.0, 8.0)}, lambda values, g: torch.zeros(1))
+    with pytest.raises(ArgumentError, match=r"make=\[1\]: must give 384 levels"):
+        prl.Teacher("plr", few).ask()
+    model = prl.MadeLevels({"slope": (0.0, 8.0)}, hills, features=lambda levels: levels[..., :1])
+    assert model.features(old).shape == (1, 2, 1)
 
 
 def test_all_that_need_nothing_are_here() -> None:
@@ -316,7 +490,7 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     ),
     "a state of another curriculum": (
         lambda t: t.load_state_dict(prl.Teacher("plr", SPACE).state_dict()),
-        "state: of another curriculum, by its '\\w+'",
+        "state: of another curriculum: kind was plr, is ",
     ),
     "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7: must be from 0 to 1"),
     "too few": (
@@ -505,6 +679,31 @@ def test_filtering_works_on_spaces() -> None:
         prl.Teacher("target", SPACE, filter="hard")
     with pytest.raises(ArgumentError, match="times=1"):
         prl.Teacher("target", SPACE, filter={"times": 1})
+
+
+def test_a_model_reads_success_where_it_is_asked_to() -> None:
+    """The same settings by a recipe and by a filter, as below the key ``model`` of a run."""
+    recipe = prl.curricula.model_transport(labels="success", half_life=5, probes=1)
+    model = {"labels": "success", "ridge": 0.3, "half_life": 5}
+    around: dict[str, Any] = {"labels": "success", "half_life": 5, "times": 3}
+    for teacher in (
+        prl.Teacher(recipe, SPACE),
+        prl.Teacher("plr", SPACE, filter=around),
+        prl.Teacher("model_transport", SPACE, filter=around),
+    ):
+        assert (
+            teacher.reads == ("success",)
+            and teacher.state_dict()["of"]["curriculum"]["model"] == model
+        )
+    assert recipe.overrides()[1:] == [
+        *("++model.labels='success'", "++model.half_life=5", "++curriculum.probes=1"),
+    ]
+    for wrong, message in (
+        ({"labels": "much"}, "labels='much': input should be"),
+        ({"lables": "success"}, "lables: unknown; there are: .*labels"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            prl.Teacher(prl.curricula.model_transport(**wrong), SPACE)
 
 
 def test_recipes_of_ones_own_and_their_settings() -> None:

@@ -1,0 +1,104 @@
+"""Levels of any structure that a function makes of named parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.settings import ArgumentError
+from proposer_rl.task import Levels
+from proposer_rl.tasks.parameters import ParameterSpace
+from proposer_rl.teaching.spaces import DRAWN, LevelSpace, Parameters, Ranges
+
+Make = Callable[[TensorDictBase, torch.Generator], Any]
+
+
+class MadeLevels(Parameters):
+    """Levels that a function makes of parameters, such as terrains of a slope and a roughness.
+
+    The parameters are what curricula tell levels apart by: their bins, the target, and small edits,
+    after which the level is made anew. What a loop gets is the level alone.
+
+    Args:
+        ranges: of each parameter, by name; see :class:`Parameters`.
+        make: ``make(values, generator)`` gives levels [n] of a tensordict of values [n]: a tensor
+            or a tensordict.
+        features: ``features(levels)`` gives what a model of outcomes knows of levels [*B], float
+            [*B, F], each about -1 to 1; None for the parameters alone.
+        bins, target, named: as of :class:`Parameters`.
+
+    Raises:
+        ArgumentError: as :class:`Parameters`; if levels are no such thing, or not as many as asked.
+
+    Example:
+        >>> def rows(values, generator):
+        ...     x = torch.linspace(0, 1, 5).double()
+        ...     return values["slope"].unsqueeze(-1) * x + torch.rand(len(values), 5)
+        >>> space = MadeLevels({"slope": (0.0, 8.0)}, rows, target={"slope": 8.0})
+        >>> space.size, space.given(space.sample(3, torch.Generator())).shape
+        (8, torch.Size([3, 5]))
+    """
+
+    def __init__(
+        self,
+        ranges: Ranges,
+        make: Make,
+        *,
+        features: Callable[[Any], Tensor] | None = None,
+        bins: int | Mapping[str, int] = 8,
+        target: Ranges | None = None,
+        named: Mapping[str, Ranges] | None = None,
+    ) -> None:
+        super().__init__(ranges, bins=bins, target=target, named=named)
+        self._make, self._features = make, features
+        parts = {name: _Made(part, self) for name, part in self._parts.items()}
+        self.distributions = {"all": self, **parts}
+
+    def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
+        """Levels [n] of the values of the parameters [n], beside these."""
+        kept = values.select(*self.bins)
+        levels = self._make(kept.clone(), generator)
+        if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (len(kept),):
+            shape = list(getattr(levels, "shape", ())) or type(levels).__name__
+            raise ArgumentError(f"make={shape}: must give {len(kept)} levels, [{len(kept)}, ...]")
+        return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
+
+    def features(self, levels: Levels) -> Tensor:
+        """What a model of outcomes knows of levels: float [*B, F]."""
+        if self._features is None:
+            return super().features(levels)
+        return self._features(self.given(levels))
+
+    def given(self, levels: TensorDictBase) -> Any:
+        """Levels [*B] as the function made them."""
+        return levels[DRAWN]
+
+    def rows(self, levels: TensorDictBase) -> list[Any]:
+        """Levels [n] one by one."""
+        return LevelSpace.rows(self, levels)
+
+    def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        """Levels [K, P] at points of the box that the ranges span."""
+        values = zip(super().at(points, generators), generators, strict=True)
+        return torch.stack([self.made(own, g) for own, g in values])
+
+    def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
+        return self.made(super()._draw(choices, generator), generator)
+
+    def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
+        return self.made(super()._edited(levels, count, generator), generator)
+
+
+class _Made(ParameterSpace):
+    """A part of a space of made levels."""
+
+    def __init__(self, bins: Any, whole: MadeLevels) -> None:
+        super().__init__(bins, seeded=False)
+        self._whole = whole
+
+    def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
+        return self._whole.made(super()._draw(choices, generator), generator)
