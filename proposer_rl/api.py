@@ -39,7 +39,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import Recipe, filter_content, override_value, recipe_function
+from proposer_rl.recipes import Recipe, filter_content, override, recipe_function
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -223,10 +223,9 @@ def train(
     if isinstance(filter, str):
         overrides.append(f"+filter={filter}")
     given = {**(filter_content(filter) if isinstance(filter, Mapping) else {}), **(settings or {})}
-    overrides += [f"++{name}={override_value(value)}" for name, value in given.items()]
-    overrides.append(f"seed={override_value(seed)}")
-    overrides.append(f"compute.progress={override_value(progress)}")
+    overrides += [override(f"++{name}", value) for name, value in given.items()]
+    overrides += [override("seed", seed), override("compute.progress", progress)]
     if updates is not None:
-        overrides.append(f"schedule.updates={override_value(updates)}")
+        overrides.append(override("schedule.updates", updates))
     own = {**task.own(), **curriculum.own()}
     return Run(compose_and_run(overrides, own, None if folder is None else Path(folder)))

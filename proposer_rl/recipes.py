@@ -47,7 +47,7 @@ class Recipe:
             return ["~task"] if self.group == "task" else []
         group = "task" if self.group == "task" else "+method"
         given = [
-            f"++{key}.{name}={override_value(value)}"
+            override(f"++{key}.{name}", value)
             for key, settings in self.by_key().items()
             for name, value in settings.items()
         ]
@@ -67,7 +67,9 @@ class Recipe:
         if self.target is None:
             return {}
         named = {"method": self.name} if self.group == "method" else {}
-        return {**named, self._key: {"_target_": self.target, **self.settings}}
+        from proposer_rl.settings import plain  # which help does without
+
+        return {**named, self._key: {"_target_": self.target, **plain(self.settings)}}
 
     @property
     def _key(self) -> str:
@@ -166,8 +168,20 @@ def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
     return {key: content.get(key) or {} for key in KEYS[group]}
 
 
+def override(key: str, value: Any) -> str:
+    """A key and its value as an override of Hydra's.
+
+    Raises:
+        ArgumentError: naming the key, as :func:`override_value`.
+    """
+    try:
+        return f"{key}={override_value(value)}"
+    except ValueError as error:
+        raise _refusal(f"{key.lstrip('+')}={error}") from error
+
+
 def override_value(value: Any) -> str:
-    r"""A value of Python's as Hydra's grammar of overrides takes it.
+    r"""A value of Python's, NumPy's or OmegaConf's as Hydra's grammar of overrides takes it.
 
     Raises:
         ArgumentError: if it is neither a number, a text, a list nor a mapping of such.
@@ -176,6 +190,9 @@ def override_value(value: Any) -> str:
         >>> override_value({"a": [1, None, True], "b": "it's"})
         "{a: [1, null, true], b: 'it\\'s'}"
     """
+    from proposer_rl.settings import plain, shown  # which help does without
+
+    value = plain(value)
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, int | float):
@@ -188,7 +205,7 @@ def override_value(value: Any) -> str:
         return "{" + ", ".join(f"{_key(k)}: {override_value(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(override_value, value)) + "]"
-    raise _refusal(f"{value!r}: must be a number, a text, a list or a mapping of such")
+    raise _refusal(f"{shown(value)}: must be a number, a text, a list or a mapping of such")
 
 
 def _key(key: Any) -> str:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from operator import index
 from typing import (
     Annotated,
     Any,
@@ -108,8 +109,9 @@ def arguments(
     """Check arguments against the signature of what will be called with them.
 
     Numbers are read strictly (true is no number, "3" is none, 1.0 no integer), infinity and NaN are
-    refused, a list may stand for a tuple and a mapping for settings. An argument whose type says
-    nothing that could be checked, such as a task, is passed on as it is.
+    refused, a list may stand for a tuple and a mapping for settings. Other libraries' numbers,
+    arrays, lists and mappings are read as Python's own; see :func:`plain`. An argument whose type
+    says nothing that could be checked, such as a task or a tensor, is passed on as it is.
 
     Args:
         function: a class or function.
@@ -178,7 +180,9 @@ def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None
 
 
 def _adapter(hint: Any) -> TypeAdapter[Any] | None:
-    """What reads values of a type; None for one that pydantic knows nothing of, as a task."""
+    """What reads values of a type; None for any, or one that pydantic knows nothing of."""
+    if hint in (Any, object):
+        return None
     for config in (ConfigDict(allow_inf_nan=False), None):  # a dataclass has its own
         try:
             return TypeAdapter(hint, config=config)
@@ -187,9 +191,52 @@ def _adapter(hint: Any) -> TypeAdapter[Any] | None:
     return None
 
 
+def plain(value: Any) -> Any:
+    """Returns a value of NumPy's, torch's, pandas' or OmegaConf's as Python's own.
+
+    Numbers, texts and truth values become Python's, arrays, series and ranges lists, mappings
+    dicts, and so does what is in them. A tuple stays one, and so does whatever else there is.
+
+    Example:
+        >>> import numpy as np
+        >>> plain({"rate": np.float32(0.5), "bins": np.arange(3, 6), "walls": (np.int64(1), 2)})
+        {'rate': 0.5, 'bins': [3, 4, 5], 'walls': (1, 2)}
+    """
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, Mapping):
+        return {plain(name): plain(entry) for name, entry in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(plain, value))
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [*map(plain, value)]
+    return value
+
+
+def shown(value: Any) -> str:
+    """Returns a value as errors show it: in one line of at most 80 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def whole(name: str, value: Any, least: int | None = None) -> int:
+    """Returns a whole number, of whichever library, as Python's own.
+
+    Raises:
+        ArgumentError: naming it, if it is none, or smaller than the least.
+    """
+    allowed = "must be a whole number" + ("" if least is None else f", at least {least}")
+    try:
+        number = None if isinstance(value, bool) else index(value)
+    except TypeError:
+        number = None
+    if number is None or (least is not None and number < least):
+        raise ArgumentError(f"{name}={shown(plain(value))}: {allowed}")
+    return number
+
+
 def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
     try:
-        text = json.dumps(value)
+        text = json.dumps(value, default=plain)
     except (TypeError, ValueError, RecursionError):
         text = None
     try:
@@ -216,9 +263,7 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
         return f"{key}: unknown" + (f"; there are: {known}" if known else "")
     if details["type"] == "missing":
         return f"{key}: missing"
-    given = repr(details["input"])
-    given = given if len(given) <= 80 else f"{given[:77]}..."
-    return f"{key}={given}: {message}"
+    return f"{key}={shown(details['input'])}: {message}"
 
 
 def _place(details: Any, value: Any) -> tuple[list[int | str], Any]:

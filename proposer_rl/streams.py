@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import index
 
 import torch
 
@@ -29,8 +30,8 @@ class Streams:
     """
 
     def __init__(self, seed: int, *scope: str | int) -> None:
-        self._seed = seed
-        self._scope = scope
+        self._seed = index(seed)
+        self._scope = [*map(_own, scope)]
 
     @property
     def address(self) -> list[str | int]:
@@ -60,6 +61,11 @@ class Streams:
             yield
 
     def _seed_of(self, *key: str | int) -> int:
-        address = repr((self._seed, *self._scope, *key)).encode()
+        address = repr((self._seed, *self._scope, *map(_own, key))).encode()
         # 63 bits: the range that torch accepts on every device.
         return int.from_bytes(hashlib.blake2b(address, digest_size=8).digest(), "little") >> 1
+
+
+def _own(key: str | int) -> str | int:
+    """A key as Python's own, which has another representation than NumPy's."""
+    return str(key) if isinstance(key, str) else index(key)

@@ -6,9 +6,13 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from annotated_types import Interval
+from omegaconf import OmegaConf
+from torch import Tensor
 
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.meta.settings import ProposerSettings
@@ -34,6 +38,8 @@ def make(
     reward: Callable[..., Any] | None = None,
     solver: SolverSettings | None = None,
     flag: bool = False,
+    weights: Tensor | None = None,
+    anything: Any = None,
 ) -> dict[str, Any]:
     """Give back what was read."""
     return dict(locals())
@@ -67,6 +73,14 @@ WRONG = [
     ("solver", {"size": 1, "ppo": {}}, "solver.size: unknown; there are: ppo"),
     ("solver", 3, "solver=3: input should be"),
     ("flag", 1, "flag=1: input should be a valid boolean"),
+    ("flag", np.int64(1), "flag=1: input should be a valid boolean"),
+    ("every", np.bool_(True), "every=True: input should be a valid integer"),
+    ("every", np.float64(1), "every=1.0: input should be a valid integer"),
+    ("every", np.array([1]), "every=[1]: input should be a valid integer"),
+    ("step", np.float32("inf"), "step=inf: input should be a finite number"),
+    ("names", np.array(["id", 3], dtype=object), "names.1=3: input should be a valid string"),
+    ("bins", OmegaConf.create({"a": [1, "b"]}), "bins.a.1='b': input should be a valid number"),
+    ("names", pd.DataFrame({"id": [1]}), "names=id 0 1: input should be an instance of Sequence"),
     ("temperature", 1, "temperature: unknown; there are: task, every, share, step, source"),
 ]
 
@@ -91,6 +105,43 @@ def test_values_come_as_the_signature_has_them() -> None:
     assert read["names"] == given and read["names"] is not given
     assert read["solver"] == SolverSettings(batch_size=4)
     assert arguments(make, {"share": 1}, given=["task"]) == {"share": 1.0}
+
+
+FOREIGN = [
+    ("every", np.int64(3), 3),
+    ("every", np.array(3, dtype=np.uint8), 3),
+    ("every", torch.tensor(3), 3),
+    ("share", np.float32(0.1), float(np.float32(0.1))),
+    ("share", np.float64(0.1), 0.1),
+    ("step", np.int32(2), 2.0),
+    ("source", np.str_("episodes"), "episodes"),
+    ("names", np.array(["id", "level"]), ["id", "level"]),
+    ("names", pd.Series(["id", "level"]), ["id", "level"]),
+    ("names", OmegaConf.create(["id", "level"]), ["id", "level"]),
+    ("shape", torch.arange(2), (0, 1)),
+    ("shape", range(2), (0, 1)),
+    ("bins", OmegaConf.create({"a": [1, 2.5]}), {"a": [1.0, 2.5]}),
+    ("bins", {"a": (np.float32(0.5), torch.tensor(1))}, {"a": [0.5, 1.0]}),
+    ("goal", np.arange(2, 4), [2, 3]),
+    ("goal", [np.int64(2), np.float64(2.5)], [2, 2.5]),
+    ("solver", OmegaConf.create({"batch_size": 4}), SolverSettings(batch_size=4)),
+    ("flag", np.bool_(True), True),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "own"), FOREIGN, ids=[str(row) for row in FOREIGN])
+def test_numbers_and_lists_of_other_libraries_are_read_as_pythons(
+    name: str, value: Any, own: Any
+) -> None:
+    read = make(object(), **{name: value})[name]
+    assert read == own and repr(read) == repr(own)
+
+
+def test_what_nothing_is_said_of_is_passed_on_as_it_is() -> None:
+    tensor, array, pair = torch.ones(2), np.ones(2), (1, 2)
+    read = make(object(), weights=tensor, anything=array)
+    assert read["weights"] is tensor and read["anything"] is array
+    assert make(object(), anything=pair)["anything"] is pair
 
 
 def test_a_missing_argument_is_named() -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
@@ -155,7 +158,7 @@ def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.Mon
     run = prl.train(task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False)
     assert "target_success" in run.metrics
     assert type(run.task()).__name__ == "SledgeTask"
-    curriculum = prl.curricula.own(again, probability=0.5)
+    curriculum = prl.curricula.own(again, probability=np.float32(0.5))
     run = prl.train("maze", curriculum, updates=2, folder=tmp_path / "2", **SMOKE)
     assert run.summary["method"] == "again"
 
@@ -174,7 +177,13 @@ def test_what_cannot_be_imported_again_is_refused() -> None:
         ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),
         ("plr", {"settings": {"slover": {}}}, "slover: unknown; there are: method"),
         ("plr", {"filter": {"times": 1}}, "filter.times=1"),
-        ("plr", {"settings": {"seed": object()}}, "must be a number, a text, a list or a mapping"),
+        ("plr", {"settings": {"seed": object()}}, "seed=<object object at"),
+        ("plr", {"updates": {1}}, "schedule.updates={1}: must be a number, a text, a list or a ma"),
+        (
+            "plr",
+            {"updates": np.float64(1)},
+            "schedule.updates=1.0: input should be a valid integer",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
@@ -222,3 +231,13 @@ VALUES = st.recursive(
 def test_values_come_through_hydras_grammar(value: object) -> None:
     parsed = OverridesParser.create().parse_override(f"key={override_value(value)}")
     assert parsed.value() == value
+    assert override_value(foreign(value)) == override_value(value)
+
+
+def foreign(value: Any) -> Any:
+    """A value as a sweep of NumPy's may hold it."""
+    if isinstance(value, dict):
+        return MappingProxyType({key: foreign(entry) for key, entry in value.items()})
+    if isinstance(value, list):
+        return np.array([*map(foreign, value), None], dtype=object)[:-1]
+    return np.array(value)[()] if isinstance(value, bool | int | float) else value

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from proposer_rl.streams import Streams
@@ -16,6 +17,11 @@ def test_equal_keys_give_equal_numbers_and_others_do_not() -> None:
     assert len(set(map(tuple, draws.values()))) == len(keys)
     assert numbers(Streams(0).generator("a", 1)) == draws["a", 1]
     assert numbers(Streams(1).generator("a", 1)) != draws["a", 1]
+
+
+def test_keys_of_numpy_are_those_of_python() -> None:
+    foreign = Streams(np.int64(5), np.str_("cycle")).generator(np.int32(3), torch.tensor(1))
+    assert numbers(foreign) == numbers(Streams(5).generator("cycle", 3, 1))
 
 
 def test_a_scope_is_part_of_the_key() -> None:

@@ -16,7 +16,8 @@ SEED = "seed"
 LARGEST_SEED = 2**31 - 1
 STEP = 0.1  # standard deviation of an edit, as a share of a range
 MOST_BINS = 256  # along an axis; readers of runs take no more
-MOST_COMBINATIONS = 2**63 - 1
+MOST_COMBINATIONS = LARGEST_WHOLE = 2**63 - 1
+LARGEST = torch.finfo(torch.float32).max
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,12 @@ def points(values: Sequence[Number], key: str = "values") -> Bins:
     """Bins that are single values; whole numbers, if all of them are.
 
     Raises:
-        ValueError: naming the key, if they do not rise.
+        ValueError: naming the key, if they do not rise, or are beyond float32 or int64.
     """
     whole = all(isinstance(value, int) for value in values)
+    largest = LARGEST_WHOLE if whole else LARGEST
+    if not all(abs(value) <= largest for value in values):
+        raise ValueError(f"{key}={list(values)} must be finite, and at most {largest:g} in size")
     line = torch.tensor(values, dtype=torch.int64 if whole else torch.float64)
     if (line.diff() <= 0).any():
         raise ValueError(f"{key}={list(values)} must rise")
@@ -150,10 +154,12 @@ def intervals(low: float, high: float, count: int = 1) -> Bins:
     """Equal parts of a range, within which values are uniform.
 
     Raises:
-        ValueError: if the range is none.
+        ValueError: if the range is none, or goes beyond float32.
     """
-    if not -math.inf < low < high < math.inf:
-        raise ValueError(f"low={low} must be below high={high}, and both finite")
+    if not -LARGEST <= low < high <= LARGEST:
+        raise ValueError(
+            f"low={low} must be below high={high}, and both finite, at most {LARGEST:g} in size"
+        )
     edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
     return Bins(edges[:-1], edges[1:])
 

@@ -11,6 +11,7 @@ from torch.utils.data import Sampler
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.teaching.spaces import Items
 from proposer_rl.teaching.teacher import Teacher
+from proposer_rl.teaching.tickets import as_array
 
 T = TypeVar("T")
 
@@ -122,6 +123,7 @@ class TeacherSampler(Sampler[int]):
         numbers, size = _plain(name, values, float), self._repeat
         if len(numbers) != groups * size:
             raise ArgumentError(f"{name}: {len(numbers)} results for {groups * size} items")
+        as_array(name, numbers, (len(numbers),))  # each of them, not their mean alone
         return [sum(numbers[at : at + size]) / size for at in range(0, len(numbers), size)]
 
 

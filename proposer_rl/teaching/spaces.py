@@ -7,16 +7,17 @@ small edits. Inside, a level is a tensordict; what a loop gets is :meth:`LevelSp
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Real
-from operator import index
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError
+from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
 
@@ -76,7 +77,8 @@ class Parameters(LevelSpace, ParameterSpace):
 
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
-            for whole numbers, a list for choices among rising numbers, or among texts.
+            for whole numbers, a list or an array for choices among rising numbers, or among texts.
+            YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of which is warned.
         bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
             twenty parameters or more, 1.
         target: what is to be mastered, for some of the parameters, by name: a value or a part of
@@ -106,15 +108,21 @@ class Parameters(LevelSpace, ParameterSpace):
         named: Mapping[str, Ranges] | None = None,
         seeded: bool = False,
     ) -> None:
+        _check_names("ranges", ranges, ranges)
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
+        ranges = {name: _own(values) for name, values in ranges.items()}
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
-        counts = dict(bins) if isinstance(bins, Mapping) else dict.fromkeys(ranges, bins)
-        _check_names("bins", counts, ranges)
+        counts = dict.fromkeys(ranges, 8)
+        if isinstance(bins, Mapping):
+            _check_names("bins", bins, ranges)
+            counts |= {name: whole(f"bins.{name}", count, 1) for name, count in bins.items()}
+        else:
+            counts = dict.fromkeys(ranges, whole("bins", bins, 1))
         self.labels = {name: _labels(values) for name, values in ranges.items()}
         parts = {
-            name: _bins(f"ranges.{name}", values, counts.get(name, 8), self.labels[name])
+            name: _bins(f"ranges.{name}", values, counts[name], self.labels[name])
             for name, values in ranges.items()
         }
         try:
@@ -124,10 +132,13 @@ class Parameters(LevelSpace, ParameterSpace):
                 f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
                 "bins=1, which suffices for curricula that need none"
             ) from error
-        self._parts = {
-            name: self._part(name, part) for name, part in _distributions(target, named).items()
-        }
+        said = _distributions(target, named)
+        self._parts = {name: self._part(name, part) for name, part in said.items()}
         further = {name: ParameterSpace(part, seeded) for name, part in self._parts.items()}
+        for key, part in {"ranges": ranges, **said}.items():
+            for name, values in part.items():
+                if key == "ranges" or parts[name].wide:
+                    _warn_of_two(f"{key}.{name}", _own(values))
         self.distributions = {"all": self, **further}
 
     @property
@@ -178,14 +189,14 @@ class Parameters(LevelSpace, ParameterSpace):
         parts = dict(self.bins)
         for name, values in ranges.items():
             whole, labels = self.bins[name], self.labels[name]
-            where = f"{key}.{name}"
+            where, values = f"{key}.{name}", _own(values)
             if labels is not None:
                 chosen = values if isinstance(values, list) else [values]
                 if any(value not in labels or chosen.count(value) > 1 for value in chosen):
                     raise ArgumentError(f"{where}={values!r}: must be among {labels}, each once")
                 parts[name] = points(sorted(labels.index(value) for value in chosen))
                 continue
-            values = [values] if isinstance(values, Real) else values
+            values = [values] if _is_number(values) else values
             part = _bins(where, values, 1, None)
             low, high = whole.low[0], whole.high[-1]
             if part.low[0] < low or part.high[-1] > high:
@@ -213,7 +224,8 @@ class Items(LevelSpace):
 
     Args:
         count: number N of items.
-        features: numbers that tell what items are like, float [N, D]; None for their places alone.
+        features: numbers that tell what items are like, float [N, D], as a tensor, an array or a
+            table; None for their places alone.
         target: places of those that are to be mastered; None for no target.
         named: further distributions like ``target``, by name.
 
@@ -225,16 +237,15 @@ class Items(LevelSpace):
         self,
         count: int,
         *,
-        features: Tensor | None = None,
+        features: Any = None,
         target: Sequence[int] | None = None,
         named: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        if count < 1:
-            raise ArgumentError(f"count={count}: must be at least 1")
+        count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
-        lines = torch.arange(count).unsqueeze(-1) if features is None else torch.as_tensor(features)
-        if lines.ndim != 2 or len(lines) != count or not lines.isfinite().all():
+        lines = torch.arange(count).unsqueeze(-1) if features is None else _table(features)
+        if lines.ndim != 2 or len(lines) != count or not lines.float().isfinite().all():
             raise ArgumentError(
                 f"features={list(lines.shape)}: must have a row of finite numbers for each item"
             )
@@ -242,9 +253,7 @@ class Items(LevelSpace):
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
         for name, given in _distributions(target, named).items():
-            places = [*map(index, given)]  # also of a tensor
-            if not places or min(places) < 0 or max(places) >= count:
-                raise ArgumentError(f"{name}={places}: must be places from 0 to {count - 1}")
+            places = _places(name, given, count)
             parts[name] = _SomeItems(torch.tensor(places))
         self._parts = parts
         self.distributions = {"all": self, **parts}
@@ -302,7 +311,8 @@ class LevelGenerator(LevelSpace):
     """Levels that a function draws; there are no bins.
 
     Args:
-        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict or a tensorclass.
+        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict or a tensorclass; an
+            array is taken as a tensor.
         target: the same for what is to be mastered; None for no target.
         edit: ``edit(levels, count, generator)``: levels [n] after so many small random edits; None
             where levels cannot be edited.
@@ -351,7 +361,8 @@ class LevelGenerator(LevelSpace):
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
-            return torch.stack([_wrapped(edit(self.given(own), count, g)) for own, g in rows])
+            made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
+            return torch.stack([_taken("edit", new, n) for new, n in made])
 
         return edited
 
@@ -361,20 +372,64 @@ class _Drawn:
         self._name, self._draw = name, draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        levels = self._draw(count, generator)
-        if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (count,):
-            shape = list(getattr(levels, "shape", ())) or type(levels).__name__
-            raise ArgumentError(f"{self._name}={shape}: must give {count} levels, [{count}, ...]")
-        return _wrapped(levels)
+        return _taken(self._name, self._draw(count, generator), count)
 
 
-def _wrapped(levels: Any) -> Levels:
-    return TensorDict({DRAWN: levels}, levels.shape[:1]) if isinstance(levels, Tensor) else levels
+def _taken(name: str, levels: Any, count: int) -> Levels:
+    """Levels [count] that a function gives, as curricula take them."""
+    if isinstance(levels, np.ndarray) and levels.dtype.kind in "biuf":
+        levels = torch.from_numpy(levels.copy())
+    if not isinstance(levels, Tensor) and not is_tensor_collection(levels):
+        raise ArgumentError(
+            f"{name}={type(levels).__name__}: must give a tensor, a tensordict or a tensorclass"
+        )
+    if tuple(levels.shape[:1]) != (count,):
+        shape = list(levels.shape)
+        raise ArgumentError(f"{name}={shape}: must give {count} levels, [{count}, ...]")
+    return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
+
+
+def _table(features: Any) -> Tensor:
+    """Numbers [N, D], whatever they are given as."""
+    array = hasattr(features, "__array__") and not isinstance(features, Tensor)
+    try:
+        table = torch.as_tensor(np.array(features) if array else features)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArgumentError(f"features={shown(features)}: must be numbers [N, D]") from error
+    return table if table.is_floating_point() else table.long()  # small integers would overflow
+
+
+def _places(name: str, given: Any, count: int) -> list[int]:
+    """Places of items, or a single one."""
+    places = plain(given)
+    places = [*places] if isinstance(places, Iterable) else [places]
+    if not places or not all(type(one) is int and 0 <= one < count for one in places):
+        raise ArgumentError(f"{name}={shown(places)}: must be places from 0 to {count - 1}")
+    return places
 
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """What is said of distributions beside the space itself, by their names."""
     return {**({} if target is None else {"target": target}), **(named or {})}
+
+
+def _own(values: Any) -> Any:
+    """A range or values of one as Python's own; what a list has besides numbers and texts stays."""
+    if isinstance(values, list | tuple):
+        own = [plain(value) if getattr(value, "ndim", None) == 0 else value for value in values]
+        return tuple(own) if isinstance(values, tuple) else own
+    return values if isinstance(values, range) else plain(values)
+
+
+def _warn_of_two(key: str, values: Any) -> None:
+    """Say how a list is read that a file may have in place of a tuple."""
+    if isinstance(values, list) and len(values) == 2 and any(isinstance(v, float) for v in values):
+        low, high = values
+        warnings.warn(
+            f"{key}={values}: a list is single values, here two and nothing between them; the "
+            f"range from {low} to {high} is a tuple, ({low}, {high})",
+            stacklevel=3,
+        )
 
 
 def _labels(values: Any) -> list[Any] | None:
@@ -390,26 +445,28 @@ def _is_number(value: Any) -> bool:
 
 def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
     """The bins of a range."""
-    if not isinstance(count, int) or count < 1:
-        raise ArgumentError(f"bins={count}: must be at least 1")
     if labels is not None:
         places = torch.arange(len(labels))
         return _Texts(places, places)
     try:
+        if isinstance(values, range):
+            points(sorted({values.start, values.stop}))  # refuses what int64 cannot hold
         if isinstance(values, range) and values.step == 1 and len(values) > count:
             edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
             low = edges[:-1].ceil().long()
             return Bins(low, torch.cat([low[1:], torch.tensor([values.stop])]) - 1)
         if isinstance(values, tuple) and len(values) == 2 and all(map(_is_number, values)):
             return intervals(float(values[0]), float(values[1]), count)
-        if isinstance(values, list | range) and len(values):
+        if isinstance(values, list | range) and len(values) and all(map(_is_number, values)):
             return points(list(values))
-    except ValueError as error:
-        raise ArgumentError(f"{key}={values!r}: {error}") from error
-    raise ArgumentError(f"{key}={values!r}: must be (low, high), a range or a list")
+    except (ValueError, OverflowError) as error:
+        raise ArgumentError(f"{key}={shown(values)}: {error}") from error
+    raise ArgumentError(f"{key}={shown(values)}: must be (low, high), a range or a list")
 
 
 def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    if not isinstance(given, Mapping):
+        raise ArgumentError(f"{key}={shown(given)}: must have ranges by the parameters' names")
     unknown = [name for name in given if name not in known]
     if unknown:
         raise ArgumentError(f"{key}.{unknown[0]}: unknown; there are: {', '.join(known)}")

@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from operator import index
 from pathlib import Path
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
@@ -23,9 +22,10 @@ from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
+from proposer_rl.tasks.parameters import LARGEST
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
@@ -33,7 +33,7 @@ from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.segments import LEVEL_ID, ended
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tally import Tally
-from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome
+from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome, check_values
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -107,7 +107,7 @@ class Teacher:
         **can: Any,
     ) -> None:
         self.space, self.device, self.block = space, torch.device(device), block
-        self._seeds = [_whole("seed", seed) + copy for copy in range(students)]
+        self._seeds = [whole("seed", seed) + copy for copy in range(students)]
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
@@ -144,7 +144,7 @@ class Teacher:
     def propose(self, n: SupportsIndex) -> Any:
         """Levels [n] ([K, n] of several students) to be observed together."""
         with self._here():
-            block = self._next(_whole("n", n, 1))
+            block = self._next(whole("n", n, 1))
             block.state[:] = OUT
             self._whole.append(block.start)
             self._tally.count(block.batch.levels)
@@ -163,7 +163,7 @@ class Teacher:
         with self._here():
             if n is None:
                 return self._one()
-            left = _whole("n", n, 0)
+            left = whole("n", n, 0)
             ids: list[Tensor] = []
             levels: list[Any] = []
             while left or not ids:
@@ -435,8 +435,6 @@ class Teacher:
             name: as_array(_argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
             for name, value in told.items()
         }
-        for name, array in arrays.items():
-            _check_values(name, array)
         self._check_score(told)
         self._ledger.tell(self._ledger.find(ids), arrays)
         self._scored = "score" in told
@@ -507,40 +505,18 @@ class Teacher:
         return array.reshape(-1).astype(np.int64)
 
 
-def _whole(name: str, value: SupportsIndex, least: int | None = None) -> int:
-    try:
-        number = index(value)
-    except TypeError as error:
-        raise ArgumentError(f"{name}={value!r:.60}: must be a whole number") from error
-    if least is not None and number < least:
-        raise ArgumentError(f"{name}={number}: must be a whole number, at least {least}")
-    return number
-
-
 def _number(name: str, value: Any) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{_argument(name)}={value!r:.60}: must be a number") from error
-    if not number - number == 0:
-        raise ArgumentError(f"{_argument(name)}={number}: must be finite")
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        told = f"{_argument(name)}={shown(value)}"
+        raise ArgumentError(f"{told}: must be a number of float32") from error
+    if not -LARGEST <= number <= LARGEST:
+        raise ArgumentError(f"{_argument(name)}={number}: must be finite in float32")
     # Arrays take a while to make; few numbers need one.
     if name in COUNTS or (name == "success" and not 0 <= number <= 1):
-        _check_values(name, np.array([number]))
+        check_values(name, np.array([number]))
     return number
-
-
-def _check_values(name: str, array: NDArray[np.float64]) -> None:
-    if name == "success":
-        wrong, allowed = array[(array < 0) | (array > 1)], "from 0 to 1"
-    elif name in COUNTS:
-        least = int(name == "episodes")
-        wrong = array[(array < least) | (array % 1 != 0)]
-        allowed = f"a whole number, at least {least}"
-    else:
-        return
-    if wrong.size:
-        raise ArgumentError(f"{name}={wrong[0]:g}: must be {allowed}")
 
 
 def _argument(name: str) -> str:

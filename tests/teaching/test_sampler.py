@@ -43,6 +43,7 @@ REFUSED: dict[str, tuple[list[int], Any, str]] = {
     "part of a group": ([0, 0, 0, 1], [1.0] * 4, "items: 4 are no groups of 3"),
     "too few results": ([0, 0, 0, 1, 1, 1], [1.0] * 5, "success: 5 results for 6 items"),
     "no share": ([0, 0, 0, 1, 1, 1], [1.0] * 3 + [9.0] * 3, "success=9: must be from 0 to 1"),
+    "a mean of no shares": ([0, 0, 0], [2.0, -1.0, 0.5], "success=2: must be from 0 to 1"),
     "no numbers": ([0, 0, 0], torch.ones(3, 1), r"success: must be numbers \[n\]"),
 }
 

@@ -1,0 +1,299 @@
+"""Numbers and lists of other libraries, and those that are too large, in spaces and results."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as profile
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+import proposer_rl as prl
+from proposer_rl.settings import ArgumentError
+from tests.teaching.counting import Counting
+
+NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
+LINE = prl.Parameters({"s": (0.0, 1.0)}, bins=2)
+
+# A list of Python's numbers or texts, as other libraries and files have it.
+KINDS: dict[str, Callable[[list[Any]], Any]] = {
+    "array": np.array,
+    "NumPy's scalars": lambda values: list(np.array(values)),
+    "tensor": torch.tensor,
+    "tensors": lambda values: [*map(torch.tensor, values)],
+    "series": pd.Series,
+    "omegaconf": OmegaConf.create,
+    "json": lambda values: json.loads(json.dumps(values)),
+}
+NUMBERS = st.lists(st.integers(-9, 9) | st.floats(-9, 9, width=32), min_size=3, max_size=5)
+
+
+def levels(space: Any) -> Any:
+    return space.rows(space.sample(5, torch.Generator().manual_seed(0)))
+
+
+@profile(max_examples=15)
+@given(st.data())
+def test_choices_may_be_in_any_list(data: st.DataObject) -> None:
+    """Against Python's own list: the same choices, target and draws, with the same types."""
+    values: list[Any] = sorted({float(number): number for number in data.draw(NUMBERS)}.values())
+    if not all(isinstance(value, int) for value in values):
+        values = [*map(float, values)]
+    if len(values) < 3:
+        return
+    own = prl.Parameters({"g": values}, target={"g": values[1]})
+    for as_kind in KINDS.values():
+        space = prl.Parameters({"g": as_kind(values)}, target={"g": as_kind(values)[1]})
+        assert repr(space.axes) == repr(own.axes)
+        assert space.target_shares.tolist() == own.target_shares.tolist()
+        assert repr(levels(space)) == repr(levels(own))
+
+
+@pytest.mark.parametrize("kind", KINDS.keys() - {"tensor", "tensors"})
+def test_texts_may_be_in_any_list(kind: str) -> None:
+    texts = KINDS[kind](["flat", "stairs"])
+    space = prl.Parameters({"h": texts}, target={"h": texts[1]}, named={"both": {"h": texts}})
+    assert {type(level["h"]) for level in levels(space)} == {str}
+    assert space.target_shares.tolist() == [0, 1]
+    assert space.distributions["both"].size == 2  # type: ignore[attr-defined]
+
+
+def test_choices_that_are_arrays_stay_what_they_are() -> None:
+    mazes = [np.eye(2), np.ones((2, 2))]
+    assert all(
+        any(level["maze"] is m for m in mazes) for level in levels(prl.Parameters({"maze": mazes}))
+    )
+
+
+def test_ranges_and_counts_may_be_of_any_library() -> None:
+    own = prl.Parameters({"a": (0.5, 3.0), "b": range(3, 9)}, bins={"b": 2}, target={"a": 2.0})
+    given = {"a": (np.float32(0.5), torch.tensor(3)), "b": range(np.int64(3), np.int64(9))}
+    space = prl.Parameters(given, bins={"b": np.int64(2)}, target={"a": np.float64(2)})
+    assert levels(space) == levels(own)
+    assert prl.Parameters(OmegaConf.create({"g": [1, 2, 3]}), bins=np.uint8(2)).axes == {
+        "g": [1, 2, 3]
+    }
+    teacher = prl.Teacher(
+        prl.curricula.plr(capacity=np.int64(30), temperature=np.float32(0.5)),
+        space,
+        seed=np.int64(1),
+        students=np.int64(2),
+        block=torch.tensor(7),
+    )
+    assert teacher.ask(np.int64(4))[1].batch_size == (2, 4)
+    stages = prl.curricula.hand_designed(
+        distributions=OmegaConf.create(["target", "all"]), until=np.array([1])
+    )
+    teacher = prl.Teacher(stages, space, block=np.int64(1))
+    assert teacher.ask()[1]["a"] == 2 and teacher.ask()[1]["a"] != 2
+
+
+@pytest.mark.parametrize("where", ["ranges", "target"])
+def test_two_numbers_in_a_list_are_two_and_that_is_said_once(where: str) -> None:
+    """A file has no tuples: what is meant as a range would be two values in silence."""
+    read = json.loads('{"g": [5.0, 25.0]}')
+    given = {"ranges": read} if where == "ranges" else {"ranges": {"g": (0.0, 30.0)}, where: read}
+    with pytest.warns(UserWarning, match=rf"{where}\.g=\[5\.0, 25\.0\]: .* a tuple, ") as said:
+        space = prl.Parameters(**given)
+    assert len(said) == 1 and said[0].filename == __file__
+    read_as = space if where == "ranges" else space.target
+    assert read_as.bins["g"].low.tolist() == [5, 25] == read_as.bins["g"].high.tolist()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prl.Parameters(
+            {"g": (5.0, 25.0), "arm": [0, 1], "h": [1.0, 2.0, 3.0]}, target={"h": [1.0, 2.0]}
+        )
+
+
+TARGETS = [np.array([1, 2]), torch.tensor([1, 2]), range(1, 3), pd.Series([1, 2]), {1, 2}, (1, 2)]
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: type(target).__name__)
+def test_places_of_items_may_be_in_any_list(target: Any) -> None:
+    assert prl.Items(np.int64(3), target=target).target_shares.tolist() == [0, 0.5, 0.5]
+    assert prl.Items(3, target=np.int64(2)).target_shares.tolist() == [0, 0, 1]
+
+
+COLORS = pd.get_dummies(pd.Series(["red", "blue", "red"]))  # a table of truth values
+FEATURES = [
+    (COLORS, [[-1, 1], [1, -1], [-1, 1]]),
+    (COLORS.to_numpy(), [[-1, 1], [1, -1], [-1, 1]]),
+    (np.array([[-128], [0], [127]], np.int8), [[-1], [1 / 255], [1]]),  # their width is no int8
+    (np.broadcast_to([3.0, 1.0], (3, 2))[:, ::-1], [[-1, -1]] * 3),
+    ([[0.0], [0.5], [1.0]], [[-1], [0], [1]]),
+    (OmegaConf.create([[0.0], [0.5], [1.0]]), [[-1], [0], [1]]),
+]
+
+
+@pytest.mark.parametrize(("features", "expected"), FEATURES)
+def test_features_may_be_a_table_or_an_array(features: Any, expected: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        coordinates = prl.Items(3, features=features).coordinates
+    torch.testing.assert_close(coordinates, torch.tensor(expected, dtype=torch.float32))
+
+
+def test_an_array_that_a_function_draws_is_a_tensor() -> None:
+    def draw(n: int, generator: torch.Generator) -> Any:
+        return np.arange(3.0 * n).reshape(n, 3)[::-1]
+
+    space = prl.LevelGenerator(draw, target=draw, edit=lambda levels, count, g: levels.numpy() + 1)
+    _, drawn = prl.Teacher("target", space).ask(4)
+    assert (
+        drawn.dtype == torch.float64 and drawn.tolist() == draw(384, torch.Generator())[:4].tolist()
+    )
+    batch = space.sample(4, torch.Generator())[None]
+    assert (space.edit(batch, 1, [torch.Generator()])["level"] == batch["level"] + 1).all()
+
+
+def draws(what: Any) -> Any:
+    return prl.Teacher("plr", prl.LevelGenerator(lambda n, g: what(n))).ask()
+
+
+NO_SPACE = [
+    (lambda: prl.Parameters({"g": (0.0, HUGE)}), r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
+    (lambda: prl.Parameters({"g": (NAN, 1.0)}), r"ranges.g=\(nan, 1.0\): low=nan must be below"),
+    (lambda: prl.Parameters({"g": (2.0, 1.0)}), r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),
+    (lambda: prl.Parameters({"g": (0, 10**400)}), r"ranges.g=\(0, 10{70}.*too large"),
+    (lambda: prl.Parameters({"g": [1.0, NAN, 2.0]}), r"ranges.g=\[1.0, nan, 2.0\]: .* be finite"),
+    (
+        lambda: prl.Parameters({"g": np.array([0, 1, HUGE])}),
+        r"ranges.g=\[0.0, 1.0, 1e\+39\]: .* at",
+    ),
+    (lambda: prl.Parameters({"g": [1, 2**63]}), r"ranges.g=\[1, 9223372036854775808\]: .* at most"),
+    (lambda: prl.Parameters({"g": range(2**64)}), r"ranges.g=range\(0, 18446744073709551616\): "),
+    (lambda: prl.Parameters({"g": range(9)}, target={"g": True}), "target.g=True: must be "),
+    (lambda: prl.Parameters({"g": range(9)}, target={"g": ["a"]}), r"target.g=\['a'\]: must be "),
+    (lambda: prl.Parameters({"g": range(9)}, target=3), "target=3: must have ranges by the param"),
+    (lambda: prl.Parameters(pd.DataFrame({"g": [1]})), "ranges=g 0 1: must have ranges by"),
+    (lambda: prl.Parameters({"g": range(9)}, bins=True), "bins=True: must be a whole number, at"),
+    (
+        lambda: prl.Parameters({"g": range(9)}, bins={"g": np.float64(2)}),
+        "bins.g=2.0: must be a wh",
+    ),
+    (lambda: prl.Items(np.bool_(True)), "count=True: must be a whole number, at least 1"),
+    (lambda: prl.Items(3.0), "count=3.0: must be a whole number"),
+    (
+        lambda: prl.Items(4, target=np.array([True, False])),
+        r"target=\[True, False\]: must be places",
+    ),
+    (lambda: prl.Items(4, target=np.array([1.0])), r"target=\[1.0\]: must be places from 0 to 3"),
+    (lambda: prl.Items(2, features=np.array([[HUGE], [0]])), r"features=\[2, 1\]: .* finite"),
+    (lambda: prl.Items(1, features=pd.DataFrame({"a": ["x"]})), "features=a 0 x: must be numbers"),
+    (
+        lambda: draws(lambda n: np.array(["a"] * n)),
+        "draw=ndarray: must give a tensor, a tensordict",
+    ),
+    (lambda: draws(lambda n: pd.DataFrame({"a": range(n)})), "draw=DataFrame: must give a tensor"),
+    (lambda: draws(lambda n: [{"a": 1}] * n), "draw=list: must give a tensor"),
+    (lambda: draws(lambda n: np.ones((n + 1, 2))), r"draw=\[2, 2\]: must give 1 levels"),
+    (lambda: prl.Teacher("plr", LINE, seed=True), "seed=True: must be a whole number"),
+    (
+        lambda: prl.Teacher("plr", LINE, block=np.float64(3)),
+        "block=3.0: input should be a valid int",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), NO_SPACE, ids=[line for _, line in NO_SPACE])
+def test_what_is_no_number_there_is_refused_in_one_line(make: Any, message: str) -> None:
+    with pytest.raises(ArgumentError, match=rf"^{message}") as refused:
+        make()
+    assert "\n" not in str(refused.value)
+
+
+def rollout(*rewards: float, dtype: torch.dtype = torch.float32) -> TensorDict:
+    """An episode on one level."""
+    done = torch.zeros(1, len(rewards), 1, dtype=torch.bool)
+    done[:, -1] = True
+    after = {"reward": torch.tensor(rewards, dtype=dtype).view(1, -1, 1), "done": done}
+    return TensorDict({"next": {**after, "terminated": done, "success": done}}, done.shape[:2])
+
+
+TOO_LARGE: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
+    "a return": (lambda t: t.tell(0, HUGE, 1), r"return_=1e\+39: must be finite in float32"),
+    "one below": (lambda t: t.tell(0, -HUGE, 1), r"return_=-1e\+39: must be finite"),
+    "one of NumPy's": (lambda t: t.tell(0, np.float64(HUGE), 1), r"return_=1e\+39: must be finite"),
+    "among others": (
+        lambda t: t.tell([0, 1], [0, HUGE], [1, 1]),
+        r"return_=1e\+39: must be finite",
+    ),
+    "an integer": (lambda t: t.tell(0, 10**400, 1), "return_=1000.*: must be a number of float32"),
+    "integers": (
+        lambda t: t.tell([0], [10**400], 1),
+        r"return_=\[1000.*: must be numbers of float32",
+    ),
+    "a score": (lambda t: t.tell(0, 0, 1, score=HUGE), r"score=1e\+39: must be finite"),
+    "scores": (lambda t: t.tell([0], [0], [1], score=[INF]), "score=inf: must be finite"),
+    "episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* at most 1e\+15"),
+    "steps": (lambda t: t.tell([0], [0], [1], steps=1e30), r"steps=1e\+30: must be a whole number"),
+    "a success": (
+        lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]),
+        "success=1: must be fr",
+    ),
+    "a rollout's sum": (
+        lambda t: t.observe(prl.outcome_of(rollout(3e38, 3e38)), ids=0),
+        "return=inf: must be finite",
+    ),
+    "one of float64": (
+        lambda t: t.observe(prl.outcome_of(rollout(HUGE, dtype=torch.float64)), ids=0),
+        r"return=1e\+39: must be finite",
+    ),
+    "a sum of both signs": (
+        lambda t: t.observe(prl.outcome_of(rollout(INF, -INF)), ids=0),
+        "return=nan: must be finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", TOO_LARGE)
+def test_what_float32_cannot_keep_is_refused_and_the_loop_goes_on(what: str) -> None:
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, prl.Items(9), block=2)
+    teacher.ask(2)
+    wrong, message = TOO_LARGE[what]
+    with pytest.raises(ArgumentError, match=f"^{message}") as refused:
+        wrong(teacher)
+    assert "\n" not in str(refused.value)
+    teacher.drop(0)
+    teacher.tell(1, 3.4e38, 1)
+    teacher.ask()
+    assert curriculum.seen == {1: (pytest.approx(3.4e38), 1.0)}
+
+
+@pytest.mark.parametrize("name", ["plr", "learning_progress"])
+def test_the_largest_results_harm_no_curriculum(name: str) -> None:
+    """Differences of returns that float32 can keep may be more than it can."""
+    episodes = {} if name == "plr" else {"source": "episodes"}
+    recipe = getattr(prl.curricula, name)(**episodes, **({"capacity": 8} if name == "plr" else {}))
+    teacher = prl.Teacher(recipe, LINE, seed=1, block=8)
+    for number in range(60):
+        ticket, _ = teacher.ask()
+        teacher.tell(ticket, 3.4e38 * (-1) ** number, success=number % 2)
+    assert teacher.log()
+
+
+@given(st.floats())
+def test_results_are_those_that_float32_can_keep(number: float) -> None:
+    """Of one ticket and of several alike, against NumPy's conversion."""
+    with np.errstate(over="ignore"):
+        kept = bool(np.isfinite(np.float32(number)))
+    for told in (number, [number]):
+        teacher = prl.Teacher(Counting(), prl.Items(9), block=1)
+        ticket, _ = teacher.ask()
+        try:
+            teacher.tell(ticket if told is number else [ticket], told)
+            assert kept
+        except ArgumentError as error:
+            assert re.match(r"return_=\S+: must be finite in float32", str(error))
+            assert not kept or abs(number) > np.finfo(np.float32).max
