@@ -23,7 +23,7 @@ from proposer_rl.learning import load_agent, located
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import Measure
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
@@ -97,7 +97,7 @@ class ProblemProposer(Curriculum):
             problems = policy.batch_shape[1]
             shape = (-(-count // problems), 1, problems)
             noise = torch.rand(shape, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(seen["probes"].device))  # [times, 1, P]
+            choices = draw_at(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
         bins = choices.view(1, -1).cpu()  # [1, times * P]
         drawn = {agent.action_key: choices, agent.log_prob_key: log_prob}

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic, draw_at
 
 SEEDS = 2**62
 SWEEP = 16  # steps between two checks which levels all Solvers have finished
@@ -58,7 +58,7 @@ def play(
             action = distribution.mode
         else:
             given = noise[step, place]
-            action = draw(distribution, given.expand(len(over), *given.shape))
+            action = draw_at(distribution, given.expand(len(over), *given.shape))
         after = env.step(state.set(agent.action_key, action))["next"]
         yield place, after, ~over
         over = over | after["done"].squeeze(-1)

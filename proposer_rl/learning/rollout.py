@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning.continued import ContinuedEpisodes
-from proposer_rl.models import ActorCritic, draw, population, uniform_noise
+from proposer_rl.models import ActorCritic, draw_at, population, uniform_noise
 from proposer_rl.settings import ArgumentError
 
 
@@ -181,7 +181,7 @@ class RolloutPolicy(TensorDictModuleBase):
         tensordict.update(self.memory)
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
-        action = draw(distribution, noise)
+        action = draw_at(distribution, noise)
         tensordict.set(agent.action_key, action)
         tensordict.set(agent.log_prob_key, distribution.log_prob(action))
         for before, after in zip(agent.memory, agent.memory_keys, strict=True):

@@ -188,7 +188,7 @@ def normal(logits: Tensor) -> Distribution:
     return Independent(Normal(location, log_scale.exp(), validate_args=False), 1)
 
 
-def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
+def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:
     """Sample by inverting the cumulative distribution function at ``uniform``.
 
     Torch's distributions take no generator. This way the random numbers are data, which can be
@@ -199,7 +199,7 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
         uniform: numbers in [0, 1), one for each element of a sample.
     """
     if isinstance(distribution, Independent):
-        return draw(distribution.base_dist, uniform)
+        return draw_at(distribution.base_dist, uniform)
     if isinstance(distribution, Categorical):
         cumulative = distribution.probs.cumsum(-1)
         threshold = uniform.unsqueeze(-1) * cumulative[..., -1:]
@@ -223,3 +223,15 @@ def uniform_noise(
     else:
         drawn = torch.stack([torch.rand(steps, *shape[1:], generator=g) for g in generators], 1)
     return (drawn.pin_memory() if device.type == "cuda" else drawn).to(device, non_blocking=True)
+
+
+def orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:
+    """Initialise every convolution and linear layer orthogonally, biases with zero (in place).
+
+    The default gain keeps the variance of activations through ReLU layers (Saxe et al. 2014).
+    """
+    for layer in module.modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)

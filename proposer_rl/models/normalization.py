@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-LARGEST = 10.0
+FARTHEST = 10.0
 """Standard deviations from the mean at which a normalised number ends, as is usual."""
 
 TINY = 1e-8  # added to variances
@@ -63,7 +63,7 @@ class RunningMoments(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """Numbers [K, *B, *S] without their mean, in standard deviations, cut off far out."""
         mean, deviation = (self.along(each, values) for each in (self.mean, self.deviation))
-        return ((values - mean.float()) / deviation).clamp(-LARGEST, LARGEST)
+        return ((values - mean.float()) / deviation).clamp(-FARTHEST, FARTHEST)
 
     def along(self, moments: Tensor, values: Tensor) -> Tensor:
         """Moments [K, *S], to be broadcast against values [K, *B, *S]."""

@@ -17,8 +17,6 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 from torch.nn.functional import linear
 
-from proposer_rl.models.convolution import Conv3x3
-
 
 class Population(nn.Module):
     """K independent replicas of a network, called and trained as one module.
@@ -86,7 +84,7 @@ class Population(nn.Module):
     def prefer_products(self) -> None:
         """Let 3x3 convolutions of several replicas be products, which a compiler fuses."""
         for layer in self._template[0].modules():
-            if isinstance(layer, Conv3x3):
+            if hasattr(layer, "as_product"):
                 layer.as_product = self.copies > 1
 
     def forward(self, *inputs: Tensor) -> Any:

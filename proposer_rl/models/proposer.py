@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from proposer_rl.models.actor_critic import ActorCritic
-from proposer_rl.models.unet import orthogonal_
+from proposer_rl.models.actor_critic import ActorCritic, orthogonal_
 
 
 class MapEncoder(nn.Sequential):

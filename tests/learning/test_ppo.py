@@ -25,7 +25,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 from proposer_rl.learning.losses import MakeLoss, clip_gradients_
 from proposer_rl.learning.ppo import PPO, PPOSettings
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
-from proposer_rl.models.maps import read_maps
+from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv

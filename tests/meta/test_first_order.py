@@ -25,7 +25,7 @@ from proposer_rl.meta.first_order import (
     target_performance,
 )
 from proposer_rl.models import ActorCritic, Population, UNet, categorical
-from proposer_rl.models.maps import cell_logits, read_maps
+from proposer_rl.models.grids import cell_logits, read_maps
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 
