@@ -19,7 +19,7 @@ from proposer_rl import (
     SolverSettings,
     Streams,
 )
-from proposer_rl.learning.settings import LearningSettings
+from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.tasks.mazes.settings import (

@@ -10,7 +10,7 @@ import pytest
 import torch
 from annotated_types import Interval
 
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, arguments, checked
 

@@ -14,8 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from tensordict import TensorDictBase
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams

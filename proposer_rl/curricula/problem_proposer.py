@@ -19,9 +19,8 @@ from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
 from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
-from proposer_rl.learning import load_agent, located
+from proposer_rl.learning import PPOSettings, load_agent, located
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import Measure
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked

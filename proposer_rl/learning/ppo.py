@@ -24,27 +24,26 @@ from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import graphs
-from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.learning.losses import (
+from proposer_rl.learning.objective import (
     ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
     clip_gradients_,
     explained_variance,
+    gae,
     make_loss,
     of_copies,
 )
-from proposer_rl.learning.minibatches import Minibatches
+from proposer_rl.learning.ppo_settings import PPOSettings
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.learning.snapshot import (
     complete_adam,
     restore_snapshot,
     set_learning_rate,
     take_snapshot,
 )
-from proposer_rl.learning.statistics import Statistics
+from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population
 from proposer_rl.settings import ArgumentError
 

@@ -19,10 +19,15 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO, first_episode_return, first_episode_success, graphs
-from proposer_rl.learning.episodes import mean_performance
-from proposer_rl.learning.rollout import RolloutCollector
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import (
+    PPO,
+    RolloutCollector,
+    SolverSettings,
+    first_episode_return,
+    first_episode_success,
+    graphs,
+    mean_performance,
+)
 from proposer_rl.models import (
     ActorCritic,
     Population,
@@ -79,7 +84,7 @@ class Task(ABC):
         batched: as of :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
         drop_finished: whether evaluations make environments of fewer levels as others are finished,
-            as of :func:`~proposer_rl.learning.episodes.mean_performance`.
+            as of :func:`~proposer_rl.learning.mean_performance`.
         replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
             ``"rollouts"`` in an environment whose new levels come to where the old ones were, and
             of the methods ``"performance"``, ``"probe"`` and ``"measure"``.

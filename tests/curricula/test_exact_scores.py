@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from proposer_rl.curricula import Student, TaskStudent
 from proposer_rl.curricula.exact_scores import expected_best, return_variance
 from proposer_rl.curricula.scores import AT_ONCE, Scored, Scorer, unseen
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import EpisodeLaw, NoSuccessError
 from proposer_rl.tasks.mazes import Level

@@ -19,8 +19,7 @@ from proposer_rl.curricula import (
     SampledFirstOrderProposer,
     Student,
 )
-from proposer_rl.learning import DivergedError
-from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.learning import DivergedError, PPOSettings
 from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,

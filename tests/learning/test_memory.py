@@ -16,9 +16,8 @@ from torchrl.envs import (
 )
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import PPO
+from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.learning.rollout import set_values
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import surrogate
 from proposer_rl.models import Population, memory_actor_critic
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.curricula import TaskStudent
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
-from proposer_rl.learning.snapshot import agent_weights, load_agent
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings, agent_weights, load_agent
 from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.models.normalization import FARTHEST, RunningMoments
 from proposer_rl.settings import ArgumentError

@@ -22,8 +22,8 @@ from torch.utils._pytree import tree_leaves
 from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
-from proposer_rl.learning.losses import MakeLoss, clip_gradients_
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO, MakeLoss, PPOSettings
+from proposer_rl.learning.objective import clip_gradients_
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams

@@ -12,9 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn.functional import unfold
 
-from proposer_rl.learning.advantages import gae
-from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO, DivergedError, PPOSettings, gae
 from proposer_rl.meta.first_order import (
     alignment,
     bin_scores,

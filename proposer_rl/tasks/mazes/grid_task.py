@@ -13,8 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import first_episode_success
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.play.board import Board
 from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings
 from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
 from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard

@@ -15,8 +15,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import Unbounded
 
-from proposer_rl.learning import in_first_episode
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork

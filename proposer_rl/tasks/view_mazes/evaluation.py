@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from proposer_rl.learning.episodes import play
+from proposer_rl.learning import play_episodes
 from proposer_rl.models import ActorCritic
 from proposer_rl.tasks.mazes.levels import cell_plane
 from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
@@ -39,7 +39,9 @@ def walks(
     if not len(levels):  # of which there is no environment
         return went, steps
     begin = env(torch.arange(len(levels), device=first.device))
-    for step, (place, state, counts) in enumerate(play(agent, begin, max_steps, noise, env), 1):
+    for step, (place, state, counts) in enumerate(
+        play_episodes(agent, begin, max_steps, noise, env), 1
+    ):
         went[:, place, step] = torch.cat([state["agent"], state["direction"].unsqueeze(-1)], -1)
         steps[:, place] += counts
     return went, steps

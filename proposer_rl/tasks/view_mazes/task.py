@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.episodes import mean_performance
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, mean_performance
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
