@@ -18,7 +18,7 @@ from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, Proposer
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.settings import MazeSettings
+from proposer_rl.tasks.mazes.maze_settings import MazeSettings
 from tests.tiny import composed
 
 ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))

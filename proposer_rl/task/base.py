@@ -6,7 +6,7 @@ K are Solvers, P the levels of one update, T its steps, E validation levels, C p
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Categorical, MultiCategorical, TensorSpec
+from torchrl.data import Categorical, MultiCategorical
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import (
@@ -28,19 +28,22 @@ from proposer_rl.learning import (
     graphs,
     mean_performance,
 )
-from proposer_rl.models import (
-    ActorCritic,
-    Population,
-    categorical,
-    joint_categorical,
-    normal,
-)
+from proposer_rl.models import ActorCritic, Population, normal
 from proposer_rl.runs.pictures import pixels, png, written
 from proposer_rl.streams import Streams
-from proposer_rl.task.contract import ComputeContext, Distribution, LevelResult, Levels, Space
-from proposer_rl.task.features import space_features
+from proposer_rl.task.protocols import (
+    ComputeContext,
+    Distribution,
+    LevelResult,
+    Levels,
+    Space,
+    check_distributions,
+    distribution_of,
+    for_copies,
+    space_features,
+)
 
-SAMPLES = 6  # levels of each distribution that a reader is shown
+SAMPLES_SHOWN = 6  # levels of each distribution that a reader is shown
 NAMED = 128  # levels of a distribution that are evaluated one by one
 
 
@@ -124,7 +127,7 @@ class Task(ABC):
         measured: Mapping[str, Any] | None = None,
     ) -> None:
         names = list(distributions if measured_on is None else measured_on)
-        check_names(distributions, target, names)
+        check_distributions(distributions, target, names)
         self.precision = "fp32" if context.precision == "auto" else context.precision
         self.batch_size = solver.batch_size
         self.distributions: Mapping[str, Any] = dict(distributions)
@@ -360,7 +363,7 @@ class Task(ABC):
             "measured": self._measured,
             "exact": self.exact_metrics,
             "samples": {
-                name: self.record(levels[:SAMPLES], None)
+                name: self.record(levels[:SAMPLES_SHOWN], None)
                 for name, levels in self.evaluated_on.items()
             },
         }
@@ -420,47 +423,3 @@ class Task(ABC):
     def _numbers(self, levels: Levels) -> list[str]:
         """Axes of the space that are entries of the levels."""
         return [name for name in self.space.axes if name in levels.keys()]
-
-
-def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
-    """What makes a policy's distribution of actions of logits, by the actions' spec."""
-    if isinstance(acts, MultiCategorical):
-        return joint_categorical
-    return categorical if isinstance(acts, Categorical) else normal
-
-
-def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
-    """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
-    return levels.expand(agent.copies, levels.batch_size[-1])
-
-
-def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuse unknown names of distributions.
-
-    Raises:
-        ValueError: naming the key.
-    """
-    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
-
-
-def refuse_single_bin(space: Space) -> None:
-    """Refuse a space in which there is nothing to choose.
-
-    Raises:
-        ValueError: if it has one bin.
-    """
-    if space.size < 2:
-        raise ValueError(
-            "the space has a single bin, so there is nothing to choose among; give its axes bins"
-        )
-
-
-def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Make something, naming the key in whatever is wrong with its value."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error

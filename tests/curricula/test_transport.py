@@ -21,7 +21,7 @@ from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, currot
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
-from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
+from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task

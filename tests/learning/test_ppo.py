@@ -28,7 +28,7 @@ from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
 from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from tests.host_reads import HostRead, NoHostReads
 from tests.tiny import TASK, tiny_view_task
 

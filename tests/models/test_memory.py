@@ -14,13 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from proposer_rl.models import (
-    ActorCritic,
-    MemoryNetwork,
-    Population,
-    memory,
-    memory_actor_critic,
-)
+from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory, memory_actor_critic
 from proposer_rl.models.memory import MEMORY
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, tiny_view_task

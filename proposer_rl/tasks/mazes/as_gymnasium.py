@@ -14,12 +14,12 @@ from tensordict import TensorDictBase
 
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.tasks.mazes.distributions import SpecificationSpace
-from proposer_rl.tasks.mazes.dynamics import MOVES
-from proposer_rl.tasks.mazes.env import MazeEnv
 from proposer_rl.tasks.mazes.levels import Level, validate_levels
-from proposer_rl.tasks.mazes.settings import Fractions, MazeSettings, Mechanism, PathLengths
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
+from proposer_rl.tasks.mazes.maze_settings import Fractions, MazeSettings, Mechanism, PathLengths
+from proposer_rl.tasks.mazes.paths import MOVES
 
-AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
+LEVELS_AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}
 
 N = TypeVar("N", int, float)
@@ -38,7 +38,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         mechanism: as in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
         render_mode: what :meth:`render` gives, a picture or a text.
         **maze: ``height``, ``width``, ``max_steps``, ``step_penalty`` and ``observe_agent`` of
-            :class:`~proposer_rl.tasks.mazes.settings.MazeSettings`.
+            :class:`~proposer_rl.tasks.mazes.maze_settings.MazeSettings`.
 
     Raises:
         ArgumentError: if an argument is invalid.
@@ -132,9 +132,9 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         return picture if self.render_mode == "ansi" else picture.numpy()
 
     def _draw(self, seed: int) -> Level:
-        """Levels [AHEAD], uniformly over the specifications."""
+        """Levels [LEVELS_AHEAD], uniformly over the specifications."""
         generator = torch.Generator().manual_seed(seed)
-        bins = torch.randint(self._space.size, (AHEAD,), generator=generator)
+        bins = torch.randint(self._space.size, (LEVELS_AHEAD,), generator=generator)
         return self._space.generate(bins[None], [generator])[0]
 
     def _observe(self, state: TensorDictBase) -> Observation:

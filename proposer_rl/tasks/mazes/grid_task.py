@@ -16,14 +16,14 @@ from torch import Tensor
 from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.play.board import Board
-from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
-from proposer_rl.tasks.mazes.distance import shortest_path_length
-from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.task import ComputeContext, LevelResult, Task, check_distributions, named
+from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.tasks.mazes.paths import shortest_path_length
 from proposer_rl.tasks.mazes.rendering import level_records
 
-SLACK = 2  # of a named level: steps allowed for each one of its shortest way
+STEPS_PER_SHORTEST = 2  # of a named level: steps allowed for each one of its shortest way
 _ON_A_GRID = re.compile(r"(.+?)(?:@(\d{1,3})x(\d{1,3}))?")
 
 
@@ -78,7 +78,7 @@ class GridTask(Task):
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
-        check_names(distributions, target, evaluation.distributions)
+        check_distributions(distributions, target, evaluation.distributions)
         self.maze = maze
         self.grid = (maze.height, maze.width)
         self.device = torch.device(context.device)  # of what is made next
@@ -184,7 +184,7 @@ class GridTask(Task):
             ValueError: naming the level.
         """
 
-    def step_limit(self, steps: int, slack: int = SLACK) -> int:
+    def step_limit(self, steps: int, slack: int = STEPS_PER_SHORTEST) -> int:
         """The step limit of a level, given the steps of its shortest way."""
         return max(self.maze.max_steps, slack * steps)
 
@@ -244,7 +244,7 @@ class GridTask(Task):
         if Path(name).suffix in self.suffixes:
             if not Path(name).exists():
                 raise ValueError(f"--levels {name}: there is no such file")
-            return dict(self.read_file(name)), SLACK
+            return dict(self.read_file(name)), STEPS_PER_SHORTEST
         asked = _ON_A_GRID.fullmatch(name)
         for known, kind in self._kinds.items():
             if asked is None or known.casefold() != asked[1].casefold():
@@ -260,7 +260,7 @@ class GridTask(Task):
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
         if name in shipped_sets():
-            return dict(shipped_levels(name, self.level)), SLACK
+            return dict(shipped_levels(name, self.level)), STEPS_PER_SHORTEST
         raise ValueError(
             f"--levels {name}: must be one of: {', '.join(shipped_sets())}, a file that ends in "
             f"{' or '.join(self.suffixes)}, or a distribution: {', '.join(self._kinds)}, as it is "

@@ -156,20 +156,20 @@ def validate_levels(level: Level) -> None:
             raise ValueError(
                 f"{name} must be int64 {[*batch, 2]}, got {cell.dtype} {list(cell.shape)}"
             )
-        _refuse(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
+        _refuse_any(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
         index = cell_index(cell, width).unsqueeze(-1)
-        _refuse(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
-    _refuse((level.start == level.goal).all(-1), "start and goal on the same cell")
+        _refuse_any(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
+    _refuse_any((level.start == level.goal).all(-1), "start and goal on the same cell")
     if (direction := getattr(level, "direction", None)) is not None:
         if direction.dtype != torch.int64 or direction.shape != batch:
             raise ValueError(
                 f"direction must be int64 {list(batch)}, "
                 f"got {direction.dtype} {list(direction.shape)}"
             )
-        _refuse((direction < 0) | (direction > 3), "direction outside 0..3")
+        _refuse_any((direction < 0) | (direction > 3), "direction outside 0..3")
 
 
-def _refuse(bad: Tensor, fault: str) -> None:
+def _refuse_any(bad: Tensor, fault: str) -> None:
     if count := int(bad.sum()):
         raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.distance import cells_at_depth, padded_index, schedule
 from proposer_rl.tasks.mazes.levels import Level, cell_position
+from proposer_rl.tasks.mazes.paths import cells_at_depth, depth_schedule, padded_index
 
 Generators = torch.Generator | None | Sequence[torch.Generator]
 
@@ -242,7 +242,7 @@ def _shortcut_rank(rank: Tensor, start: Tensor, goal: Tensor, path_length: Tenso
     spare = torch.full_like(reached, _NEVER)
     goal = padded_index(goal, width).unsqueeze(0)
     result = torch.full_like(rank[0, 0], _NEVER)
-    for first, end in schedule((path_length - 2).clamp(min=0)):
+    for first, end in depth_schedule((path_length - 2).clamp(min=0)):
         here, following = reached[..., first:], spare[1:-1, 1:-1, first:]
         torch.minimum(here[:-2, 1:-1], here[2:, 1:-1], out=following)
         torch.minimum(following, here[1:-1, :-2], out=following)

@@ -16,12 +16,11 @@ from proposer_rl.learning import SolverSettings
 from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
 from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
-from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
-from proposer_rl.tasks.mazes.env import MazeEnv
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
+    episode_law,
     optimal_return,
     policy_path,
     worst_mean,
@@ -29,24 +28,23 @@ from proposer_rl.tasks.mazes.evaluation import (
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.level_files import RECORD, SUFFIXES, read_levels
 from proposer_rl.tasks.mazes.levels import Level, planes
-from proposer_rl.tasks.mazes.network import (
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
+from proposer_rl.tasks.mazes.maze_settings import (
     ACTIONS,
     PLANES,
+    Channels,
+    DistributionSettings,
+    MazeEvaluationSettings,
+    MazeSettings,
+    SpaceSettings,
+    UNetSettings,
     check_level_size,
     check_network,
     faster_precision,
     unet,
 )
-from proposer_rl.tasks.mazes.occupancy import episode_law
+from proposer_rl.tasks.mazes.paths import shortest_path_length
 from proposer_rl.tasks.mazes.rendering import EPISODE, draw_level
-from proposer_rl.tasks.mazes.settings import (
-    Channels,
-    DistributionSettings,
-    EvaluationSettings,
-    MazeSettings,
-    NetworkSettings,
-    SpaceSettings,
-)
 
 WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
@@ -82,9 +80,9 @@ class MazeTask(GridTask):
         distributions: dict[str, DistributionSettings],
         target: str,
         space: SpaceSettings,
-        network: NetworkSettings,
+        network: UNetSettings,
         encoder_channels: Channels,
-        evaluation: EvaluationSettings,
+        evaluation: MazeEvaluationSettings,
         solver: SolverSettings,
         context: ComputeContext,
         make_network: Callable[[], nn.Module] | None = None,

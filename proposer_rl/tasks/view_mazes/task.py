@@ -18,22 +18,26 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import planes
+from proposer_rl.tasks.mazes.maze_settings import Channels
 from proposer_rl.tasks.mazes.rendering import draw_level
-from proposer_rl.tasks.mazes.settings import Channels
 from proposer_rl.tasks.view_mazes.board import ViewBoard
-from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
-from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import visits, walks
-from proposer_rl.tasks.view_mazes.level_files import SUFFIXES, read_view_levels
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
-from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
-from proposer_rl.tasks.view_mazes.settings import (
-    DistributionSettings,
-    EvaluationSettings,
-    SpaceSettings,
+from proposer_rl.tasks.view_mazes.view_distributions import ViewDistribution, ViewSpace
+from proposer_rl.tasks.view_mazes.view_env import (
+    ViewMazeEnv,
+    fewest_actions,
+    optimal_view_return,
+    visits,
+    walks,
+)
+from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
+from proposer_rl.tasks.view_mazes.view_settings import (
+    VIEW_ENTRIES,
+    ViewDistributionSettings,
+    ViewEvaluationSettings,
     ViewMazeSettings,
     ViewNetworkSettings,
+    ViewSpaceSettings,
+    view_network,
 )
 
 LOCATING = 4096  # levels by which the target is located among the bins
@@ -55,7 +59,7 @@ class ViewMazeTask(GridTask):
     """
 
     level = ViewLevel
-    suffixes = SUFFIXES
+    suffixes = VIEW_SUFFIXES
     read_file = staticmethod(read_view_levels)
     fewest_steps = staticmethod(fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
@@ -69,12 +73,12 @@ class ViewMazeTask(GridTask):
         self,
         *,
         maze: ViewMazeSettings,
-        distributions: dict[str, DistributionSettings],
+        distributions: dict[str, ViewDistributionSettings],
         target: str,
-        space: SpaceSettings,
+        space: ViewSpaceSettings,
         network: ViewNetworkSettings,
         encoder_channels: Channels,
-        evaluation: EvaluationSettings,
+        evaluation: ViewEvaluationSettings,
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
@@ -95,12 +99,12 @@ class ViewMazeTask(GridTask):
         self.board = ViewBoard(self, self._named_episodes, self._draws)
 
     def make_distribution(
-        self, settings: DistributionSettings, height: int, width: int
+        self, settings: ViewDistributionSettings, height: int, width: int
     ) -> ViewDistribution:
         """The levels of a distribution's settings on a grid."""
         return ViewDistribution(settings, height, width, self.device)
 
-    def make_space(self, settings: SpaceSettings) -> ViewSpace:
+    def make_space(self, settings: ViewSpaceSettings) -> ViewSpace:
         """The Proposer's bins."""
         return ViewSpace(settings, *self.grid, self.device)
 
@@ -121,11 +125,11 @@ class ViewMazeTask(GridTask):
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
         """K networks with memory."""
-        return memory_actor_critic(population, OBSERVED, self._network.memory)
+        return memory_actor_critic(population, VIEW_ENTRIES, self._network.memory)
 
     def optimal_return(self, levels: ViewLevel) -> Tensor:
         """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
-        return optimal_return(levels, self.maze.max_steps)
+        return optimal_view_return(levels, self.maze.max_steps)
 
     def probe(self, agent: ActorCritic, levels: ViewLevel) -> Tensor:
         """Planes of levels [C], and where the most probable actions lead: float [K, C, 4, H, W]."""
