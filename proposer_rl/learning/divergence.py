@@ -1,4 +1,4 @@
-"""Numbers that are not finite: recognised in the update in which they arise, and named."""
+"""The check that an update's numbers are finite, and the error that names one that is not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def require_finite(
     copies: int | None,
     first: int = 0,
 ) -> None:
-    """Check one update; costs one number read from the device unless something is wrong.
+    """Checks one update; costs one number read from the device unless something is wrong.
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.

@@ -24,7 +24,7 @@ def play_episodes(
     noise: Tensor | None = None,
     remake: Callable[[Tensor], EnvBase] | None = None,
 ) -> Iterator[tuple[Tensor, TensorDictBase, Tensor]]:
-    """Play one episode of each of K Solvers on each of its levels, all at once.
+    """Plays one episode of each of K Solvers on each of its levels, all at once.
 
     Args:
         agent: K Solvers, with memory or without.
@@ -80,7 +80,7 @@ def mean_performance(
     at_once: int | None = None,
     drop_finished: bool = False,
 ) -> TensorDict:
-    """Mean return and share of successes of K Solvers over episodes on levels.
+    """Returns mean return and share of successes of K Solvers over episodes on levels.
 
     The random numbers are those of the levels, the same for every Solver: they differ by what they
     do alone, and what one gets does not depend on which others are evaluated with it.
@@ -131,7 +131,7 @@ def mean_performance(
 
 
 def first_episode_return(rollout: TensorDictBase) -> Tensor:
-    """The sum of the rewards of every environment's first episode, as far as the rollout has it.
+    """Returns every environment's sum of rewards in its first episode, as far as it was played.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
@@ -151,7 +151,7 @@ def first_episode_return(rollout: TensorDictBase) -> Tensor:
 
 
 def succeeded(rollout: TensorDictBase) -> Tensor:
-    """Whether each step of a rollout [*B, T] ended an episode that is a success, bool [*B, T].
+    """Returns whether each step of a rollout [*B, T] ended a successful episode, bool [*B, T].
 
     ``("next", "success")`` [*B, T, 1] says so; without such an entry, success is termination.
     """
@@ -160,7 +160,7 @@ def succeeded(rollout: TensorDictBase) -> Tensor:
 
 
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Whether the first episode of every environment was a success; not if the rollout cut it off.
+    """Returns whether every environment's first episode succeeded; not if the rollout cut it off.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
@@ -182,6 +182,6 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
 
 
 def in_first_episode(rollout: TensorDictBase) -> Tensor:
-    """Steps up to and including the first end, bool [*B, T]."""
+    """Returns whether each step is at or before the first end of an episode, bool [*B, T]."""
     done = rollout["next", "done"].squeeze(-1).long()
     return done.cumsum(-1) - done == 0

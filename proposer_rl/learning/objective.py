@@ -24,7 +24,7 @@ LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from no
 
 
 def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
-    """TorchRL's generalised advantage estimation, of values that stand in the rollout."""
+    """Returns TorchRL's generalised advantage estimation, of values that stand in the rollout."""
     # Its vectorised form splits the batch where episodes end, which it has to look up.
     estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
     estimator.set_keys(value=value_key)
@@ -63,7 +63,7 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
+        """Writes ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
         copies = tensordict.batch_size[0]
         if copies < 2:
             raise ValueError("a baseline from the other copies needs at least 2 copies, got 1")
@@ -86,7 +86,7 @@ MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
 
 def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """The loss of an agent's actor and critic, reading the entries that the agent writes.
+    """Returns the loss of an agent's actor and critic, which reads what the agent writes.
 
     Raises:
         ValueError: if it reduces what belongs to different replicas.
@@ -134,7 +134,7 @@ class CopiesClipLoss(ClipPPOLoss):
             self.clip_value = numbers["clip_value"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms and diagnostics of transitions [*B, T]."""
+        """Returns the terms and diagnostics of transitions [*B, T]."""
         self._each: dict[str, Tensor] = {}
         return super().forward(tensordict).update(self._each)
 
@@ -146,7 +146,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return log_weight, distribution, kl_approx, correction
 
     def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
-        """The critic's term; the old values are not those that the caller has just written."""
+        """Returns the critic's term; its old values are those with which the agent acted."""
         self._acted_value = tensordict.get(ACTED_VALUE, None)
         return super().loss_critic(tensordict)
 
@@ -166,14 +166,14 @@ class CopiesClipLoss(ClipPPOLoss):
 
 
 def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
-    """Means over each replica's own batch, [K], without replicas []; a scalar is everybody's."""
+    """Returns means over each replica's batch, [K] or []; a scalar stands for all replicas."""
     if copies is not None and not numbers.ndim:
         return numbers.expand(copies)
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
 def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
-    """Share of the targets' variance that the values explain: [K], without replicas []."""
+    """Returns the share of the targets' variance that the values explain, [K] or []."""
     value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
@@ -181,7 +181,7 @@ def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None
 
 
 def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
-    """Scale gradients (in place) so that no replica's norm over its parameters exceeds a largest.
+    """Scales gradients (in place) so that no replica's norm exceeds ``max_norm``.
 
     Returns:
         The norms before clipping, [K], without replicas [].

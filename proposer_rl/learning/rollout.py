@@ -69,13 +69,13 @@ class RolloutCollector:
         self.begin_anew()  # a collector resets what it gets
 
     def begin_anew(self) -> None:
-        """Begin the next rollout with a reset in any case."""
+        """Begins the next rollout with a reset in any case."""
         self.memory = None
         if self.episodes is not None:
             self.episodes.begin_anew()
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """A complete rollout [*B, T]; see :meth:`~proposer_rl.learning.ppo.PPO.collect`."""
+        """Returns a complete rollout [*B, T]; see :meth:`proposer_rl.learning.PPO.collect`."""
         device = next(self._agent.parameters()).device
         noise = uniform_noise(self._action.shape, self._horizon, generators, device)
         acted = self.act(TensorDict({"noise": noise}))
@@ -87,7 +87,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
-        """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
+        """Acts by uniform ``noise`` [T, ...]: a ``rollout`` [*B, T] without its ``level`` [*B]."""
         self._policy.begin(inputs["noise"], self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
@@ -102,8 +102,8 @@ class RolloutCollector:
 class ContinuedEpisodes(TransformedEnv):
     """Hands out where its episodes stand when it is reset, after the first time.
 
-    An episode begins where another has ended, on the level that is set by then. So whoever sets the
-    levels need not know when that is; or is asked for them by ``next_levels``.
+    An episode begins where another has ended, on the level that is set by then. Levels can be set
+    at any time, or they are asked of ``next_levels``.
 
     Args:
         env: of batch [*B], which keeps a level until the next reset.
@@ -120,15 +120,15 @@ class ContinuedEpisodes(TransformedEnv):
 
     @property
     def fresh(self) -> bool:
-        """Whether all episodes begin with the next reset."""
+        """Returns whether all episodes begin with the next reset."""
         return self._standing is None
 
     def begin_anew(self) -> None:
-        """Begin all episodes with the next reset."""
+        """Begins all episodes with the next reset."""
         self._standing: TensorDictBase | None = None
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begin episodes where others have ended."""
+        """Begins episodes where others have ended."""
         ended = tensordict["done"].squeeze(-1)
         if self.next_levels is not None and bool(ended.any()):
             self.base_env.set_levels(self.next_levels(ended))
@@ -137,7 +137,7 @@ class ContinuedEpisodes(TransformedEnv):
         return standing
 
     def stand(self, levels: Any, actions: Tensor, steps: Tensor) -> None:
-        """Take up episodes on levels [*B] where other ones like them were left.
+        """Brings episodes on levels [*B] to where others, with the same actions, were left.
 
         An environment that does the same after the same actions then stands where that one did.
 
@@ -170,7 +170,7 @@ class ContinuedEpisodes(TransformedEnv):
 
 @torch.no_grad()
 def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase) -> None:
-    """Write the present values of steps [*B, T] on a level [*B], before and after each step."""
+    """Writes the present values of steps [*B, T] on a level [*B], before and after each step."""
     context = agent.encode(level)
     with set_recurrent_mode(True):
         now = agent.decode(steps.select(*agent.step_keys), context)
@@ -181,7 +181,7 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 
 @torch.no_grad()
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
-    """Write the values after each of the steps [*B, T], whose level has this context [*B].
+    """Writes the values after each of the steps [*B, T], whose level has this context [*B].
 
     With the memory that is there after each step. Where an episode goes on, that is the value
     before the next step; an agent that reads each step for itself is not asked again for those.
@@ -235,7 +235,7 @@ class RolloutPolicy(TensorDictModuleBase):
         ]
 
     def begin(self, noise: Tensor, memory: TensorDictBase | None = None) -> None:
-        """Expect a rollout.
+        """Prepares for the next rollout.
 
         Args:
             noise: uniform numbers in [0, 1), [T, ...], one for each element of T actions.
@@ -245,7 +245,7 @@ class RolloutPolicy(TensorDictModuleBase):
         self._before = memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write action, log-probability and value of the next step."""
+        """Writes action, log-probability and value of the next step."""
         (agent,), (level,) = self._agent, self._level
         index, noise = next(self._steps)
         if index == 0:

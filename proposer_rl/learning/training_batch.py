@@ -51,7 +51,7 @@ class Minibatches:
         self.steps = smallest * length if self._sequences else smallest
 
     def draw(self, generators: Sequence[torch.Generator] | None) -> dict[str, Tensor]:
-        """The orders of one update, one for each epoch by its entry's name: int64 [K, N] or [N].
+        """Draws an update's orders, one for each epoch by its entry's name: int64 [K, N] or [N].
 
         Replica k's come from the k-th generator; without any, from torch's default one.
         """
@@ -71,7 +71,7 @@ class Minibatches:
     def __call__(
         self, steps: TensorDictBase, level: TensorDictBase, order: Tensor | None
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """The parts of steps [*B, T] on a level [*B] in an epoch's order, each with its level.
+        """Yields the parts of steps [*B, T] in an epoch's order, each with its level.
 
         Without an order that is all of it as it is.
         """
@@ -147,7 +147,7 @@ class Statistics:
             agent.normalization = numbers.to(next(agent.parameters()).device)
 
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
-        """Take in the rewards of a rollout [*B, T], and put its values into their unit.
+        """Updates the moments of rewards by a rollout [*B, T], and puts its values into their unit.
 
         In the first one, before which nothing was trained on, observations come first.
         """
@@ -166,12 +166,12 @@ class Statistics:
                 rollout.set(key, rollout[key] * change)
 
     def after(self, rollout: TensorDictBase, *, first: bool) -> None:
-        """Take in what was observed in a rollout [*B, T] that has been trained on."""
+        """Updates the moments of observations by a rollout [*B, T] that has been trained on."""
         if self._agent.normalization is not None and not first:
             self._agent.normalization.update_observations(rollout)
 
     def in_units(self, steps: TensorDictBase) -> TensorDictBase:
-        """Steps whose values, targets and advantages are in the unit of the agent's values."""
+        """Returns steps with values, targets and advantages in the unit of the agent's values."""
         value, normalization = self._agent.value_key, self._agent.normalization
         if normalization is not None and normalization.returns is not None:
             unit = normalization.unit(steps[value])
@@ -180,7 +180,7 @@ class Statistics:
         return steps
 
     def _discounted(self, rollout: TensorDictBase) -> Tensor:
-        """The sum of an episode's discounted rewards up to each step: float64 [*B, T]."""
+        """Returns the sum of an episode's discounted rewards up to each step, float64 [*B, T]."""
         reward = rollout["next", "reward"].squeeze(-1).double()
         going_on = ~rollout["next", "done"].squeeze(-1)
         sums, so_far = [], self.discounted

@@ -1,96 +1,25 @@
-"""Networks over whole grids: 3x3 convolutions, a U-Net, and its maps read at the agent's cell."""
+"""Networks over whole grids: a U-Net, and its maps read at the agent's cell."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.nn.grad import conv2d_input
 
 from proposer_rl.models.actor_critic import ActorCritic, categorical, orthogonal_
-from proposer_rl.models.population import Population
+from proposer_rl.models.population import Conv3x3, Population
 
-# Where the product below is faster than the library's kernel, measured on a CPU with AMX.
-FEW_PIXELS = 25  # pixels at most
-MANY_CHANNELS = 64  # at least, in and out
 LARGEST_MATRIX = 2**22  # numbers in the weights of an interpolation: a 64x64 grid from its half
 CELLS_PER_PASS = 2**17  # that go through a network together, where each has planes of its own
 
 
-class Conv3x3(nn.Conv2d):
-    """A 3x3 convolution with a border of zeros; the resolution stays.
-
-    In bf16 on a CPU the library's weight gradient takes several times as long as its forward pass
-    on maps of a few pixels with many channels. There it is computed as one matrix product instead;
-    everything else, and every other case, is PyTorch's.
-
-    Attributes:
-        as_product: whether all of it is one product with every pixel's neighbourhood. The
-            convolutions of stacked networks, which have a kernel for each of them otherwise, are
-            products of stacks then.
-    """
-
-    as_product = False
-
-    def __init__(self, in_channels: int, out_channels: int) -> None:
-        super().__init__(in_channels, out_channels, 3, padding=1)
-
-    def forward(self, maps: Tensor) -> Tensor:
-        """Convolve maps [B, in_channels, H, W] to [B, out_channels, H, W]."""
-        assert self.bias is not None
-        if self.as_product:
-            weight = self.weight.permute(2, 3, 1, 0).flatten(0, 2)  # [9 * in, out]
-            pixels = torch.addmm(self.bias, _neighbourhoods(maps), weight)
-            pixels = pixels.view(len(maps), *maps.shape[-2:], self.out_channels)
-            return pixels.permute(0, 3, 1, 2).clone(memory_format=torch.contiguous_format)
-        small = maps.shape[-2] * maps.shape[-1] <= FEW_PIXELS
-        small &= min(self.in_channels, self.out_channels) >= MANY_CHANNELS
-        if small and maps.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
-            low = torch.get_autocast_dtype("cpu")
-            return _ProductGradient.apply(maps.to(low), self.weight.to(low), self.bias.to(low))
-        return super().forward(maps)
-
-
-class _ProductGradient(torch.autograd.Function):
-    """``F.conv2d`` with padding 1, and its weight gradient as one matrix product."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(maps: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        return F.conv2d(maps, weight, bias, padding=1)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:2])
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        maps, weight = ctx.saved_tensors
-        pixels = gradient.permute(0, 2, 3, 1).flatten(0, 2)  # [B * H * W, out]
-        product = pixels.T.contiguous() @ _neighbourhoods(maps)  # [out, 9 * in]
-        of_weight = product.unflatten(1, (3, 3, -1)).permute(0, 3, 1, 2)
-        wanted = ctx.needs_input_grad[0]
-        of_maps = conv2d_input(maps.shape, weight, gradient, padding=1) if wanted else None
-        return of_maps, of_weight, pixels.sum(0)
-
-
-def _neighbourhoods(maps: Tensor) -> Tensor:
-    """The 3x3 pixels around every pixel, [B * H * W, 9 * C] from [B, C, H, W]."""
-    height, width = maps.shape[-2:]
-    padded = F.pad(maps.permute(0, 2, 3, 1), (0, 0, 1, 1, 1, 1))
-    around = [padded[:, r : r + height, c : c + width] for r in range(3) for c in range(3)]
-    return torch.cat(around, -1).flatten(0, 2)
-
-
 class DoubleConv(nn.Sequential):
-    """Twice: 3x3 convolution, GroupNorm, ReLU."""
+    """A 3x3 convolution, GroupNorm and ReLU, twice."""
 
     def __init__(self, in_channels: int, out_channels: int, groups: int) -> None:
         super().__init__(
@@ -152,7 +81,7 @@ class UNet(nn.Module):
             orthogonal_(head, gain)
 
     def forward(self, planes: Tensor) -> tuple[Tensor, ...]:
-        """Map ``planes`` [*B, in_channels, H, W] to one tensor [*B, maps, H, W] for each head."""
+        """Maps ``planes`` [*B, in_channels, H, W] to one tensor [*B, maps, H, W] for each head."""
         leading = planes.shape[:-3]
         x = planes.reshape(-1, *planes.shape[-3:])
         # Channels last, by permutation: the memory format itself is not available under vmap.
@@ -170,7 +99,7 @@ class UNet(nn.Module):
 
 
 def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
-    """Interpolate maps [B, C, h, w] bilinearly to [B, C, H, W], as ``F.interpolate`` does.
+    """Interpolates maps [B, C, h, w] bilinearly to [B, C, H, W], as ``F.interpolate`` does.
 
     One product with a constant matrix: on small maps its backward pass takes a fraction of the time
     of the kernel's, and the result stays in the channels-last layout. Maps for which the matrix
@@ -188,7 +117,7 @@ def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
 def _interpolation(
     height: int, width: int, to_height: int, to_width: int, device: torch.device
 ) -> Tensor:
-    """Weights of every input pixel in every output pixel, float32 [H * W, h * w]."""
+    """Returns weights of every input pixel in every output pixel, float32 [H * W, h * w]."""
     with torch.inference_mode(False), torch.autocast(device.type, enabled=False):
         pixels = torch.eye(height * width, device=device).unflatten(1, (1, height, width))
         columns = F.interpolate(pixels, (to_height, to_width), mode="bilinear")
@@ -196,7 +125,7 @@ def _interpolation(
 
 
 def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCritic:
-    """Actor-critic of a network that maps planes [*B, C, H, W] to action and value maps.
+    """Returns actor-critic of a network that maps planes [*B, C, H, W] to action and value maps.
 
     It reads ``planes``, and the agent's row and column in ``agent``, int64 [*B, 2].
 
@@ -225,7 +154,7 @@ def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCrit
 
 
 def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Tensor, Tensor]:
-    """Read logits and values at the agents' cells.
+    """Reads logits and values at the agents' cells.
 
     Args:
         policy_map: float [*B, A, H, W].
@@ -244,7 +173,7 @@ def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Ten
 
 
 def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) -> Tensor:
-    """Action logits at every cell of levels: what the agent would do wherever it stood.
+    """Returns action logits at every cell of levels: what the agent would do wherever it stood.
 
     Args:
         agent: from :func:`map_actor_critic`.
@@ -260,7 +189,7 @@ def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) 
 def cell_maps(
     agent: ActorCritic, planes: Tensor, *, gradients: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Action logits and values at every cell of levels; the arguments are :func:`cell_logits`'.
+    """Returns action logits and values at every cell of levels; see :func:`cell_logits`.
 
     Returns:
         Logits float [*B, A, H, W] and the critic's values float [*B, 1, H, W].

@@ -65,7 +65,7 @@ class MemoryNetwork(nn.Module):
     def forward(
         self, begins: Tensor, hidden: Tensor, cell: Tensor, *observed: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Go through N sequences of T steps.
+        """Reads N sequences of T steps.
 
         Args:
             begins: bool [N, T, 1], whether an episode begins with the step.
@@ -102,7 +102,7 @@ def memory_actor_critic(
     *,
     distribution_class: Callable[..., Distribution] = categorical,
 ) -> ActorCritic:
-    """Actor-critic of K networks with memory.
+    """Returns actor-critic of K networks with memory.
 
     As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` says that the
     last batch dimension is time: the memory then goes through it from what stands at the first
@@ -150,7 +150,7 @@ class _MemoryHead(TensorDictModuleBase):
 def through_time(
     cell: LSTMCell, inputs: Tensor, rows: Tensor, begins: Tensor, memory: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """An LSTM over N sequences of T steps, which forgets where an episode begins.
+    """Runs an LSTM over N sequences of T steps, which forgets where an episode begins.
 
     Args:
         cell: has the weights of a ``torch.nn.LSTMCell``, of width M.
@@ -255,7 +255,7 @@ def _backwards(
 
 
 def _compiled(steps: Any, on: Tensor) -> Any:
-    """The steps as TorchScript on CPUs, which spends less between the operations than Python."""
+    """Returns the steps as TorchScript on CPUs, which spends less time between operations."""
     # Python 3.14 has no TorchScript; on a GPU the steps are recorded.
     if not population.at_hand(on) or sys.version_info >= (3, 14):
         return steps
@@ -326,5 +326,5 @@ class _ThroughTime(torch.autograd.Function):
             x.expand(info.batch_size, *x.shape) if dim is None else x.movedim(dim, 0)
             for x, dim in zip(tensors, in_dims, strict=True)
         )
-        rows = tensors[1]  # of codes, which are nobody's own
+        rows = tensors[1]  # of codes, which all replicas share
         return _ThroughTime.apply(inputs, rows, kept.movedim(0, 1), hidden, cell, weight), (1,) * 4

@@ -56,7 +56,7 @@ class Distribution(Protocol):
     """Levels to draw from."""
 
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
-        """Draw levels [count] on the task's device; the generator is one of the CPU."""
+        """Draws levels [count] on the task's device; the generator is one of the CPU."""
 
 
 class Space(Distribution, Protocol):
@@ -64,21 +64,21 @@ class Space(Distribution, Protocol):
 
     @property
     def axes(self) -> Mapping[str, Sequence[float]]:
-        """The values along each axis, by the axis's name.
+        """Returns the values along each axis, by the axis's name.
 
         The bins are their product, the last axis running fastest.
         """
 
     @property
     def size(self) -> int:
-        """The number N of bins."""
+        """Returns the number N of bins."""
 
     @property
     def coordinates(self) -> Tensor:
-        """Of each bin, scaled to [-1, 1] along every axis: float32 [N, D] on the CPU."""
+        """Returns each bin's place, -1 to 1 along every axis: float32 [N, D] on the CPU."""
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, P] of bins, int64 [K, P], on the task's device; row k from generator k."""
+        """Draws levels [K, P] of bins, int64 [K, P], on the task's device; row k by generator k."""
 
 
 class LevelResult(NamedTuple):
@@ -106,7 +106,7 @@ class DifferentiableTask(Protocol):
     """A task whose performance has gradients: first-order gain without sampling."""
 
     def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
+        """Computes return and success of K Solvers on their own levels [K, E], with gradients.
 
         Where gradients are enabled, with gradients towards the agent's parameters.
         """
@@ -128,7 +128,7 @@ class OptimalTask(Protocol):
     """A task that knows what could be reached: regret without an antagonist."""
 
     def optimal_return(self, levels: Levels) -> Tensor:
-        """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
+        """Returns the largest expected return that a policy reaches on levels [*B]: float [*B]."""
 
 
 class EpisodeLaw(NamedTuple):
@@ -158,7 +158,7 @@ class EnumerableTask(Protocol):
     """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
 
     def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
-        """The law of the episodes of K Solvers, each on its own levels [K, E]."""
+        """Returns the law of the episodes of K Solvers, each on its own levels [K, E]."""
 
 
 @runtime_checkable
@@ -166,11 +166,11 @@ class EditableTask(Protocol):
     """A task whose levels can be changed a little."""
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+        """Returns levels [K, n] after ``count`` small random edits; row k by generator k."""
 
 
 def space_features(space: Any, levels: Levels) -> Tensor:
-    """Features of levels by where they lie in a space, among the bins or beside them.
+    """Returns features of levels by where they lie in a space, among the bins or beside them.
 
     With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
     unless there are more than :data:`MANY_BINS`.
@@ -206,19 +206,19 @@ def space_features(space: Any, levels: Levels) -> Tensor:
 
 
 def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
-    """What makes a policy's distribution of actions of logits, by the actions' spec."""
+    """Returns what makes a policy's distribution of its logits, by the actions' spec."""
     if isinstance(acts, MultiCategorical):
         return joint_categorical
     return categorical if isinstance(acts, Categorical) else normal
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
-    """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
+    """Expands levels [E], which all K Solvers share, to [K, E]; returns [K, E] as they are."""
     return levels.expand(agent.copies, levels.batch_size[-1])
 
 
 def check_distributions(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuse unknown names of distributions.
+    """Refuses names of distributions that there are not.
 
     Raises:
         ValueError: naming the key.
@@ -230,7 +230,7 @@ def check_distributions(known: Mapping[str, Any], target: str, measured: Sequenc
 
 
 def refuse_single_bin(space: Space) -> None:
-    """Refuse a space in which there is nothing to choose.
+    """Refuses a space in which there is nothing to choose.
 
     Raises:
         ValueError: if it has one bin.
@@ -242,7 +242,7 @@ def refuse_single_bin(space: Space) -> None:
 
 
 def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Make something, naming the key in whatever is wrong with its value."""
+    """Makes something of arguments, and names their key in what is wrong with them."""
     try:
         return make(*arguments)
     except ValueError as error:

@@ -6,7 +6,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from proposer_rl.models import UNet
-from proposer_rl.models.grids import Conv3x3, _ProductGradient, upsample
+from proposer_rl.models.grids import upsample
+from proposer_rl.models.population import Conv3x3, _ProductGradient
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (5, 5), (3, 7)])

@@ -168,7 +168,7 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
 
 
 def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.01) -> Tensor:
-    """The largest expected return of any policy, that of a shortest path.
+    """Returns the largest expected return of any policy, that of a shortest path.
 
     With d moves on it, T the step limit and c the step's penalty it is 1 - c d if d <= T: the step
     that reaches the goal costs, too, and none of fewer steps does. Otherwise every policy plays to
@@ -195,7 +195,7 @@ def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.0
 
 
 def worst_mean(values: Tensor, fraction: float) -> Tensor:
-    """Mean of the lowest values: the conditional value at risk of a uniform draw from them.
+    """Returns the mean of the lowest values, the conditional value at risk of a uniform draw.
 
     With n values and m = fraction · n it is exactly the mean of the m lowest, of which the last
     counts in part where m is no whole number (Rockafellar & Uryasev, Journal of Banking & Finance
@@ -219,7 +219,7 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
 
 
 def _policy(cell_logits: Tensor, greedy: bool = False) -> Tensor:
-    """Action probabilities ``[*B, 4, H, W]``, as precise as the logits."""
+    """Returns action probabilities ``[*B, 4, H, W]``, as precise as the logits."""
     precise = torch.promote_types(cell_logits.dtype, torch.float32)
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)
@@ -269,7 +269,7 @@ def _result(levels: Level, returns: Tensor, success: Tensor) -> TensorDict:
 
 
 def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
-    """Probability of reaching the goal from every cell, each with the whole step limit.
+    """Returns the probability of reaching the goal from every cell within the step limit.
 
     Returns:
         float ``[H, W]``, 1 at the goal. What it says of an obstacle has no meaning.
@@ -291,7 +291,7 @@ def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
 
 
 def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
-    """Expected number of steps that an episode begins at every cell.
+    """Returns the expected number of steps that an episode takes from every cell.
 
     Returns:
         float ``[H, W]``, 0 at the goal, where no step is taken; their sum is the expected length of
@@ -308,7 +308,7 @@ def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
 def episode_law(
     levels: Level, policy: Tensor, values: Tensor, max_steps: int = 25, step_penalty: float = 0.01
 ) -> EpisodeLaw:
-    """All that an episode can come to, and all steps that it can be made of.
+    """Returns the law of episodes: their outcomes, and the steps that they are made of.
 
     With p_t(c) the probability that step t + 1 begins at cell c, and g_t(c) the expectation of
     1 / (steps of the episode) for one that is at c after t of them, the weight of action a at c is
@@ -363,7 +363,7 @@ def episode_law(
 
 
 def _presence(levels: Level, policy: Tensor, max_steps: int) -> Tensor:
-    """Probability that a step begins at every cell, [max_steps, *B, H*W]: none does at the goal.
+    """Returns the probability that a step begins at every cell, 0 at the goal: [T, *B, H*W].
 
     Of levels [*B] and action probabilities float [*B, 4, H*W].
     """

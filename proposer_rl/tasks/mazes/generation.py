@@ -115,7 +115,7 @@ def generate_levels(
 def _specifications(
     obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Both arguments as float64 and int64 tensors of one shape on the CPU, if they are in range."""
+    """Returns both arguments in range, as float64 and int64 tensors of one shape on the CPU."""
     if isinstance(obstacle_fraction, Tensor):
         obstacle_fraction = obstacle_fraction.detach().cpu()
     fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
@@ -200,7 +200,7 @@ class _Task:
         return result
 
     def _share(self, pending: Tensor, drawn: Tensor, accepted: Tensor, on_cpu: bool) -> Tensor:
-        """Candidates of each specification to draw next, as many as should fill what is pending.
+        """Returns how many candidates of each specification should fill what is pending.
 
         The estimated rate is that of a uniform prior (one success and one failure seen in
         advance), so a specification never met asks for twice as many each time.
@@ -251,7 +251,7 @@ FLIP_WALL, MOVE_GOAL, MOVE_START = range(3)
 
 
 def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) -> L:
-    """Levels after a number of random edits, one after another.
+    """Returns levels after a number of random edits, one after another.
 
     An edit is one of three operators, each with probability 1/3:
 
@@ -305,7 +305,7 @@ def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) ->
 
 
 def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
-    """One edit of each of levels [C]: int64 [C] says which, float [C] in [0, 1) where."""
+    """Edits levels [C] once each; int64 [C] says how, float [C] in [0, 1) where."""
     width = levels.walls.shape[-1]
     walls = levels.walls.flatten(1)  # [C, H*W]
     start, goal = (cell_index(end, width).unsqueeze(1) for end in (levels.start, levels.goal))

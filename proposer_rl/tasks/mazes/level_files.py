@@ -36,7 +36,7 @@ class Item:
 
 
 def _items(levels: list[Item]) -> None:
-    """What a file in JSON holds."""
+    """Takes what a file in JSON must hold, for the check of its types."""
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -85,12 +85,12 @@ def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> N
 
 
 def shipped_sets() -> list[str]:
-    """Names of the sets that come with the package."""
+    """Returns the names of the sets that come with the package."""
     return sorted(file.stem for file in _HERE.glob("*.txt"))
 
 
 def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """The levels of a shipped set; an agent that turns looks to the right.
+    """Returns the levels of a shipped set; an agent that turns looks to the right.
 
     Args:
         name: Of the set.
@@ -218,7 +218,7 @@ def levels_to_json(levels: Mapping[str, Level]) -> str:
 def named_levels(
     drawn: Sequence[tuple[str, Sequence[str], int | None]], kind: type[Level] = Level
 ) -> dict[str, Level]:
-    """Levels of names, rows of a drawing and, where it is known, the length of the shortest path.
+    """Returns levels by name, of their names, rows and, where known, shortest path lengths.
 
     Raises:
         ValueError: As :func:`levels_from_text`.
@@ -247,13 +247,13 @@ def named_levels(
 
 
 def check_count(count: int) -> None:
-    """Refuse a file of more levels than are ever evaluated."""
+    """Refuses a file of more levels than are ever evaluated."""
     if count > MOST_FILE_LEVELS:
         raise ValueError(f"holds {count:,} levels; at most {MOST_FILE_LEVELS:,} are read")
 
 
 def check_size(name: str, height: int, width: int) -> None:
-    """Refuse a level of more cells than are ever evaluated."""
+    """Refuses a level of more cells than are ever evaluated."""
     if height * width > MOST_CELLS:
         raise ValueError(
             f"level {name!r:.80}: {height:,}x{width:,} cells; at most {MOST_CELLS:,} are read"
@@ -267,7 +267,7 @@ def _with_lengths(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
 
 
 def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
-    """The length of the level's shortest path, if it is the one recorded."""
+    """Returns the length of a level's shortest path; refuses another recorded one."""
     usable = name.strip() == name and name.isprintable() and not set(name) & set("[]")
     if not usable or not 0 < len(name) <= LONGEST_NAME:
         raise ValueError(
@@ -284,6 +284,6 @@ def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
 
 
 def check_suffix(path: Path, known: Sequence[str]) -> None:
-    """Refuse a file whose name says that it holds something else."""
+    """Refuses a file whose name says that it holds something else."""
     if path.suffix not in known:
         raise ValueError(f"{path}: must end in one of {', '.join(known)}")

@@ -73,7 +73,7 @@ class Level(TensorClass):
 
     @classmethod
     def _parse(cls, drawing: str) -> Any:
-        """The level of one drawing."""
+        """Reads the level of one drawing."""
         rows = drawn_rows(drawing)
         flat = "".join(rows)
         if not rows or any(len(row) != len(rows[0]) for row in rows):
@@ -128,7 +128,7 @@ def cell_index(cell: Tensor, width: int) -> Tensor:
 
 
 def cell_position(index: Tensor, width: int) -> Tensor:
-    """Inverse of :func:`cell_index`: int64 ``[*B]`` to int64 ``[*B, 2]`` (row, column)."""
+    """Returns rows and columns, int64 ``[*B, 2]``, of numbered cells, int64 ``[*B]``."""
     return torch.stack([index // width, index % width], dim=-1)
 
 
@@ -175,5 +175,5 @@ def _refuse_any(bad: Tensor, fault: str) -> None:
 
 
 def drawn_rows(drawing: str) -> list[str]:
-    """The rows of a drawing, without blank lines and what stands before or after a row."""
+    """Returns the rows of a drawing, without blank lines and what stands before or after a row."""
     return [row for row in map(str.strip, drawing.splitlines()) if row]

@@ -63,11 +63,11 @@ class LevelEnv(EnvBase):
 
     @abstractmethod
     def _first(self) -> dict[str, Tensor]:
-        """What is observed when an episode begins, ``"agent"`` included; nobody writes into it."""
+        """Returns what is observed when an episode begins, ``"agent"`` too; do not write to it."""
 
     @property
     def levels(self) -> Level:
-        """The levels that are being played, ``[*B]``."""
+        """Returns the levels that are being played, ``[*B]``."""
         return self._levels
 
     def set_levels(self, levels: Level) -> None:
@@ -92,7 +92,7 @@ class LevelEnv(EnvBase):
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's, without its checks of what this environment has written itself."""
+        """Steps as TorchRL does, without checks of what this environment has written itself."""
         after, given = self._step(tensordict), tensordict.get("next", None)
         if given is not None:  # by the policy, such as what it remembers
             after.update(given.exclude(*after.keys()))
@@ -121,7 +121,7 @@ class LevelEnv(EnvBase):
         return TensorDict(after, tensordict.batch_size, device=tensordict.device)
 
     def _begun(self, first: Tensor, standing: Tensor, done: Tensor, ended: Tensor | None) -> Tensor:
-        """What stands in mazes, as at first where they are done."""
+        """Returns an entry's values, those of the beginning where mazes are done."""
         each = first.shape[self.batch_dims :]
         if ended is None:
             return first.where(done.reshape(*self.batch_size, *[1] * len(each)), standing)
@@ -137,7 +137,7 @@ class LevelEnv(EnvBase):
         return self
 
     def _specify(self, actions: int, **observed: TensorSpec) -> None:
-        """Make the specifications: of one of so many actions, and of what else is observed."""
+        """Makes the specifications of ``actions`` choices and of further observations."""
         batch, (height, width) = self.batch_size, self._grid
         last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
         self.observation_spec = Composite(
@@ -176,7 +176,7 @@ class LevelEnv(EnvBase):
         return TensorDict(state, self.batch_size, device=self.device)
 
     def _after(self, terminated: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Count of the steps, and whether the episode has ended, after a step.
+        """Returns the count of steps, and whether the episode has ended, after a step.
 
         A step that reaches the goal at the limit is terminated and not truncated, since nothing was
         cut off.

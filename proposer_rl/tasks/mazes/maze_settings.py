@@ -94,7 +94,7 @@ PLANES = 3
 
 
 def unet(settings: UNetSettings, planes: int) -> UNet:
-    """The network of one Solver, which sees so many planes."""
+    """Returns the U-Net of one Solver, which sees so many planes."""
     return UNet(
         in_channels=planes,
         head_channels=(ACTIONS, 1),
@@ -105,7 +105,7 @@ def unet(settings: UNetSettings, planes: int) -> UNet:
 
 
 def faster_precision(channels: Sequence[int], device: torch.device) -> str:
-    """``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
+    """Returns ``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
 
     That is a wide network on a CPU with instructions for it; see docs/explanation/performance.md.
 
@@ -118,7 +118,7 @@ def faster_precision(channels: Sequence[int], device: torch.device) -> str:
 
 
 def check_network(maze: MazeSettings, network: UNetSettings) -> None:
-    """Refuse a grid that the U-Net of the settings cannot see."""
+    """Refuses a grid that the U-Net of the settings cannot see."""
     size, channels = f"{maze.height}x{maze.width}", network.channels
     if min(maze.height, maze.width) >> (len(channels) - 1) < 1:
         raise ValueError(
@@ -138,7 +138,7 @@ def check_network(maze: MazeSettings, network: UNetSettings) -> None:
 
 
 def check_level_size(name: str, size: Sequence[int], network: UNetSettings) -> None:
-    """Refuse a level of a size that the U-Net of the settings cannot see."""
+    """Refuses a level of a size that the U-Net of the settings cannot see."""
     least = 2 ** (len(network.channels) - 1)
     height, width = size
     if min(height, width) < least:
@@ -154,7 +154,7 @@ def check_level_size(name: str, size: Sequence[int], network: UNetSettings) -> N
 
 
 def _normalises_single_numbers(height: int, width: int, network: UNetSettings) -> bool:
-    """Whether a group of channels of the U-Net has one number, which normalising makes zero."""
+    """Returns whether a group of channels has one number, which normalising makes zero."""
     return any(
         (height >> halvings) * (width >> halvings) * channels == network.groups
         for halvings, channels in enumerate(network.channels)

@@ -38,17 +38,17 @@ class Draws:
         self._group = group
 
     def rand(self, rows: int) -> Tensor:
-        """Uniform numbers in [0, 1), float32 ``[rows, C]``."""
+        """Returns uniform numbers in [0, 1), float32 ``[rows, C]``."""
         return self._columns(lambda n, g: torch.rand(rows, n, generator=g, device=self.device))
 
     def randint(self, high: int) -> Tensor:
-        """Uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
+        """Returns uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
         return self._columns(
             lambda n, g: torch.randint(high, (1, n), generator=g, device=self.device)
         )
 
     def of(self, kept: Tensor) -> Draws:
-        """The same for some of the candidates, whose ascending indices are given, int64 ``[A]``."""
+        """Returns the draws of some candidates, given by their ascending indices, int64 ``[A]``."""
         return Draws(self._generators, self._group[kept.cpu()], self.device)
 
     def _columns(self, draw: Callable[[int, torch.Generator | None], Tensor]) -> Tensor:
@@ -95,7 +95,7 @@ def draw_uniform(
 
 
 def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
-    """Uniform obstacles and a uniform free start.
+    """Draws uniform obstacles and a uniform free start.
 
     The obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
     3.4.2, algorithm S): a cell becomes one with probability (obstacles still needed) / (cells still
@@ -145,7 +145,7 @@ def draw_path_first(
 
 
 def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[Tensor, Tensor]:
-    """Random paths of which no two cells touch unless they are consecutive.
+    """Draws random paths of which no two cells touch unless they are consecutive.
 
     A path goes on to a uniform choice among the cells whose only carved neighbour is its end.
 

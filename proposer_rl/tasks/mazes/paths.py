@@ -50,7 +50,7 @@ def successors(level: Level) -> Tensor:
 def shortest_way(
     following: Sequence[Sequence[int]], start: int, arrived: Callable[[int], bool]
 ) -> list[int] | None:
-    """The nodes of a way of fewest actions, the first and the last included.
+    """Returns the nodes of a path of fewest actions, the first and the last included.
 
     Args:
         following: where each action leads from each node.
@@ -154,12 +154,12 @@ def cells_at_depth(free: Tensor, source: Tensor, depth: Tensor) -> Tensor:
 
 
 def padded_index(cell: Tensor, width: int) -> Tensor:
-    """Numbers of cells of an H x W grid within that grid padded by one cell on every side."""
+    """Returns numbers of cells in a grid padded on every side, from those in the grid itself."""
     return (cell // width + 1) * (width + 2) + cell % width + 1
 
 
 def _begin(free: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-    """The frontier at step 0, ``[H + 2, W + 2, N]`` with an empty rim, and the cells not in it."""
+    """Returns the frontier at step 0, ``[H + 2, W + 2, N]`` with an empty rim, and other cells."""
     height, width, count = free.shape
     frontier = free.new_zeros(height + 2, width + 2, count)
     frontier.flatten(0, 1).scatter_(0, padded_index(source, width).unsqueeze(0), True)
@@ -167,7 +167,7 @@ def _begin(free: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _spread(frontier: Tensor, spare: Tensor, unvisited: Tensor) -> None:
-    """One step: writes the next frontier into ``spare`` and takes it out of ``unvisited``."""
+    """Writes the next frontier into ``spare`` and takes it out of ``unvisited``."""
     following = spare[1:-1, 1:-1]
     torch.bitwise_or(frontier[:-2, 1:-1], frontier[2:, 1:-1], out=following)
     following |= frontier[1:-1, :-2]

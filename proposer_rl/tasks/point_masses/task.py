@@ -93,7 +93,7 @@ class PointMassEnv(EnvBase):
         self.set_levels(levels)
 
     def set_levels(self, levels: TensorDictBase) -> None:
-        """Play these levels [*B]; each mass from its next reset on.
+        """Sets levels [*B], which each mass plays from its next reset on.
 
         Raises:
             ValueError: if they are of another batch shape.
@@ -106,7 +106,7 @@ class PointMassEnv(EnvBase):
         self._first[..., -len(GATE) :] = torch.stack([levels[n].float() for n in GATE], -1)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """As TorchRL's, but without asking a GPU first whether any episode is over."""
+        """Begins ended episodes anew, without asking a GPU first whether there are any."""
         done = tensordict["done"]
         if population.at_hand(done):
             return super().maybe_reset(tensordict)
@@ -146,11 +146,11 @@ class PointMassEnv(EnvBase):
         return TensorDict(entries, self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Do nothing: nothing is random."""
+        """Does nothing, as nothing is random."""
 
 
 def after_substeps(seen: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where masses are after a step, and whether they hit the wall on their way.
+    """Returns where masses are after a step, and whether they hit the wall on their way.
 
     Args:
         seen: observations, float [*B, 7].
@@ -247,22 +247,22 @@ class PointMassTask(Task):
 
     @property
     def about(self) -> dict[str, str]:
-        """Texts about the task, by their labels."""
+        """Returns texts about the task by their labels."""
         target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
         return {"Target": target, **super().about}
 
     def environment(self, levels: TensorDictBase) -> PointMassEnv:
-        """Masses before their gates."""
+        """Returns an environment of masses before their gates."""
         return PointMassEnv(levels, max_steps=self.max_steps, device=self.device)
 
     def network(self) -> nn.Module:
-        """Two MLPs, of the policy and of the critic."""
+        """Returns two MLPs, of the policy and of the critic."""
         return SolverNetwork([Unbounded(4 + len(GATE))], Unbounded(2), self._network)
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
-        """The walls of levels [n], and where the mass was in the first episode of [n, T]."""
+        """Draws the walls of levels [n], and the mass's path in the first episode of [n, T]."""
         gates = list(zip(levels["position"].tolist(), levels["width"].tolist(), strict=True))
         if rollout is None:
             return [gate_picture(x, width, []) for x, width in gates]
@@ -275,7 +275,7 @@ class PointMassTask(Task):
 def gate_picture(
     position: float, width: float, way: Sequence[Sequence[float]]
 ) -> NDArray[np.uint8]:
-    """A wall with its gate, the goal, and a way: uint8 [SIDE_PIXELS, SIDE_PIXELS, 3]."""
+    """Draws a wall with its gate, the goal, and a path: uint8 [SIDE_PIXELS, SIDE_PIXELS, 3]."""
 
     def at(x: float, y: float) -> tuple[float, float]:
         return (x + BORDER) / (2 * BORDER) * SIDE_PIXELS, (BORDER - y) / (2 * BORDER) * SIDE_PIXELS

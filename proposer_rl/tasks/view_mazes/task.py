@@ -101,44 +101,44 @@ class ViewMazeTask(GridTask):
     def make_distribution(
         self, settings: ViewDistributionSettings, height: int, width: int
     ) -> ViewDistribution:
-        """The levels of a distribution's settings on a grid."""
+        """Returns the levels of a distribution's settings on a grid."""
         return ViewDistribution(settings, height, width, self.device)
 
     def make_space(self, settings: ViewSpaceSettings) -> ViewSpace:
-        """The Proposer's bins."""
+        """Returns the Proposer's bins."""
         return ViewSpace(settings, *self.grid, self.device)
 
     @property
     def target_shares(self) -> Tensor:
-        """The bins nearest to each of many levels of the target, as shares of the bins: [N]."""
+        """Returns the share of the target's levels that is nearest to each bin: float [N]."""
         levels = self.target.sample(LOCATING, Streams(0, "target_shares").generator())
         shares: Tensor = self.space.shares(levels)
         return shares
 
     def environment(self, levels: ViewLevel) -> EnvBase:
-        """Mazes to be played."""
+        """Returns an environment of mazes."""
         return ViewMazeEnv(levels, max_steps=self.maze.max_steps)
 
     def network(self) -> MemoryNetwork:
-        """The network of one Solver."""
+        """Returns the network of one Solver."""
         return view_network(self._network)
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """K networks with memory."""
+        """Returns K networks with memory."""
         return memory_actor_critic(population, VIEW_ENTRIES, self._network.memory)
 
     def optimal_return(self, levels: ViewLevel) -> Tensor:
-        """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
+        """Returns the largest expected return of any policy on levels [*B]: float [*B]."""
         return optimal_view_return(levels, self.maze.max_steps)
 
     def probe(self, agent: ActorCritic, levels: ViewLevel) -> Tensor:
-        """Planes of levels [C], and where the most probable actions lead: float [K, C, 4, H, W]."""
+        """Returns planes of levels [C] with the K Solvers' visits: float [K, C, 4, H, W]."""
         drawn = planes(for_copies(agent, levels))
         went = visits(agent, levels, self.maze.max_steps)
         return torch.cat([drawn, went.unsqueeze(-3)], -3)
 
     def at_once(self, cells: int) -> int:
-        """How many levels are evaluated together."""
+        """Returns how many levels are evaluated together."""
         return EPISODES_AT_ONCE // self._named_episodes
 
     def results_on(
@@ -148,7 +148,7 @@ class ViewMazeTask(GridTask):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """What K Solvers reach on levels [n] of any one size, by episodes.
+        """Yields what K Solvers reach in episodes on levels [n] of any one size.
 
         ``success``, the share of episodes that reached the goal, with the bounds of its 95 %
         interval (Wilson 1927), ``success_low`` and ``success_high``, and ``return``, the mean.
@@ -164,7 +164,7 @@ class ViewMazeTask(GridTask):
             episodes=episodes,
             drop_finished=self.drop_finished,
         ).cpu()
-        for i, (name, told) in enumerate(about.items()):
+        for i, (name, known) in enumerate(about.items()):
             for k in range(len(copies)):
                 reached = round(float(performance["success"][k, i]) * episodes)
                 interval = scipy.stats.binomtest(reached, episodes).proportion_ci(method="wilson")
@@ -174,15 +174,15 @@ class ViewMazeTask(GridTask):
                     "success_high": float(interval.high),
                     "return": float(performance["return"][k, i]),
                 }
-                fewest = f"fewest actions {told[self.steps_name]}"
+                fewest = f"fewest actions {known[self.steps_name]}"
                 note = f"{reached} of {episodes} episodes, {fewest}"
                 picture = partial(self._picture, agent, k, levels[i], max_steps)
-                yield LevelResult(name, k, told, results, note, picture)
+                yield LevelResult(name, k, known, results, note, picture)
 
     def _picture(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int
     ) -> NDArray[np.uint8]:
-        """A level, and one episode of one Solver there."""
+        """Draws a level, and one episode of one Solver there."""
         noise = torch.rand(max_steps, 1, generator=self._draws.generator("picture"))
         went, steps = walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
         path = went[solver, 0, : int(steps[solver, 0]) + 1, :2]

@@ -50,7 +50,7 @@ class ViewDistribution:
         self.sample(1, torch.Generator().manual_seed(0))
 
     def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
-        """Draw levels [count]; the generator is one of the CPU."""
+        """Draws levels [count]; the generator is one of the CPU."""
         return self._draw(count, generator).to(self._device)
 
     def _draw(self, count: int, generator: torch.Generator) -> ViewLevel:
@@ -116,18 +116,18 @@ class ViewSpace:
         self.generate(torch.arange(self.size).unsqueeze(0), [torch.Generator().manual_seed(0)])
 
     def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
-        """Draw levels [count] uniformly from the bins."""
+        """Draws levels [count] uniformly from the bins."""
         choices = torch.randint(self.size, (1, count), generator=generator)
         return self.generate(choices, [generator])[0]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> ViewLevel:
-        """Levels [K, P] of bins, int64 [K, P]; replica k's are drawn from generator k."""
+        """Draws levels [K, P] of bins, int64 [K, P]; row k by generator k."""
         pairs = zip(choices.cpu(), generators, strict=True)
         levels = [self._generate(self._values[index], draw) for index, draw in pairs]
         return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
 
     def locate(self, levels: ViewLevel) -> Tensor:
-        """Where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
+        """Returns where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
 
         A goal that cannot be reached counts as far away as there are cells.
         """
@@ -135,7 +135,7 @@ class ViewSpace:
         return self._scaled(counts.where(counts >= 0, math.prod(self._grid)))
 
     def shares(self, levels: ViewLevel) -> Tensor:
-        """Shares of the bins that are nearest to levels [n], float32 [N]; unsolvable ones are none.
+        """Returns the share of levels [n] nearest to each bin, float32 [N], of solvable ones.
 
         Without lengths all of the levels count.
         """
@@ -145,7 +145,7 @@ class ViewSpace:
         return nearest.bincount(minlength=self.size) / len(nearest)
 
     def _counts(self, levels: ViewLevel) -> Tensor:
-        """Walls, and where it is an axis the path's length (-1 for none): int64 [*B, D]."""
+        """Returns levels' walls, and path lengths (-1 for none) if an axis: int64 [*B, D]."""
         counts = [levels.walls.flatten(-2).sum(-1)]
         if "path length" in self.axes:
             counts.append(shortest_path_length(levels))
@@ -175,7 +175,7 @@ MOST_DRAWS = 1000  # of a level whose goal is to be reachable
 
 
 def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
-    """Levels with exact numbers of walls; their cells, start, goal and direction are uniform.
+    """Draws levels with exact numbers of walls; all cells and the direction are uniform.
 
     Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's. The
     numbers are int64 ``[N]`` on the CPU, at most height * width - 2.
@@ -189,7 +189,7 @@ def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generato
 
 
 def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
-    """Mazes with exactly one way between any two free cells: a random depth-first search.
+    """Draws mazes with one path between any two free cells, by a random depth-first search.
 
     The cells of even row and column are all free; the search opens the cells between them. Start,
     goal and direction are uniform.
@@ -229,7 +229,7 @@ def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -
 
 
 def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
-    """Four rooms around a cross of walls, each of whose arms has one door at a random place.
+    """Draws four rooms around a cross of walls, each of whose arms has a random door.
 
     Start, goal and direction are uniform.
 
@@ -253,7 +253,7 @@ def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> V
 
 
 def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
-    """Drawn levels whose goal can be reached; others are drawn again."""
+    """Draws levels until the goal of each can be reached."""
     levels = draw_levels(number)
     for _ in range(MOST_DRAWS):
         bad = (shortest_path_length(levels) < 0).nonzero().squeeze(1)
@@ -264,14 +264,14 @@ def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
 
 
 def _placed(walls: Tensor, draw: torch.Generator) -> ViewLevel:
-    """Levels of walls [N, H, W]; start and goal are different uniform free cells."""
+    """Returns levels of walls [N, H, W] with different uniform free cells as start and goal."""
     chance = torch.rand(walls.flatten(1).shape, generator=draw)
     ends = chance.where(~walls.flatten(1), -1.0).topk(2, 1).indices
     return _level_of(walls, ends, draw)
 
 
 def _level_of(walls: Tensor, ends: Tensor, draw: torch.Generator) -> ViewLevel:
-    """Levels of walls [N, H, W] and cells of start and goal [N, 2]; the direction is uniform."""
+    """Returns levels of walls [N, H, W] and ends [N, 2], start and goal, in random directions."""
     start, goal = cell_position(ends, walls.shape[-1]).unbind(1)
     return ViewLevel(
         walls=walls,

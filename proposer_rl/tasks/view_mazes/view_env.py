@@ -141,7 +141,7 @@ class ViewMazeEnv(LevelEnv):
 
 @cache
 def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """What actions and directions mean in a line of grids of some width.
+    """Tabulates what actions and directions mean in a line of grids of some width.
 
     Made once: from numbers of the host, which a recorded reset must not ask for.
 
@@ -169,7 +169,7 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
 
 
 def fewest_actions(levels: ViewLevel) -> Tensor:
-    """Actions on a shortest way from the start to the goal: turns to either side, and moves.
+    """Returns how many actions, turns and moves, a shortest way to the goal has.
 
     A frontier spreads over all pairs of a cell and a direction at once.
 
@@ -210,7 +210,7 @@ def fewest_actions(levels: ViewLevel) -> Tensor:
 
 
 def optimal_view_return(levels: ViewLevel, max_steps: int = 250) -> Tensor:
-    """The largest expected return of any policy: that of a shortest way, 0 if it is too long.
+    """Returns the largest expected return of any policy, that of a shortest way within the limit.
 
     Args:
         levels: Levels ``[*B]``; the goal need not be reachable.
@@ -228,7 +228,7 @@ def optimal_view_return(levels: ViewLevel, max_steps: int = 250) -> Tensor:
 def walks(
     agent: ActorCritic, levels: ViewLevel, max_steps: int, noise: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Where K Solvers go on levels, one episode on each.
+    """Plays one episode of K Solvers on each level, and returns where they go.
 
     Args:
         agent: K Solvers.
@@ -260,7 +260,7 @@ def walks(
 
 
 def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
-    """Where K Solvers are on levels [C] when they take the most probable actions.
+    """Returns which cells of levels [C] K Solvers visit by their most probable actions.
 
     Returns:
         Share of the steps of one episode after which an agent is in each cell, float32

@@ -80,7 +80,7 @@ class ViewLevel(Level):
 
 
 def directed(level: Level, direction: Tensor) -> ViewLevel:
-    """Levels [*B] with the directions in which their agents begin, int64 [*B]."""
+    """Returns levels [*B] with the directions in which their agents begin, int64 [*B]."""
     return ViewLevel(
         walls=level.walls,
         start=level.start,
@@ -126,7 +126,7 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
 
 
 def _assigned(content: bytes) -> dict[str, list[str]]:
-    """Rows of the drawings that a module assigns to names."""
+    """Reads the drawings that a module assigns to names, as rows."""
     try:
         if len(content) > LARGEST_MODULE:
             raise ValueError(f"is larger than {LARGEST_MODULE:,} bytes, for a module")
@@ -153,7 +153,7 @@ def _is_drawing(text: str) -> bool:
 
 
 def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
-    """Rows of MiniGrid's encodings."""
+    """Reads MiniGrid's encodings, as rows of drawings."""
     try:
         if path.suffix == ".npy":
             array: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
@@ -177,7 +177,7 @@ def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
 
 
 def _drawn(grid: NDArray[Any], name: str) -> Iterator[str]:
-    """Rows of one grid [W, H, 3] of objects, colours and states."""
+    """Yields the rows of a drawing of one grid [W, H, 3] of objects, colours and states."""
     objects, states = grid[..., 0].T, grid[..., 2].T  # [H, W]
     border = [objects[0], objects[-1], objects[:, 0], objects[:, -1]]
     if min(objects.shape) > 2 and all((side == WALL_OBJECT).all() for side in border):

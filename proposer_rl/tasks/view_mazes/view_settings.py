@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from proposer_rl.models import MemoryNetwork
 from proposer_rl.settings import BY_KIND, settings
-from proposer_rl.tasks.view_mazes.view_env import FORWARD, GOAL_OBJECT, VIEW, WALL_OBJECT
-from proposer_rl.tasks.view_mazes.view_levels import AHEAD
+from proposer_rl.tasks.view_mazes.view_env import FORWARD, VIEW
+from proposer_rl.tasks.view_mazes.view_levels import AHEAD, GOAL_OBJECT, WALL_OBJECT
 
 Walls = Annotated[int, Ge(0)]
 
@@ -139,13 +139,13 @@ class ViewEncoder(nn.Module):
         self.features = channels * (VIEW - 2) ** 2 + direction
 
     def codes(self, view: Tensor, direction: Tensor) -> Tensor:
-        """Numbers of what is seen, int64 [N], equal where views and directions are."""
+        """Returns codes int64 [N], equal where both views and directions are equal."""
         digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
         base = 4 ** torch.arange(VIEW**2, device=view.device)
         return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
 
     def forward(self, view: Tensor, direction: Tensor) -> Tensor:
-        """Features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
+        """Returns features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
         colour = (view == WALL_OBJECT) * GREY_COLOUR + (view == GOAL_OBJECT) * GREEN_COLOUR
         image = torch.stack([view, colour], 1) / SCALE
         seen = torch.relu(self.convolution(image)).flatten(1)
@@ -153,7 +153,7 @@ class ViewEncoder(nn.Module):
 
 
 def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
-    """The network of one Solver."""
+    """Returns the network of one Solver."""
     encoder = ViewEncoder(settings.channels, settings.direction)
     return MemoryNetwork(
         encoder, encoder.features, VIEW_ACTIONS, memory=settings.memory, head=settings.head
