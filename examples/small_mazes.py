@@ -19,15 +19,15 @@ from proposer_rl import (
     SolverSettings,
     Streams,
 )
-from proposer_rl.learning.settings import LearningSettings
+from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.tasks.mazes.settings import (
+from proposer_rl.tasks.mazes.maze_settings import (
     DistributionSettings,
-    EvaluationSettings,
+    MazeEvaluationSettings,
     MazeSettings,
-    NetworkSettings,
     SpaceSettings,
+    UNetSettings,
 )
 from proposer_rl.tasks.mazes.task import MazeTask
 
@@ -42,9 +42,9 @@ def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
         distributions={"id": DistributionSettings(specifications=[(0.2, 4)])},
         target="id",
         space=SpaceSettings(obstacle_fractions=[0.0, 0.2, 0.4], path_lengths=[1, 2, 4, 6]),
-        network=NetworkSettings(channels=[16, 32]),
+        network=UNetSettings(channels=[16, 32]),
         encoder_channels=[8, 16],
-        evaluation=EvaluationSettings(distributions=["id"], levels=128),
+        evaluation=MazeEvaluationSettings(distributions=["id"], levels=128),
         solver=SolverSettings(batch_size=32, ppo=ppo),
         context=ComputeContext(),
         make_network=network,

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 import proposer_rl as prl
-from proposer_rl.tasks.mazes.edits import edit_levels
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.generation import scattered_walls
+from proposer_rl.tasks.mazes.generation import edit_levels
+from proposer_rl.tasks.view_mazes.view_distributions import scattered_walls
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 
 MAZES, STEPS = 32, 24
 

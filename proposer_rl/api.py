@@ -24,8 +24,7 @@ from proposer_rl.curricula import (
     outcome_of,
 )
 from proposer_rl.experiment import Experiment, ScheduleSettings
-from proposer_rl.learning import PPO, LeaveOneOutBaseline
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, SolverSettings
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.rewards import log_success_gain, performance_gain, task_difficulty

@@ -37,8 +37,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.curricula.proposer import load_proposer
 from proposer_rl.curricula.scores import Source
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
     meta_env,

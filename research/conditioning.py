@@ -21,7 +21,7 @@ from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.stored import StoredRun, stored_run
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Components, frozen_proposer
-from proposer_rl.models import draw, uniform_noise
+from proposer_rl.models import draw_at, uniform_noise
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, Task
 from research.common import Rows, answer, parser_of
@@ -87,7 +87,7 @@ def _shares(frozen: ProposerCurriculum, seen: TensorDict, batch_size: int) -> Te
         # One generator for all: the same numbers for whatever is seen, so that only that differs.
         generator = Streams(0, "look").generator()
         shape = torch.Size([1, *distribution.batch_shape, *distribution.event_shape])
-        action = draw(distribution, uniform_noise(shape, 1, [generator], seen.device)[0, 0])
+        action = draw_at(distribution, uniform_noise(shape, 1, [generator], seen.device)[0, 0])
     generators = [Streams(0, "look", k).generator() for k in range(SAMPLES)]
     choices = frozen.actions.draw(action.cpu(), batch_size, generators)
     return choices.flatten().bincount(minlength=frozen.actions.bins) / choices.numel()

@@ -14,7 +14,7 @@ from annotated_types import Interval
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, arguments, checked
 

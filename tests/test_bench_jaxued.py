@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from research.benchmarks.__main__ import main
 from research.benchmarks.jaxued_peer import LEAN, TRAINING, WAYS, WRAPPER
 from research.benchmarks.peer import jaxued_maze, played

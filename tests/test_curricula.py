@@ -17,8 +17,7 @@ from proposer_rl.curricula import (
     Student,
     TaskStudent,
 )
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, agent_weights, load_agent
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, agent_weights, load_agent
 from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.models import (
     ActorCritic,

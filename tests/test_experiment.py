@@ -31,8 +31,7 @@ from proposer_rl.curricula import (
     outcome_of,
 )
 from proposer_rl.experiment import Experiment, ScheduleSettings
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.signals import Interrupted, StopSignals

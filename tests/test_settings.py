@@ -13,12 +13,12 @@ from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import ComputeSettings
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.experiment import ScheduleSettings
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, ProposerSettings
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.settings import MazeSettings
+from proposer_rl.tasks.mazes.maze_settings import MazeSettings
 from tests.tiny import composed
 
 ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))

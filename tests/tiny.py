@@ -14,34 +14,33 @@ from hydra.core.global_hydra import GlobalHydra
 from tensordict import TensorDictBase
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings as GateNetworkSettings
+from proposer_rl.tasks.gymnasium.settings import NetworkSettings
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
-from proposer_rl.tasks.mazes.settings import (
+from proposer_rl.tasks.mazes.maze_settings import (
     DistributionSettings,
-    EvaluationSettings,
+    MazeEvaluationSettings,
     MazeSettings,
-    NetworkSettings,
     SpaceSettings,
+    UNetSettings,
 )
 from proposer_rl.tasks.mazes.task import MazeTask
 from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
-from proposer_rl.tasks.view_mazes.settings import EvaluationSettings as ViewEvaluationSettings
-from proposer_rl.tasks.view_mazes.settings import (
+from proposer_rl.tasks.view_mazes.task import ViewMazeTask
+from proposer_rl.tasks.view_mazes.view_settings import (
     PerfectSettings,
     ScatteredSettings,
+    ViewEvaluationSettings,
     ViewMazeSettings,
     ViewNetworkSettings,
+    ViewSpaceSettings,
 )
-from proposer_rl.tasks.view_mazes.settings import SpaceSettings as ViewSpaceSettings
-from proposer_rl.tasks.view_mazes.task import ViewMazeTask
 
 EXAMPLES = str(Path(__file__).parents[1] / "examples")
 EVALUATE = ExactEvaluator(max_steps=8)
@@ -55,9 +54,9 @@ def tiny_task(**changed: Any) -> MazeTask:
         "distributions": {"id": DistributionSettings(specifications=[(0.2, 4)])},
         "target": "id",
         "space": SpaceSettings(obstacle_fractions=[0.0, 0.2], path_lengths=[2, 4]),
-        "network": NetworkSettings(channels=[8, 8], groups=4),
+        "network": UNetSettings(channels=[8, 8], groups=4),
         "encoder_channels": [8, 8],
-        "evaluation": EvaluationSettings(distributions=["id"], levels=8),
+        "evaluation": MazeEvaluationSettings(distributions=["id"], levels=8),
         "solver": SolverSettings(batch_size=4, ppo=ppo),
         "context": ComputeContext(),
     }
@@ -92,7 +91,7 @@ def point_masses(**changed: Any) -> PointMassTask:
             width=RangeSettings(low=0.5, high=8.0, bins=5, target=0.5),
             friction=RangeSettings(low=0.0, high=4.0, bins=2, target=0.0),
         ),
-        network=GateNetworkSettings(hidden=[8], scale=0.25),
+        network=NetworkSettings(hidden=[8], scale=0.25),
         levels=8,
         solver=SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2)),
         context=ComputeContext(),

@@ -19,11 +19,10 @@ from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
 from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
-from proposer_rl.learning import load_agent, located
+from proposer_rl.learning import PPOSettings, load_agent, located
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import Measure
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
@@ -97,7 +96,7 @@ class ProblemProposer(Curriculum):
             problems = policy.batch_shape[1]
             shape = (-(-count // problems), 1, problems)
             noise = torch.rand(shape, generator=stream.generator("choices"))
-            choices = draw(policy, noise.to(seen["probes"].device))  # [times, 1, P]
+            choices = draw_at(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
         bins = choices.view(1, -1).cpu()  # [1, times * P]
         drawn = {agent.action_key: choices, agent.log_prob_key: log_prob}

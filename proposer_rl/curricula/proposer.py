@@ -18,7 +18,7 @@ from proposer_rl.meta.actions import Actions
 from proposer_rl.meta.copies import Copies
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.meta.view import SolverView
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
 from proposer_rl.runs.folder import PROPOSER
 from proposer_rl.settings import ArgumentError
@@ -135,7 +135,9 @@ class ProposerCurriculum(LearnedCurriculum):
             return distribution.mode
         generator = stream.generator("proposals")
         shape = (1, *distribution.batch_shape[1:], *distribution.event_shape)
-        return draw(distribution, torch.rand(shape, generator=generator).to(self.view.task.device))
+        return draw_at(
+            distribution, torch.rand(shape, generator=generator).to(self.view.task.device)
+        )
 
 
 class ProposerTrainer:

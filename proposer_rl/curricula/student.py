@@ -17,9 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO
-from proposer_rl.learning.advantages import gae
-from proposer_rl.learning.rollout import RolloutCollector
+from proposer_rl.learning import PPO, RolloutCollector, gae
 from proposer_rl.meta.first_order import (
     Direction,
     alignment,

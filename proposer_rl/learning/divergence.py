@@ -1,4 +1,4 @@
-"""Numbers that are not finite: recognised in the update in which they arise, and named."""
+"""The check that an update's numbers are finite, and the error that names one that is not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def require_finite(
     copies: int | None,
     first: int = 0,
 ) -> None:
-    """Check one update; costs one number read from the device unless something is wrong.
+    """Checks one update; costs one number read from the device unless something is wrong.
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.
@@ -44,12 +44,12 @@ def require_finite(
     sums = nn.utils.get_total_norm([reward, *scalars, *weights.values()], norm_type=1.0)
     if bool(sums.isfinite()):
         return
-    _refuse("reward", reward, len(reward), first)
+    _require_finite("reward", reward, len(reward), first)
     for i in range(len(steps)):
         for name in names:
-            _refuse(f"{name} of gradient step {i}", steps[name][i], copies, first)
+            _require_finite(f"{name} of gradient step {i}", steps[name][i], copies, first)
     for name, weight in weights.items():
-        _refuse(f"weight {name}", weight, copies, first)
+        _require_finite(f"weight {name}", weight, copies, first)
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def located(place: str) -> Iterator[None]:
         raise DivergedError(f"{place}: {error}") from error
 
 
-def _refuse(name: str, tensor: Tensor, copies: int | None, first: int) -> None:
+def _require_finite(name: str, tensor: Tensor, copies: int | None, first: int) -> None:
     finite = tensor.detach().isfinite().reshape(copies or 1, -1)
     if bool(finite.all()):
         return

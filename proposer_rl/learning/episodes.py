@@ -1,4 +1,4 @@
-"""What Solvers reach on levels, by playing whole episodes there."""
+"""What Solvers reach in whole episodes: in those of a rollout, and in episodes played on levels."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import ActorCritic, draw
+from proposer_rl.models import ActorCritic, draw_at
 
 SEEDS = 2**62
 SWEEP = 16  # steps between two checks which levels all Solvers have finished
 
 
 @torch.no_grad()
-def play(
+def play_episodes(
     agent: ActorCritic,
     env: EnvBase,
     max_steps: int,
     noise: Tensor | None = None,
     remake: Callable[[Tensor], EnvBase] | None = None,
 ) -> Iterator[tuple[Tensor, TensorDictBase, Tensor]]:
-    """Play one episode of each of K Solvers on each of its levels, all at once.
+    """Plays one episode of each of K Solvers on each of its levels, all at once.
 
     Args:
         agent: K Solvers, with memory or without.
@@ -58,7 +58,7 @@ def play(
             action = distribution.mode
         else:
             given = noise[step, place]
-            action = draw(distribution, given.expand(len(over), *given.shape))
+            action = draw_at(distribution, given.expand(len(over), *given.shape))
         after = env.step(state.set(agent.action_key, action))["next"]
         yield place, after, ~over
         over = over | after["done"].squeeze(-1)
@@ -80,7 +80,7 @@ def mean_performance(
     at_once: int | None = None,
     drop_finished: bool = False,
 ) -> TensorDict:
-    """Mean return and share of successes of K Solvers over episodes on levels.
+    """Returns mean return and share of successes of K Solvers over episodes on levels.
 
     The random numbers are those of the levels, the same for every Solver: they differ by what they
     do alone, and what one gets does not depend on which others are evaluated with it.
@@ -121,10 +121,67 @@ def mean_performance(
         noise = None if greedy else torch.rand(max_steps, *shape, generator=draws).to(device)
         returns, success = torch.zeros(2, *some.batch_size, device=device)
         remake = (lambda place, some=some: make_env(some[:, place])) if drop_finished else None
-        for place, after, counts in play(agent, env, max_steps, noise, remake):
+        for place, after, counts in play_episodes(agent, env, max_steps, noise, remake):
             ended = after.get("success", after["terminated"]).squeeze(-1)
             returns[:, place] += after["reward"].squeeze(-1) * counts / reward_scale
             success[:, place] += (ended & counts).float()
         parts.append(TensorDict({"return": returns, "success": success}, some.batch_size))
     shape = (episodes, count) if side == 1 else (count, episodes)
     return torch.cat(parts, 1).unflatten(1, shape).mean(side)
+
+
+def first_episode_return(rollout: TensorDictBase) -> Tensor:
+    """Returns every environment's sum of rewards in its first episode, as far as it was played.
+
+    Args:
+        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
+
+    Returns:
+        float [*B].
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
+        >>> rewards = torch.tensor([[1.0, 2.0, 4.0, 8.0]]).unsqueeze(-1)
+        >>> first_episode_return(TensorDict({"next": {"done": ends, "reward": rewards}}, [1, 4]))
+        tensor([3.])
+    """
+    return (rollout["next", "reward"].squeeze(-1) * in_first_episode(rollout)).sum(-1)
+
+
+def succeeded(rollout: TensorDictBase) -> Tensor:
+    """Returns whether each step of a rollout [*B, T] ended a successful episode, bool [*B, T].
+
+    ``("next", "success")`` [*B, T, 1] says so; without such an entry, success is termination.
+    """
+    after = rollout["next"]
+    return after.get("success", after["terminated"]).squeeze(-1)
+
+
+def first_episode_success(rollout: TensorDictBase) -> Tensor:
+    """Returns whether every environment's first episode succeeded; not if the rollout cut it off.
+
+    Args:
+        rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
+            reads.
+
+    Returns:
+        bool [*B].
+
+    Example:
+        >>> import torch
+        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
+        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
+        >>> first_episode_success(rollout)  # the second one does not count
+        tensor([False])
+    """
+    return (succeeded(rollout) & in_first_episode(rollout)).any(-1)
+
+
+def in_first_episode(rollout: TensorDictBase) -> Tensor:
+    """Returns whether each step is at or before the first end of an episode, bool [*B, T]."""
+    done = rollout["next", "done"].squeeze(-1).long()
+    return done.cumsum(-1) - done == 0

@@ -34,19 +34,19 @@ class GraphError(ArgumentError):
 
 
 def has_graphs(device: torch.device) -> bool:
-    """Whether functions on a device can be replayed."""
+    """Returns whether functions on a device can be replayed."""
     return device.type == "cuda"
 
 
 def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDictBase]:
-    """The same function on a GPU, replayed from its third call on.
+    """Returns a function that a GPU replays from its third call on, with the same results.
 
     Args:
         function: from a tensordict, and further objects, which are the same in every call, to a
             tensordict. All inputs keep their shapes.
 
     Returns:
-        A function whose outputs are nobody else's. It raises a GraphError where it cannot be
+        A function that returns new tensors each time. It raises a GraphError where it cannot be
         recorded.
     """
     with warnings.catch_warnings():
@@ -75,7 +75,7 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
 
 @contextmanager
 def _no_garbage() -> Iterator[None]:
-    """While a graph is recorded, another that is collected would free memory, and end it."""
+    """Switches garbage collection off: another graph that is collected would spoil a recording."""
     gc.collect()
     enabled = gc.isenabled()
     gc.disable()
@@ -99,7 +99,7 @@ class ReplayedOfAgents:
         self._graphs: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
 
     def __call__(self, agent: Any, *given: Any) -> Any:
-        """As the function."""
+        """Calls the function, or replays what was recorded for this agent and these sizes."""
         inputs = TensorDict({"levels": given[0]} if given else {})
         size = tuple(entry.shape for entry in tree_leaves(inputs.to_dict()))
         graphs = self._graphs.setdefault(agent, {})

@@ -24,27 +24,26 @@ from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import graphs
-from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.learning.losses import (
+from proposer_rl.learning.objective import (
     ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
     clip_gradients_,
     explained_variance,
+    gae,
     make_loss,
     of_copies,
 )
-from proposer_rl.learning.minibatches import Minibatches
+from proposer_rl.learning.ppo_settings import PPOSettings
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.learning.snapshot import (
     complete_adam,
     restore_snapshot,
     set_learning_rate,
     take_snapshot,
 )
-from proposer_rl.learning.statistics import Statistics
+from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population
 from proposer_rl.settings import ArgumentError
 
@@ -134,21 +133,21 @@ class PPO:
 
     @property
     def copies(self) -> int | None:
-        """The number K of copies; None without."""
+        """Returns the number K of replicas; None without."""
         return self.agent.copies
 
     @property
     def horizon(self) -> int:
-        """Steps T of a rollout."""
+        """Returns the steps T of a rollout."""
         return self.settings.horizon
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
-        """Collect one batch and train on it; see :meth:`collect` and :meth:`optimise`."""
+        """Collects one batch and trains on it; see :meth:`collect` and :meth:`optimise`."""
         rollout = self.collect(generators)
         return Update(rollout, self.optimise(rollout, generators))
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """Reset the environment, unless its episodes go on, and act for a horizon.
+        """Resets the environment, unless its episodes go on, and acts for a horizon.
 
         Args:
             generators: one for each index of the environment's first dimension, from which its
@@ -162,7 +161,7 @@ class PPO:
 
     @property
     def left(self) -> float:
-        """What annealing leaves of the learning rate in the next update, from 1 to 0."""
+        """Returns what share of the learning rate annealing leaves in the next update."""
         settings = self.settings
         if settings.anneal_updates is None:
             return 1.0
@@ -171,13 +170,13 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """Of the next update."""
+        """Returns the learning rate of the next update."""
         return self.settings.learning_rate * self.left
 
     def optimise(
         self, rollout: TensorDictBase, generators: list[torch.Generator] | None = None
     ) -> TensorDict:
-        """Train on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
+        """Trains on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
 
         Writes ``advantage`` and ``value_target`` into the rollout.
 
@@ -207,9 +206,11 @@ class PPO:
         return self._last_training[1].mean(0)
 
     def train(self, batch: TensorDictBase) -> TensorDict:
-        """From ``steps`` [*B, T] on a ``level`` [*B] to what ``gradient_steps`` [S(, K)] were like.
+        """Makes S gradient steps on the ``steps`` [*B, T] of a batch with their ``level`` [*B].
 
-        Besides, of the ``steps`` what is computed here: values, advantages and targets.
+        Returns:
+            ``gradient_steps`` [S] or [S, K], the metrics of each; and of the ``steps`` what is
+            computed here: values, advantages and targets.
         """
         steps, level, value = batch["steps"].copy(), batch["level"], self.agent.value_key
         taken = []
@@ -238,7 +239,7 @@ class PPO:
     def _forward(
         self, steps: TensorDictBase, level: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The sum of all losses, and what is told of them."""
+        """Returns the sum of all losses, and their metrics by name."""
         agent, copies = self.agent, self.copies
         steps = self.statistics.in_units(agent.decode(steps.copy(), agent.encode(level)))
         losses = self._loss(steps)
@@ -252,14 +253,14 @@ class PPO:
         return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Add what :meth:`optimise` needs to a rollout [*B, T] that another process has made."""
+        """Adds what :meth:`optimise` needs to a rollout [*B, T] that another process has made."""
         with torch.no_grad():
             context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
         set_next_values(self.agent, rollout, context)
         return rollout
 
     def compile(self) -> PPO:
-        """From here on have torch.compile fuse what a gradient step computes, for a GPU.
+        """Lets torch.compile fuse what a gradient step computes from here on, for a GPU.
 
         The first step takes half a minute and more, and numbers are rounded otherwise.
 
@@ -275,7 +276,7 @@ class PPO:
         return self
 
     def replay(self, *, rollouts: bool) -> PPO:
-        """From here on replay training on a GPU as a CUDA graph, which changes no number.
+        """Replays training on a GPU as a CUDA graph from here on, which changes no number.
 
         Args:
             rollouts: whether acting is replayed, too. The environment then reads nothing back from
@@ -290,7 +291,7 @@ class PPO:
         return self
 
     def check(self, first: int = 0) -> None:
-        """Check what was trained on last; this waits for the device, training does not.
+        """Checks that the last update was finite; this waits for the device, training does not.
 
         Args:
             first: number of the first replica, by which replicas are named.
@@ -302,14 +303,14 @@ class PPO:
         require_finite(*self._last_training, weights, self.agent.copies, first)
 
     def snapshot(self) -> TensorDict:
-        """A copy of weights and Adam's state, batch [K] with replicas and [] without.
+        """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without.
 
         ``snapshot[k]`` is replica ``k``; ``snapshot[[k] * 16]`` is 16 replicas of it.
         """
         return take_snapshot(self.agent, self._adam)
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Put a snapshot of as many replicas back; a ValueError says why one does not fit.
+        """Restores a snapshot of as many replicas; a ValueError says why one does not fit.
 
         Episodes that would have gone on begin anew.
         """

@@ -1,17 +1,22 @@
-"""Rollouts of an agent by TorchRL's collector, in which a level is read once for all steps."""
+"""Rollouts of an agent by TorchRL's collector, in which a level is read once for all steps.
+
+Every rollout begins with a reset, or goes on with the episodes of the one before.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, ExcludeTransform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, ExcludeTransform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning.continued import ContinuedEpisodes
-from proposer_rl.models import ActorCritic, draw, population, uniform_noise
+from proposer_rl.models import ActorCritic, draw_at, population, uniform_noise
 from proposer_rl.settings import ArgumentError
 
 
@@ -64,13 +69,13 @@ class RolloutCollector:
         self.begin_anew()  # a collector resets what it gets
 
     def begin_anew(self) -> None:
-        """Begin the next rollout with a reset in any case."""
+        """Begins the next rollout with a reset in any case."""
         self.memory = None
         if self.episodes is not None:
             self.episodes.begin_anew()
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """A complete rollout [*B, T]; see :meth:`~proposer_rl.learning.ppo.PPO.collect`."""
+        """Returns a complete rollout [*B, T]; see :meth:`proposer_rl.learning.PPO.collect`."""
         device = next(self._agent.parameters()).device
         noise = uniform_noise(self._action.shape, self._horizon, generators, device)
         acted = self.act(TensorDict({"noise": noise}))
@@ -82,7 +87,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
-        """From uniform ``noise`` [T, ...] to a ``rollout`` [*B, T] without its ``level`` [*B]."""
+        """Acts by uniform ``noise`` [T, ...]: a ``rollout`` [*B, T] without its ``level`` [*B]."""
         self._policy.begin(inputs["noise"], self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
@@ -94,9 +99,78 @@ class RolloutCollector:
         return TensorDict({"rollout": rollout, "level": level})
 
 
+class ContinuedEpisodes(TransformedEnv):
+    """Hands out where its episodes stand when it is reset, after the first time.
+
+    An episode begins where another has ended, on the level that is set by then. Levels can be set
+    at any time, or they are asked of ``next_levels``.
+
+    Args:
+        env: of batch [*B], which keeps a level until the next reset.
+
+    Attributes:
+        next_levels: called where episodes begin, with whose they are, bool [*B]: the levels [*B]
+            that are set then. None where levels are set from outside.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        super().__init__(env, Compose(), auto_unwrap=False)
+        self.next_levels: Callable[[Tensor], Any] | None = None
+        self.begin_anew()
+
+    @property
+    def fresh(self) -> bool:
+        """Returns whether all episodes begin with the next reset."""
+        return self._standing is None
+
+    def begin_anew(self) -> None:
+        """Begins all episodes with the next reset."""
+        self._standing: TensorDictBase | None = None
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Begins episodes where others have ended."""
+        ended = tensordict["done"].squeeze(-1)
+        if self.next_levels is not None and bool(ended.any()):
+            self.base_env.set_levels(self.next_levels(ended))
+        standing = self.base_env.maybe_reset(tensordict)
+        self._standing = standing.copy()
+        return standing
+
+    def stand(self, levels: Any, actions: Tensor, steps: Tensor) -> None:
+        """Brings episodes on levels [*B] to where others, with the same actions, were left.
+
+        An environment that does the same after the same actions then stands where that one did.
+
+        Args:
+            levels: that they are on.
+            actions: the last ones of each, [*B, T, ...].
+            steps: how many of them belong to its episode, int64 [*B].
+        """
+        longest = int(steps.max())
+        self.base_env.set_levels(levels)
+        state = self.base_env.reset()
+        for left in range(longest, -1, -1):
+            begins = steps == left
+            if left < longest and bool(begins.any()):
+                state = self.base_env.reset(state.set("_reset", begins.unsqueeze(-1)))
+            if left:
+                # Those that have not begun play as well: it does not matter where they are.
+                state.set("action", actions.select(steps.ndim, -left))
+                _, state = self.base_env.step_and_maybe_reset(state)
+        self._standing = state.copy()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
+        if self._standing is None:
+            if self.next_levels is not None:
+                every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+                self.base_env.set_levels(self.next_levels(every))
+            self._standing = super()._reset(tensordict, **options)
+        return self._standing.copy()
+
+
 @torch.no_grad()
 def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase) -> None:
-    """Write the present values of steps [*B, T] on a level [*B], before and after each step."""
+    """Writes the present values of steps [*B, T] on a level [*B], before and after each step."""
     context = agent.encode(level)
     with set_recurrent_mode(True):
         now = agent.decode(steps.select(*agent.step_keys), context)
@@ -107,7 +181,7 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 
 @torch.no_grad()
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
-    """Write the values after each of the steps [*B, T], whose level has this context [*B].
+    """Writes the values after each of the steps [*B, T], whose level has this context [*B].
 
     With the memory that is there after each step. Where an episode goes on, that is the value
     before the next step; an agent that reads each step for itself is not asked again for those.
@@ -161,7 +235,7 @@ class RolloutPolicy(TensorDictModuleBase):
         ]
 
     def begin(self, noise: Tensor, memory: TensorDictBase | None = None) -> None:
-        """Expect a rollout.
+        """Prepares for the next rollout.
 
         Args:
             noise: uniform numbers in [0, 1), [T, ...], one for each element of T actions.
@@ -171,7 +245,7 @@ class RolloutPolicy(TensorDictModuleBase):
         self._before = memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write action, log-probability and value of the next step."""
+        """Writes action, log-probability and value of the next step."""
         (agent,), (level,) = self._agent, self._level
         index, noise = next(self._steps)
         if index == 0:
@@ -181,7 +255,7 @@ class RolloutPolicy(TensorDictModuleBase):
         tensordict.update(self.memory)
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
-        action = draw(distribution, noise)
+        action = draw_at(distribution, noise)
         tensordict.set(agent.action_key, action)
         tensordict.set(agent.log_prob_key, distribution.log_prob(action))
         for before, after in zip(agent.memory, agent.memory_keys, strict=True):
@@ -207,60 +281,3 @@ class _WithoutLevel(TransformedEnv):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.base_env.maybe_reset(tensordict).exclude(*self.transform.excluded_keys)
-
-
-def first_episode_return(rollout: TensorDictBase) -> Tensor:
-    """The sum of the rewards of every environment's first episode, as far as the rollout has it.
-
-    Args:
-        rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
-
-    Returns:
-        float [*B].
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
-        >>> rewards = torch.tensor([[1.0, 2.0, 4.0, 8.0]]).unsqueeze(-1)
-        >>> first_episode_return(TensorDict({"next": {"done": ends, "reward": rewards}}, [1, 4]))
-        tensor([3.])
-    """
-    return (rollout["next", "reward"].squeeze(-1) * in_first_episode(rollout)).sum(-1)
-
-
-def succeeded(rollout: TensorDictBase) -> Tensor:
-    """Whether each step of a rollout [*B, T] ended an episode that is a success, bool [*B, T].
-
-    ``("next", "success")`` [*B, T, 1] says so; without such an entry, success is termination.
-    """
-    after = rollout["next"]
-    return after.get("success", after["terminated"]).squeeze(-1)
-
-
-def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Whether the first episode of every environment was a success; not if the rollout cut it off.
-
-    Args:
-        rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
-            reads.
-
-    Returns:
-        bool [*B].
-
-    Example:
-        >>> import torch
-        >>> ends = torch.tensor([[False, True, False, True]]).unsqueeze(-1)
-        >>> goals = torch.tensor([[False, False, False, True]]).unsqueeze(-1)
-        >>> from tensordict import TensorDict
-        >>> rollout = TensorDict({"next": {"done": ends, "terminated": goals}}, [1, 4])
-        >>> first_episode_success(rollout)  # the second one does not count
-        tensor([False])
-    """
-    return (succeeded(rollout) & in_first_episode(rollout)).any(-1)
-
-
-def in_first_episode(rollout: TensorDictBase) -> Tensor:
-    """Steps up to and including the first end, bool [*B, T]."""
-    done = rollout["next", "done"].squeeze(-1).long()
-    return done.cumsum(-1) - done == 0

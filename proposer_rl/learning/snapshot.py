@@ -13,7 +13,7 @@ from proposer_rl.models import ActorCritic
 
 
 def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
-    """Torch's Adam whose state, usually made at the first step, is there from the beginning.
+    """Returns torch's Adam with its state, which it otherwise makes at its first step.
 
     On a GPU its learning rate is a tensor there, so that a graph of its steps reads what it is set
     to (:func:`set_learning_rate`).
@@ -33,7 +33,7 @@ def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps:
 
 
 def set_learning_rate(adam: Adam, learning_rate: float) -> None:
-    """Of the next steps."""
+    """Sets the learning rate of the next steps."""
     for group in adam.param_groups:
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(learning_rate)
@@ -42,7 +42,7 @@ def set_learning_rate(adam: Adam, learning_rate: float) -> None:
 
 
 def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
-    """A copy of weights and Adam's state, batch [K] with replicas and [] without."""
+    """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without."""
     batch = _batch(agent)
     entries: dict[str, TensorDict] = {}
     for name, value in agent_values(agent).items():
@@ -56,7 +56,7 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
 
 
 def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> int:
-    """Put a snapshot of as many replicas back (in place).
+    """Restores a snapshot of as many replicas (in place).
 
     Returns:
         The number of Adam's steps so far.
@@ -95,20 +95,20 @@ def _batch(agent: ActorCritic) -> torch.Size:
 
 
 def agent_values(agent: ActorCritic) -> dict[str, Tensor]:
-    """Weights of an agent, and moments of its observations and rewards, by name, as they stand."""
+    """Returns an agent's weights, and moments of its observations and rewards, by name."""
     learnt = agent.normalization
     moments = () if learnt is None else learnt.named_buffers("normalization")
     return dict([*agent.named_parameters(), *moments])
 
 
 def agent_weights(agent: ActorCritic) -> TensorDict:
-    """A copy of what an agent is, as :func:`load_agent` takes it, batch []."""
+    """Returns a copy of an agent's weights and moments, batch [], for :func:`load_agent`."""
     values = agent_values(agent)
     return TensorDict({name: {"value": value.detach().clone()} for name, value in values.items()})
 
 
 def load_agent(agent: ActorCritic, snapshot: TensorDictBase) -> None:
-    """Put the weights and statistics of a snapshot into an agent (in place).
+    """Loads the weights and moments of a snapshot into an agent (in place).
 
     Raises:
         ValueError: if they belong to another network.

@@ -44,8 +44,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import PPO
-from proposer_rl.learning.divergence import DivergedError
+from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
 from proposer_rl.task import DifferentiableTask, Levels

@@ -21,8 +21,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import PPO
-from proposer_rl.learning.snapshot import agent_values
+from proposer_rl.learning import PPO, agent_values
 from proposer_rl.meta.first_order import squared_length, surrogate, trainable
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt
 
-from proposer_rl.learning.settings import LearningSettings
+from proposer_rl.learning import LearningSettings
 from proposer_rl.settings import BY_KIND, settings
 
 

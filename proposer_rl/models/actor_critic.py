@@ -78,20 +78,20 @@ class ActorCritic(TensorDictModuleBase):
         self.normalization: Normalization | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
+        """Writes logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
         inputs = tensordict.select(*self.in_keys)
         if self.encoder is not None:
             inputs = self.encoder(inputs)
         return tensordict.update(self._headed(inputs), keys_to_update=self.out_keys)
 
     def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The context of levels [*B] (or [K, *B]): what :meth:`decode` needs of them."""
+        """Returns the context of levels [*B] (or [K, *B]): what :meth:`decode` needs of them."""
         if self.encoder is None:
             return TensorDict({}, tensordict.batch_size, device=tensordict.device)
         return self.encoder(tensordict.select(*self.level_keys)).select(*self.context_keys)
 
     def decode(self, tensordict: TensorDictBase, context: TensorDictBase) -> TensorDictBase:
-        """Write logits and values of steps [*B, *T], given their levels' context [*B].
+        """Writes logits and values of steps [*B, *T], given their levels' context [*B].
 
         Without an encoder the context is empty and every step is computed by itself.
         """
@@ -113,18 +113,18 @@ class ActorCritic(TensorDictModuleBase):
         return outputs.set(self.value_key, value * self.normalization.unit(value))
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
-        """The memory before the first step of a batch like this tensordict's, [*B]: zeros."""
+        """Returns the memory before the first step of a batch [*B]: zeros."""
         # TorchRL's collector hands on tensordicts without a device.
         batch, device = tensordict.batch_size, next(self.parameters()).device
         zeros = {key: torch.zeros(*batch, n, device=device) for key, n in self.memory.items()}
         return TensorDict(zeros, batch, device=device)
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
-        """The action's distribution, given a tensordict with logits."""
+        """Returns the action's distribution, given a tensordict with logits."""
         return self.distribution_class(logits=tensordict.get(self.logits_key))
 
     def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
-        """The module that turns logits into an action and its log-probability; as :meth:`actor`."""
+        """Returns the module from logits to an action and its probability; see :meth:`actor`."""
         return ProbabilisticTensorDictModule(
             in_keys={"logits": self.logits_key},
             out_keys=[self.action_key],
@@ -152,7 +152,7 @@ class ActorCritic(TensorDictModuleBase):
         return ProbabilisticTensorDictSequential(self, self.sampler(sample=sample))
 
     def primer(self) -> TensorDictPrimer:
-        """TorchRL's transform by which an environment begins its episodes without a memory.
+        """Returns TorchRL's transform by which an environment begins its episodes without a memory.
 
         ``TransformedEnv(env, agent.primer())`` hands the memory on from step to step, for rollouts
         and collectors of other code; an agent without memory needs none.
@@ -162,7 +162,7 @@ class ActorCritic(TensorDictModuleBase):
         return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
 
     def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
-        """Actor and critic that take logits and values as they stand in a tensordict.
+        """Returns actor and critic that take logits and values as they stand in a tensordict.
 
         For a TorchRL loss whose caller has run this module already, so that actor and critic share
         one forward pass.
@@ -173,23 +173,23 @@ class ActorCritic(TensorDictModuleBase):
 
 
 def joint_categorical(logits: Tensor) -> Distribution:
-    """P categorical draws as one event: log-probabilities and entropies are summed over P."""
+    """Returns P categorical draws as one event, with the sum of their log-probabilities."""
     return Independent(Categorical(logits=logits, validate_args=False), 1)
 
 
 def categorical(logits: Tensor) -> Distribution:
-    """Categorical draws, each an event of its own."""
+    """Returns categorical draws, each an event of its own."""
     return Categorical(logits=logits, validate_args=False)
 
 
 def normal(logits: Tensor) -> Distribution:
-    """D normal numbers as one event, from their locations and log-scales [*B, D, 2]."""
+    """Returns D normal numbers as one event, from their locations and log-scales [*B, D, 2]."""
     location, log_scale = logits.unbind(-1)
     return Independent(Normal(location, log_scale.exp(), validate_args=False), 1)
 
 
-def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
-    """Sample by inverting the cumulative distribution function at ``uniform``.
+def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:
+    """Samples by inverting the cumulative distribution function at ``uniform``.
 
     Torch's distributions take no generator. This way the random numbers are data, which can be
     drawn for a whole rollout at once and from one generator per replica.
@@ -199,7 +199,7 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
         uniform: numbers in [0, 1), one for each element of a sample.
     """
     if isinstance(distribution, Independent):
-        return draw(distribution.base_dist, uniform)
+        return draw_at(distribution.base_dist, uniform)
     if isinstance(distribution, Categorical):
         cumulative = distribution.probs.cumsum(-1)
         threshold = uniform.unsqueeze(-1) * cumulative[..., -1:]
@@ -213,7 +213,7 @@ def draw(distribution: Distribution, uniform: Tensor) -> Tensor:
 def uniform_noise(
     shape: torch.Size, steps: int, generators: list[torch.Generator] | None, device: torch.device
 ) -> Tensor:
-    """Uniform numbers ``[T, *shape]`` for T steps; slice [:, k] comes from the k-th generator.
+    """Returns uniform numbers ``[T, *shape]`` for T steps; [:, k] comes from the k-th generator.
 
     They are drawn on the CPU, so that they are the same for every device, and handed on without
     waiting for it. Without generators all of it comes from torch's default one.
@@ -223,3 +223,15 @@ def uniform_noise(
     else:
         drawn = torch.stack([torch.rand(steps, *shape[1:], generator=g) for g in generators], 1)
     return (drawn.pin_memory() if device.type == "cuda" else drawn).to(device, non_blocking=True)
+
+
+def orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:
+    """Initialises every convolution and linear layer orthogonally, biases with zero (in place).
+
+    The default gain keeps the variance of activations through ReLU layers (Saxe et al. 2014).
+    """
+    for layer in module.modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)

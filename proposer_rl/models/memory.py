@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+import warnings
 from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torch.nn.functional import linear
 from torchrl.modules import LSTMCell, recurrent_mode
 
-from proposer_rl.models.actor_critic import ActorCritic, categorical
+from proposer_rl.models import population
+from proposer_rl.models.actor_critic import ActorCritic, categorical, orthogonal_
 from proposer_rl.models.population import Population
-from proposer_rl.models.recurrence import distinct, through_time
-from proposer_rl.models.unet import orthogonal_
+
+sigmoid_slope_ = torch.ops.aten.sigmoid_backward.grad_input
+tanh_slope_ = torch.ops.aten.tanh_backward.grad_input
 
 MEMORY = ("recurrent_state_h", "recurrent_state_c")
 """Entries of the memory, by the names that TorchRL's LSTM has for them."""
@@ -57,7 +65,7 @@ class MemoryNetwork(nn.Module):
     def forward(
         self, begins: Tensor, hidden: Tensor, cell: Tensor, *observed: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Go through N sequences of T steps.
+        """Reads N sequences of T steps.
 
         Args:
             begins: bool [N, T, 1], whether an episode begins with the step.
@@ -94,7 +102,7 @@ def memory_actor_critic(
     *,
     distribution_class: Callable[..., Distribution] = categorical,
 ) -> ActorCritic:
-    """Actor-critic of K networks with memory.
+    """Returns actor-critic of K networks with memory.
 
     As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` says that the
     last batch dimension is time: the memory then goes through it from what stands at the first
@@ -137,3 +145,186 @@ class _MemoryHead(TensorDictModuleBase):
         for key, output in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, output.reshape(*batch, *output.shape[3:]))
         return tensordict
+
+
+def through_time(
+    cell: LSTMCell, inputs: Tensor, rows: Tensor, begins: Tensor, memory: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Runs an LSTM over N sequences of T steps, which forgets where an episode begins.
+
+    Args:
+        cell: has the weights of a ``torch.nn.LSTMCell``, of width M.
+        inputs: [R, F].
+        rows: which of the inputs a step has, int64 [T, N].
+        begins: whether an episode begins with the step, bool [T, N, 1].
+        memory: before the first step, hidden and cell, [N, M] each.
+
+    Returns:
+        Hidden and cell after every step, [T, N, M] each.
+    """
+    projected = linear(inputs, cell.weight_ih, cell.bias_ih + cell.bias_hh)
+    kept, weight = (~begins).to(memory[0]), cell.weight_hh.to(projected.dtype)
+    hidden, after, *_ = _ThroughTime.apply(projected, rows, kept, *memory, weight)
+    return hidden, after
+
+
+def distinct(codes: Tensor) -> tuple[Tensor, Tensor]:
+    """Finds equal rows by their codes.
+
+    Args:
+        codes: int64 [R].
+
+    Returns:
+        One row of each kind, int64 [U], and the kind of each row, int64 [R]. On a GPU, which would
+        have to be waited for, and under ``vmap`` every row is a kind of its own.
+    """
+    return _Distinct.apply(codes)
+
+
+class _Distinct(torch.autograd.Function):
+    @staticmethod
+    def forward(codes: Tensor) -> tuple[Tensor, Tensor]:
+        every = torch.arange(len(codes), device=codes.device)
+        if not population.at_hand(codes):
+            return every, every.clone()
+        kinds, kind = torch.unique(codes, return_inverse=True)
+        return torch.empty_like(kinds).scatter_(0, kind, every), kind
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], codes: Tensor) -> tuple[Any, Any]:
+        every = torch.arange(codes.shape[1 - in_dims[0]], device=codes.device)
+        return (every, every.clone()), (None, None)
+
+
+def _forwards(
+    gates: Tensor,
+    kept: Tensor,
+    hidden: Tensor,
+    cell: Tensor,
+    weight: Tensor,
+    hiddens: Tensor,
+    cells: Tensor,
+    squashed: Tensor,
+) -> None:
+    """Writes what is there after each step, and in place of what gates are given what they are."""
+    width = hidden.shape[-1]
+    for step in range(len(gates)):
+        gate, keep = gates[step], kept[step]
+        gate.add_(torch.matmul((hidden * keep).to(weight.dtype), weight))
+        i, f, g, o = gate.chunk(4, -1)
+        gate[..., : 2 * width].sigmoid_()
+        g.tanh_()
+        o.sigmoid_()
+        f.mul_(keep)
+        cell = torch.mul(f, cell, out=cells[step]).addcmul_(i, g)
+        hidden = torch.mul(o, torch.tanh(cell, out=squashed[step]), out=hiddens[step])
+
+
+def _backwards(
+    of_hidden: Tensor | None,
+    of_cell: Tensor | None,
+    slopes: Tensor,
+    through: Tensor,
+    forget: Tensor,
+    kept: Tensor,
+    weight: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Multiplies the gates' slopes by the gradient of what they make.
+
+    Returns:
+        The gradients of hidden and cell before the first step.
+    """
+    to_hidden, to_cell = torch.zeros_like(through[0]), torch.zeros_like(through[0])
+    for step in range(len(slopes) - 1, -1, -1):
+        slope = slopes[step].unflatten(-1, (4, -1))
+        if of_hidden is not None:
+            to_hidden.add_(of_hidden[step])
+        if of_cell is not None:
+            to_cell.add_(of_cell[step])
+        to_cell.addcmul_(to_hidden, through[step])
+        slope[..., :3, :].mul_(to_cell.unsqueeze(-2))
+        slope[..., 3, :].mul_(to_hidden)
+        to_hidden = torch.matmul(slopes[step].to(weight.dtype), weight).to(kept.dtype)
+        to_hidden.mul_(kept[step])
+        to_cell.mul_(forget[step])
+    return to_hidden, to_cell
+
+
+def _compiled(steps: Any, on: Tensor) -> Any:
+    """Returns the steps as TorchScript on CPUs, which spends less time between operations."""
+    # Python 3.14 has no TorchScript; on a GPU the steps are recorded.
+    if not population.at_hand(on) or sys.version_info >= (3, 14):
+        return steps
+    with _scripting:
+        return _scripted(steps)
+
+
+_scripting = threading.Lock()  # replicas train in threads
+
+
+@cache
+def _scripted(steps: Any) -> Any:
+    with warnings.catch_warnings():
+        # What is recommended in its place unrolls all steps before it compiles them.
+        warnings.filterwarnings("ignore", message=".*torch.jit.script")
+        return torch.jit.script(steps)
+
+
+class _ThroughTime(torch.autograd.Function):
+    """The steps one after another, in place; shapes as above, with [K] before N and R under vmap.
+
+    With gates i, f, g and o of the projected inputs and the hidden state before, which is zero
+    where an episode begins, as is f: c = f c' + i g and h = o tanh(c) (Hochreiter and Schmidhuber
+    1997; Gers et al. 2000).
+    """
+
+    @staticmethod
+    def forward(
+        inputs: Tensor, rows: Tensor, kept: Tensor, hidden: Tensor, cell: Tensor, weight: Tensor
+    ) -> tuple[Tensor, ...]:
+        weight = weight.mT.contiguous()
+        given = inputs.index_select(-2, rows.flatten()).to(hidden.dtype)
+        gates = given.unflatten(-2, rows.shape).movedim(-3, 0)
+        hiddens, cells, squashed = hidden.new_empty(3, len(rows), *hidden.shape)
+        steps = _compiled(_forwards, gates)
+        steps(gates, kept, hidden, cell, weight, hiddens, cells, squashed)
+        return hiddens, cells, gates, squashed
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[2:])
+        ctx.set_materialize_grads(False)
+        ctx.distinct, ctx.low = inputs[0].shape, inputs[0].dtype
+        ctx.save_for_backward(*inputs[1:], *output)
+
+    @staticmethod
+    def backward(ctx: Any, of_hidden: Tensor | None, of_cell: Tensor | None, *_: Any) -> Any:
+        rows, kept, hidden, cell, weight, hiddens, cells, gates, squashed = ctx.saved_tensors
+        slopes = torch.empty_like(gates)
+        (i, f, g, o), (of_i, of_f, of_g, of_o) = gates.chunk(4, -1), slopes.chunk(4, -1)
+        sigmoid_slope_(g, i, grad_input=of_i)
+        sigmoid_slope_(cell, f[0], grad_input=of_f[0])
+        sigmoid_slope_(cells[:-1], f[1:], grad_input=of_f[1:])
+        tanh_slope_(i, g, grad_input=of_g)
+        sigmoid_slope_(squashed, o, grad_input=of_o)
+        through = torch.ops.aten.tanh_backward(o, squashed)
+        steps = _compiled(_backwards, gates)
+        to_hidden, to_cell = steps(of_hidden, of_cell, slopes, through, f, kept, weight)
+        before = torch.cat([hidden.unsqueeze(0), hiddens[:-1]]).mul_(kept)
+        slopes, before = (x.movedim(0, -3).flatten(-3, -2) for x in (slopes, before))
+        of_weight = torch.matmul(slopes.to(weight.dtype).mT, before.to(weight.dtype))
+        of_inputs = gates.new_zeros(ctx.distinct).index_add_(-2, rows.flatten(), slopes)
+        return of_inputs.to(ctx.low), None, None, to_hidden, to_cell, of_weight
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *tensors: Tensor) -> tuple[Any, Any]:
+        inputs, rows, kept, hidden, cell, weight = (
+            x.expand(info.batch_size, *x.shape) if dim is None else x.movedim(dim, 0)
+            for x, dim in zip(tensors, in_dims, strict=True)
+        )
+        rows = tensors[1]  # of codes, which all replicas share
+        return _ThroughTime.apply(inputs, rows, kept.movedim(0, 1), hidden, cell, weight), (1,) * 4

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-LARGEST = 10.0
+FARTHEST = 10.0
 """Standard deviations from the mean at which a normalised number ends, as is usual."""
 
 TINY = 1e-8  # added to variances
@@ -40,7 +40,7 @@ class RunningMoments(nn.Module):
         self.register_buffer("variance", torch.ones_like(zeros))
 
     def update(self, values: Tensor) -> None:
-        """Take numbers [K, *B, *S] in, or without replicas [*B, *S]."""
+        """Updates the moments by numbers [K, *B, *S], or without replicas [*B, *S]."""
         shape = self.mean.shape[self._lead :]
         rows = values.detach().double().reshape(*self.mean.shape[: self._lead], -1, *shape)
         new = rows.shape[self._lead]
@@ -57,16 +57,16 @@ class RunningMoments(nn.Module):
 
     @property
     def deviation(self) -> Tensor:
-        """float32 [K, *S]; 1 before the first numbers."""
+        """Returns the standard deviation, float32 [K, *S]; 1 before the first numbers."""
         return (self.variance + TINY).sqrt().float()
 
     def forward(self, values: Tensor) -> Tensor:
-        """Numbers [K, *B, *S] without their mean, in standard deviations, cut off far out."""
+        """Returns numbers [K, *B, *S] less their mean, in standard deviations, cut off far out."""
         mean, deviation = (self.along(each, values) for each in (self.mean, self.deviation))
-        return ((values - mean.float()) / deviation).clamp(-LARGEST, LARGEST)
+        return ((values - mean.float()) / deviation).clamp(-FARTHEST, FARTHEST)
 
     def along(self, moments: Tensor, values: Tensor) -> Tensor:
-        """Moments [K, *S], to be broadcast against values [K, *B, *S]."""
+        """Returns moments [K, *S], to be broadcast against values [K, *B, *S]."""
         between = values.ndim - moments.ndim
         lead = moments.shape[: self._lead]
         return moments.reshape(*lead, *[1] * between, *moments.shape[self._lead :])
@@ -77,7 +77,7 @@ class Normalization(nn.Module):
 
     Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
     deviation of the discounted return, and its loss is taken in that unit: the same as rewards
-    divided by it, and whoever reads a value need not know.
+    divided by it, while values can be read without knowing of the unit.
 
     ``observations`` are the shapes of the entries that are normalised, by name.
     """
@@ -92,20 +92,20 @@ class Normalization(nn.Module):
         self.returns = RunningMoments(copies, []) if rewards else None
 
     def seen(self, inputs: TensorDictBase) -> TensorDictBase:
-        """What a network gets of a tensordict [K, *B]; a copy without those entries."""
+        """Returns a copy of a tensordict [K, *B] with its observations normalised."""
         shown = inputs.copy()
         for name, moments in self.observations.items():
             shown.set(name, moments(inputs.get(name)))
         return shown
 
     def unit(self, values: Tensor) -> Tensor:
-        """Of values [K, *B, 1], to be broadcast against them; 1 where they have none."""
+        """Returns the unit of values [K, *B, 1], to be broadcast against them; 1 for none."""
         if self.returns is None:
             return values.new_ones(())
         return self.returns.along(self.returns.deviation, values)
 
     def update_observations(self, observed: TensorDictBase) -> None:
-        """Take in what was seen, [K, *B]."""
+        """Updates the moments by what was observed, [K, *B]."""
         for name, moments in self.observations.items():
             assert isinstance(moments, RunningMoments)
             moments.update(observed.get(name))

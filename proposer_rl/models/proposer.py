@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from proposer_rl.models.actor_critic import ActorCritic
-from proposer_rl.models.unet import orthogonal_
+from proposer_rl.models.actor_critic import ActorCritic, orthogonal_
 
 
 class MapEncoder(nn.Sequential):
@@ -37,13 +36,13 @@ class MapEncoder(nn.Sequential):
         super().__init__(*layers, *pooled)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Features [*B, features] of maps [*B, in_channels, H, W]."""
+        """Returns features [*B, features] of maps [*B, in_channels, H, W]."""
         features = super().forward(maps.flatten(0, -4))
         return features.unflatten(0, maps.shape[:-3])
 
 
 class ProposerNetwork(nn.Module):
-    """Observations in, parameters of the action's distribution and a value out.
+    """A network from observations to parameters of the action's distribution and a value.
 
     An encoder reads each probe; the mean over the probes, joined by whatever else is observed, is
     the context g (the paper's Proposer, section 4). ``head`` makes the policy of g, an MLP the
@@ -77,7 +76,7 @@ class ProposerNetwork(nn.Module):
         self.head = head
 
     def forward(self, probes: Tensor, *numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Map an observation to the distribution's parameters [*B, ...] and values [*B, 1].
+        """Maps an observation to the distribution's parameters [*B, ...] and values [*B, 1].
 
         Args:
             probes: float [*B, C, ...].
@@ -92,7 +91,7 @@ class ProposerNetwork(nn.Module):
 
 
 class ProblemHead(nn.Module):
-    """One categorical per problem (the paper's Proposer, section 4).
+    """A policy with one categorical per problem (the paper's Proposer, section 4).
 
     The logits of problem p come from an MLP, shared by all problems, of the context and a Fourier
     encoding of p: given the context, the problems are independent.
@@ -119,7 +118,7 @@ class ProblemHead(nn.Module):
         orthogonal_(self.logits, 0.01)
 
     def forward(self, context: Tensor) -> Tensor:
-        """Logits [*B, P, N] of contexts [*B, width]."""
+        """Returns logits [*B, P, N] of contexts [*B, width]."""
         # The first layer is linear in [g, enc(p)], so g's part is computed once for all problems.
         hidden = self.context_layer(context).unsqueeze(-2) + self.index_layer(self.index)
         return self.logits(torch.tanh(hidden))
@@ -147,13 +146,13 @@ class MixtureHead(nn.Module):
         orthogonal_(self.location[-1], 0.01)
 
     def forward(self, context: Tensor) -> Tensor:
-        """Location and log-scale [*B, D, 2] of contexts [*B, width]; see :func:`normal`."""
+        """Returns location and log-scale [*B, D, 2] of contexts [*B, width]; see :func:`normal`."""
         location = self.location(context)
         return torch.stack([location, self.log_scale.expand_as(location)], -1)
 
 
 def fourier_encoding(problems: int, bands: int) -> Tensor:
-    """Sines and cosines of the problem index at ``bands`` frequencies, float32 [P, 2 * bands].
+    """Returns sines and cosines of the problem index at several frequencies, [P, 2 * bands].
 
     The frequencies run geometrically from half a cycle over all problems to the highest that P
     samples can distinguish, P / 2 cycles.
@@ -171,7 +170,7 @@ def proposer_actor_critic(
     distribution: Callable[..., Distribution],
     observed: Sequence[str] = ("probes",),
 ) -> ActorCritic:
-    """Actor-critic of a network that maps what it observes to parameters and a value [*B, 1].
+    """Returns the actor-critic of a network from observations to parameters and values [*B, 1].
 
     Args:
         network: such as :class:`ProposerNetwork`.

@@ -6,7 +6,7 @@ K are Solvers, P the levels of one update, T its steps, E validation levels, C p
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,26 +16,34 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Categorical, MultiCategorical, TensorSpec
+from torchrl.data import Categorical, MultiCategorical
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning import PPO, first_episode_return, first_episode_success, graphs
-from proposer_rl.learning.episodes import mean_performance
-from proposer_rl.learning.rollout import RolloutCollector
-from proposer_rl.learning.settings import SolverSettings
-from proposer_rl.models import (
-    ActorCritic,
-    Population,
-    categorical,
-    joint_categorical,
-    normal,
+from proposer_rl.learning import (
+    PPO,
+    RolloutCollector,
+    SolverSettings,
+    first_episode_return,
+    first_episode_success,
+    graphs,
+    mean_performance,
 )
+from proposer_rl.models import ActorCritic, Population, normal
 from proposer_rl.runs.pictures import pixels, png, written
 from proposer_rl.streams import Streams
-from proposer_rl.task.contract import ComputeContext, Distribution, LevelResult, Levels, Space
-from proposer_rl.task.features import space_features
+from proposer_rl.task.protocols import (
+    ComputeContext,
+    Distribution,
+    LevelResult,
+    Levels,
+    Space,
+    check_distributions,
+    distribution_of,
+    for_copies,
+    space_features,
+)
 
-SAMPLES = 6  # levels of each distribution that a reader is shown
+SAMPLES_SHOWN = 6  # levels of each distribution that a reader is shown
 NAMED = 128  # levels of a distribution that are evaluated one by one
 
 
@@ -79,7 +87,7 @@ class Task(ABC):
         batched: as of :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
         drop_finished: whether evaluations make environments of fewer levels as others are finished,
-            as of :func:`~proposer_rl.learning.episodes.mean_performance`.
+            as of :func:`~proposer_rl.learning.mean_performance`.
         replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
             ``"rollouts"`` in an environment whose new levels come to where the old ones were, and
             of the methods ``"performance"``, ``"probe"`` and ``"measure"``.
@@ -119,7 +127,7 @@ class Task(ABC):
         measured: Mapping[str, Any] | None = None,
     ) -> None:
         names = list(distributions if measured_on is None else measured_on)
-        check_names(distributions, target, names)
+        check_distributions(distributions, target, names)
         self.precision = "fp32" if context.precision == "auto" else context.precision
         self.batch_size = solver.batch_size
         self.distributions: Mapping[str, Any] = dict(distributions)
@@ -143,32 +151,32 @@ class Task(ABC):
 
     @abstractmethod
     def environment(self, levels: Levels) -> EnvBase:
-        """An environment that plays levels [*B] from its next reset on.
+        """Returns an environment that plays levels [*B] from its next reset on.
 
         It has a method ``set_levels(levels [*B])``; it plays those from its next reset on. An
         episode's success is its entry ``success``, bool [*B, 1], or else that it terminated.
         """
 
     def evaluation_environment(self, levels: Levels) -> EnvBase:
-        """The same for evaluations and probes, which make one for each batch of levels [K, E]."""
+        """Returns the :meth:`environment` of evaluations and probes, one for each batch [K, E]."""
         return self.environment(levels)
 
     @abstractmethod
     def network(self) -> nn.Module:
-        """The network of one Solver, without buffers, its weights from torch's default generator.
+        """Returns one Solver's network, without buffers, drawn from torch's default generator.
 
         Where :meth:`actor_critic` is not replaced: from ``observation`` [*B, ...] to logits
         [*B, A], or locations and log-scales [*B, D, 2] of continuous actions, and values [*B, 1].
         """
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """K networks as the agent of an environment [K, P]."""
+        """Returns K networks as the agent of an environment [K, P]."""
         module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
         distribution = distribution_of(env.full_action_spec["action"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
-        """PPO of K fresh Solvers, one for each of the streams, in their environment [K, P]."""
+        """Returns PPO of K fresh Solvers, one for each stream, in their environment [K, P]."""
         copies, remaining = len(streams), iter(streams)
 
         def network() -> nn.Module:
@@ -183,7 +191,7 @@ class Task(ABC):
         return ppo.replay(rollouts="rollouts" in self.replayed) if self._graphs else ppo
 
     def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:
-        """Where the Solvers of a learner play levels [K, P] that they do not train on.
+        """Returns where the Solvers of a learner play levels [K, P] that they do not train on.
 
         Returns:
             The environment, and what rolls out whole episodes there: the learner's own where its
@@ -198,7 +206,7 @@ class Task(ABC):
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator
     ) -> TensorDictBase:
-        """What K Solvers reach on levels [E], or each on its own [K, E]: a tensordict [K, E].
+        """Returns what K Solvers reach on levels [E] or [K, E]: a tensordict [K, E].
 
         ``return`` float [K, E] is the expected return of an episode or an estimate of it,
         ``success`` the probability of success, where that has a meaning. An exact evaluation has no
@@ -220,7 +228,7 @@ class Task(ABC):
 
     @torch.no_grad()
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
-        """What K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
+        """Returns what K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
 
         Here at the beginning of each level: probabilities of n actions, of each choice where there
         are several, or the means of continuous ones, [K, C, D].
@@ -235,11 +243,11 @@ class Task(ABC):
         return logits[..., 0] if continuous else logits.softmax(-1).flatten(2)
 
     def probe_encoder(self, features: int) -> nn.Module:
-        """A network from probes [*B, ...] to features [*B, features]; here a linear layer."""
+        """Returns a network from probes [*B, ...] to features [*B, features], a linear layer."""
         return nn.Linear(self._actions, features)
 
     def features(self, levels: Levels) -> Tensor:
-        """What a model of outcomes knows of levels [K, n]: float [K, n, F], each about -1 to 1.
+        """Returns what a model of outcomes knows of levels [K, n]: float [K, n, F], -1 to 1.
 
         Here by where they lie in the space, which then needs ``locate(levels)``; a task may add
         others.
@@ -248,11 +256,11 @@ class Task(ABC):
 
     @property
     def metrics(self) -> list[str]:
-        """The names of what :meth:`measure` gives."""
+        """Returns the names of what :meth:`measure` gives."""
         return [f"{name}_{result}" for name in self.evaluated_on for result in self.results]
 
     def measure(self, agent: ActorCritic) -> TensorDictBase:
-        """Metrics of K Solvers by name, each float [K]: the columns of ``metrics.csv``.
+        """Returns metrics of K Solvers by name, each float [K]: the columns of ``metrics.csv``.
 
         Here ``<name>_success`` and ``<name>_return``, means over the evaluation levels of each
         distribution measured on.
@@ -265,7 +273,7 @@ class Task(ABC):
         return TensorDict(means, [agent.copies])
 
     def evaluate(self, agent: ActorCritic) -> Mapping[str, TensorDictBase]:
-        """The performance of K Solvers on every evaluation level, [K, E] by distribution.
+        """Returns the performance of K Solvers on every evaluation level, [K, E] by distribution.
 
         The random numbers of the actions are the same every time.
         """
@@ -275,22 +283,22 @@ class Task(ABC):
         }
 
     def evaluation_levels(self, name: str) -> Levels:
-        """The fixed evaluation levels [E] of a distribution."""
+        """Returns the fixed evaluation levels [E] of a distribution."""
         distribution = self.evaluation_distribution(name)
         return distribution.sample(self._levels, self.stream("levels", name))
 
     def evaluation_distribution(self, name: str) -> Distribution:
-        """What the levels are drawn from on which Solvers are measured on a distribution."""
+        """Returns what the evaluation levels of a distribution are drawn from."""
         distribution: Distribution = self.distributions[name]
         return distribution
 
     def stream(self, use: str, name: str) -> torch.Generator:
-        """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
+        """Returns the generator of a distribution's evaluation ``"levels"`` or ``"actions"``."""
         scope = {"levels": "evaluation", "actions": "episodes"}[use]
         return Streams(self._seed, scope, name).generator()
 
     def training_metrics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
-        """What Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K].
+        """Returns what Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K].
 
         The columns of ``training.csv``: here means of the entries that are axes of the space, and
         of the first episodes' success and return.
@@ -302,7 +310,7 @@ class Task(ABC):
         return TensorDict(means, levels.batch_size[:1])
 
     def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
-        """Levels [n], and what one Solver did there [n, T], as pictures and text, for JSON.
+        """Returns levels [n], and a Solver's steps there [n, T], as pictures and text, for JSON.
 
         Each record has a ``picture``, a PNG in base64, and may have ``text``, its lines as they
         are shown in a terminal, and anything else.
@@ -317,12 +325,12 @@ class Task(ABC):
     def pictures(
         self, levels: Levels, rollout: TensorDictBase | None
     ) -> Sequence[NDArray[np.uint8]]:
-        """Pictures uint8 [H, W, 3] for :meth:`record`; none for the level's numbers instead."""
+        """Returns pictures uint8 [H, W, 3] for :meth:`record`; without any it shows numbers."""
         return []
 
     @property
     def exact_metrics(self) -> bool:
-        """Whether :meth:`measure` draws nothing at random."""
+        """Returns whether :meth:`measure` draws nothing at random."""
         return self.exact_performance
 
     @property
@@ -336,13 +344,13 @@ class Task(ABC):
 
     @property
     def about(self) -> dict[str, str]:
-        """Texts about the task, by their labels."""
+        """Returns texts about the task by their labels."""
         names = ", ".join(self.evaluated_on)
         return {"Measured on": f"{names}; {self._levels} fixed levels each"}
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What readers of a run need to know of the task, for JSON.
+        """Returns what readers of a run need to know of the task, for JSON.
 
         - ``title``: of its runs, and ``levels``: what levels are called;
         - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
@@ -364,7 +372,7 @@ class Task(ABC):
             "measured": self._measured,
             "exact": self.exact_metrics,
             "samples": {
-                name: self.record(levels[:SAMPLES], None)
+                name: self.record(levels[:SAMPLES_SHOWN], None)
                 for name, levels in self.evaluated_on.items()
             },
         }
@@ -372,7 +380,7 @@ class Task(ABC):
     def level_results(
         self, agent: ActorCritic, name: str, max_steps: int | None
     ) -> Sequence[LevelResult]:
-        """What K Solvers reach on each level of a named set, in the set's order.
+        """Returns what K Solvers reach on each level of a named set, in the set's order.
 
         Args:
             agent: K Solvers.
@@ -410,7 +418,7 @@ class Task(ABC):
 
     @property
     def _actions(self) -> int:
-        """Numbers of a probe of one level."""
+        """Returns how many numbers a probe of one level has."""
         env = self.evaluation_environment(self._placeholders(1, 1))
         spec = env.full_action_spec["action"]
         if isinstance(spec, MultiCategorical):
@@ -418,53 +426,9 @@ class Task(ABC):
         return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
 
     def _placeholders(self, *shape: int) -> Levels:
-        """Levels of a shape, for an environment whose levels are set later."""
+        """Returns levels of a shape, for an environment whose levels are set later."""
         return next(iter(self.evaluated_on.values()))[:1].expand(*shape)
 
     def _numbers(self, levels: Levels) -> list[str]:
-        """Axes of the space that are entries of the levels."""
+        """Returns axes of the space that are entries of the levels."""
         return [name for name in self.space.axes if name in levels.keys()]
-
-
-def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
-    """What makes a policy's distribution of actions of logits, by the actions' spec."""
-    if isinstance(acts, MultiCategorical):
-        return joint_categorical
-    return categorical if isinstance(acts, Categorical) else normal
-
-
-def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
-    """Levels [E], the same for all K Solvers, or [K, E]: [K, E]."""
-    return levels.expand(agent.copies, levels.batch_size[-1])
-
-
-def check_names(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuse unknown names of distributions.
-
-    Raises:
-        ValueError: naming the key.
-    """
-    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
-
-
-def refuse_single_bin(space: Space) -> None:
-    """Refuse a space in which there is nothing to choose.
-
-    Raises:
-        ValueError: if it has one bin.
-    """
-    if space.size < 2:
-        raise ValueError(
-            "the space has a single bin, so there is nothing to choose among; give its axes bins"
-        )
-
-
-def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Make something, naming the key in whatever is wrong with its value."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, successors
 from proposer_rl.tasks.mazes.levels import cell_index
-from proposer_rl.tasks.point_masses.env import LEVEL, PointMassEnv
+from proposer_rl.tasks.point_masses.task import GATE, PointMassEnv
 from research.benchmarks.plain_env import PlainMaze
 from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.timing import interleave, rate, ratio
@@ -76,7 +76,7 @@ def point_masses(batch: int, options: Options) -> Row:
     """Point masses before gates of all kinds, pushed at random and begun again."""
     device = options.device
     spread = torch.linspace(0, 1, batch)
-    env = PointMassEnv(TensorDict({name: 4 * spread for name in LEVEL}, [batch]), device=device)
+    env = PointMassEnv(TensorDict({name: 4 * spread for name in GATE}, [batch]), device=device)
     actions = torch.rand(20, batch, 2, device=device) * 2 - 1
     seconds = interleave(
         {"TorchRL": partial(through_torchrl, env, actions)}, options.repeats, device

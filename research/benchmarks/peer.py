@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from research.benchmarks.jaxued_peer import __file__ as PROGRAM
 from research.benchmarks.timing import Timings, interleave
 

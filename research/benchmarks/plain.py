@@ -28,7 +28,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPOSettings
 
 
 class PlainUNet(nn.Module):

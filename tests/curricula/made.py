@@ -29,7 +29,7 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPOSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (

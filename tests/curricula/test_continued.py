@@ -23,8 +23,7 @@ from proposer_rl.curricula import (
 from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.continued import ContinuedLevels, outcome_of_episodes
 from proposer_rl.experiment import Experiment, ScheduleSettings
-from proposer_rl.learning.rollout import RolloutCollector
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams

@@ -11,12 +11,11 @@ from tensordict import TensorDict, TensorDictBase
 from proposer_rl.curricula import Student, TaskStudent
 from proposer_rl.curricula.exact_scores import expected_best, return_variance
 from proposer_rl.curricula.scores import AT_ONCE, Scored, Scorer, unseen
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.task import EpisodeLaw, NoSuccessError
 from proposer_rl.tasks.mazes import Level
-from proposer_rl.tasks.mazes.evaluation import optimal_return
-from proposer_rl.tasks.mazes.occupancy import episode_law
+from proposer_rl.tasks.mazes.evaluation import episode_law, optimal_return
 from tests.curricula.scripted import Scripted
 from tests.tiny import tiny_task
 

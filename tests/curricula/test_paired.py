@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from proposer_rl import methods
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components
 from proposer_rl.settings import ArgumentError

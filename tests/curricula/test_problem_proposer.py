@@ -19,13 +19,12 @@ from proposer_rl.curricula import (
     SampledFirstOrderProposer,
     Student,
 )
-from proposer_rl.learning import DivergedError
-from proposer_rl.learning.ppo import PPOSettings
+from proposer_rl.learning import DivergedError, PPOSettings
 from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,
     categorical,
-    draw,
+    draw_at,
     proposer_actor_critic,
 )
 from proposer_rl.models.actor_critic import ActorCritic
@@ -123,7 +122,7 @@ def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
     noise = torch.rand(times, 1, P, generator=Streams(0).generator("choices"))
-    choices = draw(policy, noise)  # [times, 1, P]
+    choices = draw_at(policy, noise)  # [times, 1, P]
     # Of the scores above those of the last are the highest.
     assert sorted(batch.levels[0].tolist()) == sorted(choices[-1, 0].tolist())
     step_by_hand(expected, policy, choices)
@@ -215,7 +214,7 @@ def test_every_problem_that_was_trained_on_is_credited_with_its_episodes(times: 
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
     noise = torch.rand(times, 1, P, generator=Streams(0, 1).generator("choices"))
-    choices = draw(policy, noise)[-1, 0]  # of the scores above those of the last are the highest
+    choices = draw_at(policy, noise)[-1, 0]  # of the scores above those of the last are the highest
     assert sorted(levels[0].tolist()) == sorted(choices.tolist())
     step_by_hand(expected, policy, choices)
     assert_same_weights(curriculum.agent, expected)

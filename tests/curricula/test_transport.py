@@ -22,7 +22,7 @@ from proposer_rl.methods import Components, currot
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
-from proposer_rl.tasks.mazes.settings import DistributionSettings, SpaceSettings
+from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from proposer_rl.teaching import Items, Parameters, Teacher
 from tests.curricula.scripted import Scripted, step

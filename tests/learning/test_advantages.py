@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.learning.advantages import LeaveOneOutBaseline
+from proposer_rl.learning import LeaveOneOutBaseline
 
 
 def episodes(rewards: torch.Tensor) -> TensorDict:

@@ -10,7 +10,7 @@ import torch
 from proposer_rl.cli.build import make_task
 from proposer_rl.learning import PPO
 from proposer_rl.models import Population
-from proposer_rl.models.convolution import Conv3x3
+from proposer_rl.models.population import Conv3x3
 from proposer_rl.streams import Streams
 from tests.tasks.gymnasium.toys import GATE, TINY
 from tests.tiny import composed

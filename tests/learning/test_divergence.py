@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.learning.divergence import DivergedError, located, require_finite
+from proposer_rl.learning import DivergedError, located
+from proposer_rl.learning.divergence import require_finite
 from tests.learning.test_ppo import generators, learner
 
 K, S = 3, 2

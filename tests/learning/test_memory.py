@@ -8,22 +8,19 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Unbounded
-from torchrl.envs import (
-    ExplorationType,
-    TensorDictPrimer,
-    TransformedEnv,
-    set_exploration_type,
-)
+from torchrl.envs import ExplorationType, TensorDictPrimer, TransformedEnv, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import PPO
+from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.learning.rollout import set_values
-from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta.first_order import surrogate
 from proposer_rl.models import Population, memory_actor_critic
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
-from proposer_rl.tasks.view_mazes.settings import ViewNetworkSettings
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_settings import (
+    VIEW_ENTRIES,
+    ViewNetworkSettings,
+    view_network,
+)
 from tests.tasks.view_mazes.oracles import random_levels
 
 K, P, T, M = 2, 3, 14, 8
@@ -38,7 +35,7 @@ def learner(copies: range = range(K), settings: PPOSettings = SETTINGS, **how: A
         return view_network(ViewNetworkSettings(channels=4, memory=M, head=8))
 
     population = Population(make, len(copies), **how)
-    agent = memory_actor_critic(population, OBSERVED, M)
+    agent = memory_actor_critic(population, VIEW_ENTRIES, M)
     levels = random_levels(K * P, side=5).reshape(K, P)[list(copies)]
     return PPO(ViewMazeEnv(levels, max_steps=6), agent, settings)
 

@@ -11,8 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import GymEnv
 
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
 from tests.learning import test_memory, test_ppo

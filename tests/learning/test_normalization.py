@@ -12,11 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.curricula import TaskStudent
-from proposer_rl.learning import PPO
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
-from proposer_rl.learning.snapshot import agent_weights, load_agent
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings, agent_weights, load_agent
 from proposer_rl.meta.gradient_norms import LevelGradients
-from proposer_rl.models.normalization import LARGEST, RunningMoments
+from proposer_rl.models.normalization import FARTHEST, RunningMoments
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.tasks.gymnasium.toys import walk_task
@@ -102,7 +100,7 @@ def test_the_network_gets_numbers_in_deviations_from_the_mean(trained: Any) -> N
     mean, variance = (each[:, None, None].float() for each in (moments.mean, moments.variance))
     shown = state.clone()
     shown["observation"] = ((state["observation"] - mean) / (variance + 1e-8).sqrt()).clamp(
-        -LARGEST, LARGEST
+        -FARTHEST, FARTHEST
     )
     plain = agent.head(shown)
     found = agent(state.clone())

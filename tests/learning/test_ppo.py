@@ -22,13 +22,13 @@ from torch.utils._pytree import tree_leaves
 from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
-from proposer_rl.learning.losses import MakeLoss, clip_gradients_
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO, MakeLoss, PPOSettings
+from proposer_rl.learning.objective import clip_gradients_
 from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
-from proposer_rl.models.maps import read_maps
+from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from tests.host_reads import HostRead, NoHostReads
 from tests.tiny import TASK, tiny_view_task
 

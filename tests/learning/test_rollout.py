@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.learning.rollout import first_episode_return, first_episode_success
+from proposer_rl.learning import first_episode_return, first_episode_success
 
 
 def rollout(*episodes: str) -> TensorDict:

@@ -12,9 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn.functional import unfold
 
-from proposer_rl.learning.advantages import gae
-from proposer_rl.learning.divergence import DivergedError
-from proposer_rl.learning.ppo import PPO, PPOSettings
+from proposer_rl.learning import PPO, DivergedError, PPOSettings, gae
 from proposer_rl.meta.first_order import (
     alignment,
     bin_scores,
@@ -25,7 +23,7 @@ from proposer_rl.meta.first_order import (
     target_performance,
 )
 from proposer_rl.models import ActorCritic, Population, UNet, categorical
-from proposer_rl.models.maps import cell_logits, read_maps
+from proposer_rl.models.grids import cell_logits, read_maps
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 

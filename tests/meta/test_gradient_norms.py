@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning.ppo import PPO
+from proposer_rl.learning import PPO
 from proposer_rl.meta import gradient_norms
 from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.models import ActorCritic

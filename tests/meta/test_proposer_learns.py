@@ -10,8 +10,7 @@ import torch
 from torch import nn
 from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
 
-from proposer_rl.learning import PPO, LeaveOneOutBaseline
-from proposer_rl.learning.settings import PPOSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings
 from proposer_rl.meta.actions import ProblemChoices
 from proposer_rl.models import (
     MixtureHead,

@@ -16,7 +16,7 @@ from proposer_rl.models import (
     categorical,
     cell_logits,
     cell_maps,
-    draw,
+    draw_at,
     joint_categorical,
     map_actor_critic,
     read_maps,
@@ -102,7 +102,7 @@ def test_cell_maps_are_what_the_solver_says_at_each_cell(per_step: bool) -> None
 )
 def test_draw_inverts_the_cumulative_distribution(logits: list[float], uniform: float) -> None:
     distribution = categorical(torch.tensor(logits, dtype=torch.float64))
-    action = int(draw(distribution, torch.tensor(uniform, dtype=torch.float64)))
+    action = int(draw_at(distribution, torch.tensor(uniform, dtype=torch.float64)))
     cumulative = distribution.probs.cumsum(0)
     below = float(cumulative[action - 1]) if action else 0.0
     assert below <= uniform + 1e-12 and uniform <= float(cumulative[action]) + 1e-12
@@ -111,22 +111,24 @@ def test_draw_inverts_the_cumulative_distribution(logits: list[float], uniform: 
 def test_draw_never_takes_an_impossible_action() -> None:
     probabilities = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0])
     edges = torch.tensor([0.0, 0.25, 0.5, 1 - 2**-24])
-    actions = draw(Categorical(probs=probabilities.expand(4, 5)), edges)
+    actions = draw_at(Categorical(probs=probabilities.expand(4, 5)), edges)
     assert actions.tolist() == [1, 1, 3, 3]
 
 
 def test_draws_have_the_distribution_asked_for() -> None:
     probabilities = torch.tensor([0.1, 0.2, 0.3, 0.4])
     noise = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
-    actions = draw(Categorical(probs=probabilities.expand(20_000, 4)), noise)
+    actions = draw_at(Categorical(probs=probabilities.expand(20_000, 4)), noise)
     counts = actions.bincount(minlength=4).numpy()
     assert stats.chisquare(counts, probabilities.numpy() * 20_000).pvalue > 1e-3
 
 
 def test_draw_sees_through_independence_and_takes_other_distributions() -> None:
     logits, noise = torch.randn(3, 5, 4), torch.rand(3, 5)
-    assert torch.equal(draw(joint_categorical(logits), noise), draw(categorical(logits), noise))
-    assert draw(Normal(torch.zeros(1), 1.0), torch.tensor([0.5])).item() == pytest.approx(0.0)
+    assert torch.equal(
+        draw_at(joint_categorical(logits), noise), draw_at(categorical(logits), noise)
+    )
+    assert draw_at(Normal(torch.zeros(1), 1.0), torch.tensor([0.5])).item() == pytest.approx(0.0)
 
 
 def test_noise_of_a_copy_depends_on_its_generator_alone() -> None:

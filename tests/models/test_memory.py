@@ -14,13 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from proposer_rl.models import (
-    ActorCritic,
-    MemoryNetwork,
-    Population,
-    memory_actor_critic,
-    recurrence,
-)
+from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory, memory_actor_critic
 from proposer_rl.models.memory import MEMORY
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, tiny_view_task
@@ -115,7 +109,7 @@ def test_compiled_steps_are_those_of_python(
         return [out["logits"].detach(), *slopes]
 
     compiled = [trained_on() for _ in range(3)]  # the first ones are profiled
-    monkeypatch.setattr(recurrence, "_compiled", lambda steps, on: steps)
+    monkeypatch.setattr(memory, "_compiled", lambda steps, on: steps)
     for ours in compiled:
         for one, other in zip(ours, trained_on(), strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)

@@ -12,7 +12,7 @@ from proposer_rl.models import (
     ProblemHead,
     ProposerNetwork,
     categorical,
-    draw,
+    draw_at,
     fourier_encoding,
     joint_categorical,
     normal,
@@ -124,6 +124,6 @@ def test_normal_is_that_of_scipy_and_drawn_by_its_quantiles() -> None:
         rtol=1e-5, atol=1e-6,
     )  # fmt: skip
     uniform = torch.tensor([0.0, 0.9])
-    drawn = draw(distribution, uniform)
+    drawn = draw_at(distribution, uniform)
     assert drawn.isfinite().all()
     torch.testing.assert_close(float(drawn[1]), float(reference.ppf(0.9)[1]), rtol=1e-5, atol=1e-6)

@@ -31,8 +31,7 @@ from torchrl.envs import (
 )
 
 from proposer_rl.extras import install_command
-from proposer_rl.learning import in_first_episode
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task, distribution_of

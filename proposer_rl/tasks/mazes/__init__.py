@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from gymnasium import register
 
-from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
-from proposer_rl.tasks.mazes.dynamics import successors
-from proposer_rl.tasks.mazes.env import MazeEnv
 from proposer_rl.tasks.mazes.generation import MECHANISMS, generate_levels
 from proposer_rl.tasks.mazes.levels import Level, LevelSpec, planes, validate_levels
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
+from proposer_rl.tasks.mazes.paths import shortest_path_length, successors
 from proposer_rl.tasks.mazes.rendering import draw_level
 
 __all__ = [

@@ -14,12 +14,12 @@ from tensordict import TensorDictBase
 
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.tasks.mazes.distributions import SpecificationSpace
-from proposer_rl.tasks.mazes.dynamics import MOVES
-from proposer_rl.tasks.mazes.env import MazeEnv
 from proposer_rl.tasks.mazes.levels import Level, validate_levels
-from proposer_rl.tasks.mazes.settings import Fractions, MazeSettings, Mechanism, PathLengths
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
+from proposer_rl.tasks.mazes.maze_settings import Fractions, MazeSettings, Mechanism, PathLengths
+from proposer_rl.tasks.mazes.paths import MOVES
 
-AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
+LEVELS_AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}
 
 N = TypeVar("N", int, float)
@@ -38,7 +38,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         mechanism: as in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
         render_mode: what :meth:`render` gives, a picture or a text.
         **maze: ``height``, ``width``, ``max_steps``, ``step_penalty`` and ``observe_agent`` of
-            :class:`~proposer_rl.tasks.mazes.settings.MazeSettings`.
+            :class:`~proposer_rl.tasks.mazes.maze_settings.MazeSettings`.
 
     Raises:
         ArgumentError: if an argument is invalid.
@@ -85,13 +85,13 @@ class SingleMaze(gymnasium.Env[Any, Any]):
 
     @property
     def level(self) -> Level:
-        """The level that is being played, batch shape []."""
+        """Returns the level that is being played, batch shape []."""
         return self._env.levels
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode.
+        """Begins an episode.
 
         Raises:
             ValueError: if there are other options than ``"level"``, or that is none of this grid.
@@ -109,7 +109,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         return self._observe(self._state), {}
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Make a step.
+        """Makes a step.
 
         Raises:
             ValueError: if the action is none.
@@ -125,23 +125,23 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         return self._observe(after), float(after["reward"].double()), *ends, {}
 
     def render(self) -> Any:
-        """Draw it: uint8 [H', W', 3] or text, as ``render_mode`` says, else nothing."""
+        """Draws the maze: uint8 [H', W', 3] or text, as ``render_mode`` says, else nothing."""
         if self.render_mode is None:
             return None
         picture = self._env.render(self.render_mode)
         return picture if self.render_mode == "ansi" else picture.numpy()
 
     def _draw(self, seed: int) -> Level:
-        """Levels [AHEAD], uniformly over the specifications."""
+        """Draws levels [LEVELS_AHEAD], uniformly over the specifications."""
         generator = torch.Generator().manual_seed(seed)
-        bins = torch.randint(self._space.size, (AHEAD,), generator=generator)
+        bins = torch.randint(self._space.size, (LEVELS_AHEAD,), generator=generator)
         return self._space.generate(bins[None], [generator])[0]
 
     def _observe(self, state: TensorDictBase) -> Observation:
         return {key: state[key].numpy().copy() for key in ("agent", "planes")}
 
     def _read(self, level: Level | str | Sequence[str]) -> Level:
-        """The level in ``options["level"]``."""
+        """Returns the level in ``options["level"]``."""
         try:
             one = level if isinstance(level, Level) else Level.from_text(level)
         except TypeError as error:

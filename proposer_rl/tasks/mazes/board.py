@@ -10,8 +10,12 @@ from torch import Tensor
 
 from proposer_rl.models import ActorCritic, cell_maps
 from proposer_rl.play.board import CellKind
-from proposer_rl.tasks.mazes.dynamics import shortest_way, successors
-from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, policy_path
+from proposer_rl.tasks.mazes.evaluation import (
+    ExactEvaluator,
+    expected_visits,
+    policy_path,
+    success_from_cells,
+)
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.level_files import (
     levels_from_text,
@@ -29,7 +33,7 @@ from proposer_rl.tasks.mazes.levels import (
     cell_plane,
     planes,
 )
-from proposer_rl.tasks.mazes.occupancy import expected_visits, success_from_cells
+from proposer_rl.tasks.mazes.paths import shortest_way, successors
 from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 DIGITS = 4  # of the numbers of a map: what can be seen
@@ -138,7 +142,7 @@ def shortest_path(level: Level) -> list[list[int]] | None:
 
     Returns:
         Of several the one whose moves come first in
-        :data:`~proposer_rl.tasks.mazes.dynamics.MOVES`; None
+        :data:`~proposer_rl.tasks.mazes.paths.MOVES`; None
         where there is no path.
     """
     width = level.walls.shape[1]

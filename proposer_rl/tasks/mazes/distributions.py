@@ -8,10 +8,10 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.generation import generate_levels
 from proposer_rl.tasks.mazes.levels import Level, LevelSpec
 from proposer_rl.tasks.mazes.mechanisms import Generators
+from proposer_rl.tasks.mazes.paths import shortest_path_length
 
 
 class LevelDistribution:
@@ -52,11 +52,11 @@ class LevelDistribution:
 
     @property
     def size(self) -> int:
-        """Number of specifications."""
+        """Returns the number of specifications."""
         return len(self.specifications)
 
     def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Obstacle fractions float64 ``[*B]`` and path lengths int64 ``[*B]`` of numbers ``[*B]``.
+        """Returns obstacle fractions, float64, and path lengths, int64, of numbers ``[*B]``.
 
         Raises:
             ValueError: If a number is not in 0 ... size - 1.
@@ -147,14 +147,14 @@ class SpecificationSpace(LevelDistribution):
 
     @property
     def coordinates(self) -> Tensor:
-        """Obstacle fraction and path length of each pair, each scaled to [-1, 1]: float [M * N, 2].
+        """Returns each pair's fraction and length, scaled to [-1, 1]: float [M * N, 2].
 
         Of an axis with a single value the coordinate is 0.
         """
         return torch.cartesian_prod(*self._scaled(*self.axes.values()))
 
     def locate(self, levels: Level) -> Tensor:
-        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, 2] on the CPU.
+        """Returns where levels [*B] lie, as :attr:`coordinates`: float32 [*B, 2] on the CPU.
 
         A goal that cannot be reached counts as far away as there are cells.
         """
@@ -163,7 +163,7 @@ class SpecificationSpace(LevelDistribution):
         return torch.stack(self._scaled(levels.walls.float().mean((-2, -1)).cpu(), moves.cpu()), -1)
 
     def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
-        """The number of the pair nearest to each of n specifications, by coordinates: int64 [n].
+        """Returns the number of the pair nearest to each of n specifications: int64 [n].
 
         Between equally near ones rounding decides. Pairs that the space does not have get the
         nearest that it has, also where they lie outside of it.
@@ -172,7 +172,7 @@ class SpecificationSpace(LevelDistribution):
         return torch.cdist(torch.stack(scaled, -1), self.coordinates).argmin(-1)
 
     def _scaled(self, *lines: Sequence[float] | Tensor) -> list[Tensor]:
-        """Values along each axis, which goes from -1 to 1; 0 where it has a single value."""
+        """Scales values to -1 to 1 along each axis; 0 where it has a single value."""
         scaled = []
         for values, axis in zip(lines, self.axes.values(), strict=True):
             known = torch.tensor(axis, dtype=torch.float32)

@@ -13,18 +13,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import first_episode_success
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.play.board import Board
-from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
-from proposer_rl.tasks.mazes.distance import shortest_path_length
-from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.task import ComputeContext, LevelResult, Task, check_distributions, named
+from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.tasks.mazes.paths import shortest_path_length
 from proposer_rl.tasks.mazes.rendering import level_records
 
-SLACK = 2  # of a named level: steps allowed for each one of its shortest way
+STEPS_PER_SHORTEST = 2  # of a named level: steps allowed for each one of its shortest way
 _ON_A_GRID = re.compile(r"(.+?)(?:@(\d{1,3})x(\d{1,3}))?")
 
 
@@ -79,7 +78,7 @@ class GridTask(Task):
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
-        check_names(distributions, target, evaluation.distributions)
+        check_distributions(distributions, target, evaluation.distributions)
         self.maze = maze
         self.grid = (maze.height, maze.width)
         self.device = torch.device(context.device)  # of what is made next
@@ -115,11 +114,11 @@ class GridTask(Task):
         self.default_levels = "shapes"
 
     def probe_encoder(self, features: int) -> MapEncoder:
-        """A convolutional network that reads probes."""
+        """Returns a convolutional network that reads probes."""
         return MapEncoder(self.probe_planes, self._encoder_channels, features)
 
     def training_metrics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
-        """What Solvers trained on and how they fared there, each [K] from [K, P].
+        """Returns what Solvers trained on and how they fared there, each [K] from [K, P].
 
         - ``obstacle_fraction``: obstacles per cell;
         - ``path_length``, ``path_length_sd``: mean and standard deviation of the moves on the
@@ -140,12 +139,12 @@ class GridTask(Task):
         return TensorDict(metrics, levels.batch_size[:1])
 
     def record(self, levels: Level, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
-        """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
+        """Returns drawings of levels [n], with the Solver's first episode there [n, T]."""
         return list(level_records(levels, rollout))
 
     @property
     def about(self) -> dict[str, str]:
-        """Texts about the task, by their labels."""
+        """Returns texts about the task by their labels."""
         height, width = self.grid
         kinds = "; ".join(
             f"{name.upper()} ({self.distributions[name]})" for name in self.evaluated_on
@@ -158,11 +157,11 @@ class GridTask(Task):
 
     @abstractmethod
     def make_distribution(self, settings: Any, height: int, width: int) -> Any:
-        """The levels of a distribution's settings on a grid."""
+        """Returns the levels of a distribution's settings on a grid."""
 
     @abstractmethod
     def make_space(self, settings: Any) -> Any:
-        """The Proposer's bins."""
+        """Returns the Proposer's bins."""
 
     @abstractmethod
     def results_on(
@@ -172,27 +171,27 @@ class GridTask(Task):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """What K Solvers reach on levels [n] of one size, given by name what each is like."""
+        """Yields what K Solvers reach on levels [n] of one size, described by their names."""
 
     @abstractmethod
     def at_once(self, cells: int) -> int:
-        """How many levels of so many cells are evaluated together."""
+        """Returns how many levels of so many cells are evaluated together."""
 
     def check_level(self, name: str, level: Level) -> None:
-        """Refuse a level that these Solvers cannot see.
+        """Refuses a level that these Solvers cannot see.
 
         Raises:
             ValueError: naming the level.
         """
 
-    def step_limit(self, steps: int, slack: int = SLACK) -> int:
-        """The step limit of a level, given the steps of its shortest way."""
+    def step_limit(self, steps: int, slack: int = STEPS_PER_SHORTEST) -> int:
+        """Returns the step limit of a level, given the steps of its shortest way."""
         return max(self.maze.max_steps, slack * steps)
 
     def level_results(
         self, agent: ActorCritic, name: str, max_steps: int | None
     ) -> list[LevelResult]:
-        """What Solvers reach on a distribution's levels, a file's or those of a shipped set.
+        """Returns what Solvers reach on levels of a distribution, of a file or of a shipped set.
 
         Without a step limit a distribution has that of the task, so that the means are those of its
         metrics, also on another grid (``id@13x13``); other levels at least twice the steps of a
@@ -208,7 +207,7 @@ class GridTask(Task):
     def results_of(
         self, agent: ActorCritic, levels: Mapping[str, Any], limit_of: Callable[[int], int]
     ) -> list[LevelResult]:
-        """What K Solvers reach on levels of any size, in the levels' order.
+        """Returns what K Solvers reach on levels of any size, in the levels' order.
 
         Those of one size and one step limit are evaluated together.
 
@@ -229,14 +228,14 @@ class GridTask(Task):
         for (limit, height, width), members in batches.items():
             together = max(self.at_once(height * width), 1)
             for first in range(0, len(members), together):
-                told = {known: about[known] for known in members[first : first + together]}
-                batch: Any = torch.stack([levels[known] for known in told])
-                results += self.results_on(agent, batch.to(self.device), told, limit)
+                described = {known: about[known] for known in members[first : first + together]}
+                batch: Any = torch.stack([levels[known] for known in described])
+                results += self.results_on(agent, batch.to(self.device), described, limit)
         place = {known: number for number, known in enumerate(levels)}
         return sorted(results, key=lambda result: (place[result.level], result.solver))
 
     def _named_levels(self, name: str) -> tuple[dict[str, Any], int]:
-        """The levels [] that a user names, and the steps allowed for each of their shortest way.
+        """Returns the levels that a user names, and the steps allowed per step of a shortest way.
 
         Raises:
             ValueError: if there are no such levels.
@@ -245,7 +244,7 @@ class GridTask(Task):
         if Path(name).suffix in self.suffixes:
             if not Path(name).exists():
                 raise ValueError(f"--levels {name}: there is no such file")
-            return dict(self.read_file(name)), SLACK
+            return dict(self.read_file(name)), STEPS_PER_SHORTEST
         asked = _ON_A_GRID.fullmatch(name)
         for known, kind in self._kinds.items():
             if asked is None or known.casefold() != asked[1].casefold():
@@ -261,7 +260,7 @@ class GridTask(Task):
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
         if name in shipped_sets():
-            return dict(shipped_levels(name, self.level)), SLACK
+            return dict(shipped_levels(name, self.level)), STEPS_PER_SHORTEST
         raise ValueError(
             f"--levels {name}: must be one of: {', '.join(shipped_sets())}, a file that ends in "
             f"{' or '.join(self.suffixes)}, or a distribution: {', '.join(self._kinds)}, as it is "
@@ -270,7 +269,7 @@ class GridTask(Task):
 
 
 def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of some of the values [*B, P], 0 of none: float [*B] each."""
+    """Returns mean and deviation of some of the values [*B, P], 0 of none: float [*B] each."""
     count = which.sum(-1).clamp_min(1)
     mean = (values * which).sum(-1) / count
     square = (values - mean.unsqueeze(-1)).square()

@@ -15,11 +15,11 @@ from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 SUFFIXES = (".txt", ".json")
 RECORD = ".jsonl"  # of levels that a run trained on; read, not written
-LARGEST_FILE = 10**7  # bytes; files may come from anybody
+LARGEST_FILE_BYTES = 10**7  # bytes; files may come from anybody
 LONGEST_NAME = 80
-MOST_LEVELS = 10_000  # of a file
+MOST_FILE_LEVELS = 10_000  # of a file
 MOST_CELLS = 2**14  # of a level
-MOST_STEPS = 2**29  # cells times moves of the shortest path, of all levels of a file together
+MOST_FILE_STEPS = 2**29  # cells times moves of the shortest path, of all levels of a file together
 
 _HERE = Path(__file__).parent
 _HEADER = re.compile(r"\[(.*)\]")
@@ -36,7 +36,7 @@ class Item:
 
 
 def _items(levels: list[Item]) -> None:
-    """What a file in JSON holds."""
+    """Takes what a file in JSON must hold, for the check of its types."""
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -55,7 +55,7 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
     """
     path = Path(path)
     check_suffix(path, (*SUFFIXES, RECORD))
-    content = read_bounded(path, LARGEST_FILE)
+    content = read_bounded(path, LARGEST_FILE_BYTES)
     try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
         if path.suffix == ".json":
@@ -85,12 +85,12 @@ def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> N
 
 
 def shipped_sets() -> list[str]:
-    """Names of the sets that come with the package."""
+    """Returns the names of the sets that come with the package."""
     return sorted(file.stem for file in _HERE.glob("*.txt"))
 
 
 def shipped_levels(name: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """The levels of a shipped set; an agent that turns looks to the right.
+    """Returns the levels of a shipped set; an agent that turns looks to the right.
 
     Args:
         name: Of the set.
@@ -202,7 +202,7 @@ def levels_to_text(levels: Mapping[str, Level]) -> str:
     """Draws levels; the inverse of :func:`levels_from_text`, with their path lengths."""
     return "\n".join(
         f"[{name}]\npath_length: {length}\n{level.to_text()}\n"
-        for name, level, length in _checked(levels)
+        for name, level, length in _with_lengths(levels)
     )
 
 
@@ -210,7 +210,7 @@ def levels_to_json(levels: Mapping[str, Level]) -> str:
     """Writes levels as JSON; the inverse of :func:`levels_from_json`, with their path lengths."""
     items = [
         {"name": name, "path_length": length, "level": level.to_text().splitlines()}
-        for name, level, length in _checked(levels)
+        for name, level, length in _with_lengths(levels)
     ]
     return json.dumps({"levels": items}, indent=1) + "\n"
 
@@ -218,7 +218,7 @@ def levels_to_json(levels: Mapping[str, Level]) -> str:
 def named_levels(
     drawn: Sequence[tuple[str, Sequence[str], int | None]], kind: type[Level] = Level
 ) -> dict[str, Level]:
-    """Levels of names, rows of a drawing and, where it is known, the length of the shortest path.
+    """Returns levels by name, of their names, rows and, where known, shortest path lengths.
 
     Raises:
         ValueError: As :func:`levels_from_text`.
@@ -236,10 +236,10 @@ def named_levels(
             reason = str(error).partition(", got")[0]
             raise ValueError(f"level {name!r:.80}: {reason}") from error
         steps += levels[name].walls.numel() * _check_length(name, levels[name], recorded)
-        if steps > MOST_STEPS:
+        if steps > MOST_FILE_STEPS:
             raise ValueError(
                 f"level {name!r:.80}: up to here, cells times moves of the shortest paths are more "
-                f"than {MOST_STEPS:,}, which would take minutes to evaluate"
+                f"than {MOST_FILE_STEPS:,}, which would take minutes to evaluate"
             )
     if not levels:
         raise ValueError("holds no levels")
@@ -247,27 +247,27 @@ def named_levels(
 
 
 def check_count(count: int) -> None:
-    """Refuse a file of more levels than are ever evaluated."""
-    if count > MOST_LEVELS:
-        raise ValueError(f"holds {count:,} levels; at most {MOST_LEVELS:,} are read")
+    """Refuses a file of more levels than are ever evaluated."""
+    if count > MOST_FILE_LEVELS:
+        raise ValueError(f"holds {count:,} levels; at most {MOST_FILE_LEVELS:,} are read")
 
 
 def check_size(name: str, height: int, width: int) -> None:
-    """Refuse a level of more cells than are ever evaluated."""
+    """Refuses a level of more cells than are ever evaluated."""
     if height * width > MOST_CELLS:
         raise ValueError(
             f"level {name!r:.80}: {height:,}x{width:,} cells; at most {MOST_CELLS:,} are read"
         )
 
 
-def _checked(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
+def _with_lengths(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
     if not levels:
         raise ValueError("there must be at least one level to write")
     return [(name, level, _check_length(name, level)) for name, level in levels.items()]
 
 
 def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
-    """The length of the level's shortest path, if it is the one recorded."""
+    """Returns the length of a level's shortest path; refuses another recorded one."""
     usable = name.strip() == name and name.isprintable() and not set(name) & set("[]")
     if not usable or not 0 < len(name) <= LONGEST_NAME:
         raise ValueError(
@@ -284,6 +284,6 @@ def _check_length(name: str, level: Level, recorded: int | None = None) -> int:
 
 
 def check_suffix(path: Path, known: Sequence[str]) -> None:
-    """Refuse a file whose name says that it holds something else."""
+    """Refuses a file whose name says that it holds something else."""
     if path.suffix not in known:
         raise ValueError(f"{path}: must end in one of {', '.join(known)}")

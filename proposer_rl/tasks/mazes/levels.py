@@ -73,7 +73,7 @@ class Level(TensorClass):
 
     @classmethod
     def _parse(cls, drawing: str) -> Any:
-        """The level of one drawing."""
+        """Reads the level of one drawing."""
         rows = drawn_rows(drawing)
         flat = "".join(rows)
         if not rows or any(len(row) != len(rows[0]) for row in rows):
@@ -128,7 +128,7 @@ def cell_index(cell: Tensor, width: int) -> Tensor:
 
 
 def cell_position(index: Tensor, width: int) -> Tensor:
-    """Inverse of :func:`cell_index`: int64 ``[*B]`` to int64 ``[*B, 2]`` (row, column)."""
+    """Returns rows and columns, int64 ``[*B, 2]``, of numbered cells, int64 ``[*B]``."""
     return torch.stack([index // width, index % width], dim=-1)
 
 
@@ -156,24 +156,24 @@ def validate_levels(level: Level) -> None:
             raise ValueError(
                 f"{name} must be int64 {[*batch, 2]}, got {cell.dtype} {list(cell.shape)}"
             )
-        _refuse(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
+        _refuse_any(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
         index = cell_index(cell, width).unsqueeze(-1)
-        _refuse(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
-    _refuse((level.start == level.goal).all(-1), "start and goal on the same cell")
+        _refuse_any(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
+    _refuse_any((level.start == level.goal).all(-1), "start and goal on the same cell")
     if (direction := getattr(level, "direction", None)) is not None:
         if direction.dtype != torch.int64 or direction.shape != batch:
             raise ValueError(
                 f"direction must be int64 {list(batch)}, "
                 f"got {direction.dtype} {list(direction.shape)}"
             )
-        _refuse((direction < 0) | (direction > 3), "direction outside 0..3")
+        _refuse_any((direction < 0) | (direction > 3), "direction outside 0..3")
 
 
-def _refuse(bad: Tensor, fault: str) -> None:
+def _refuse_any(bad: Tensor, fault: str) -> None:
     if count := int(bad.sum()):
         raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
 
 
 def drawn_rows(drawing: str) -> list[str]:
-    """The rows of a drawing, without blank lines and what stands before or after a row."""
+    """Returns the rows of a drawing, without blank lines and what stands before or after a row."""
     return [row for row in map(str.strip, drawing.splitlines()) if row]

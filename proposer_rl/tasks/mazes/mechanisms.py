@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.distance import cells_at_depth, padded_index, schedule
 from proposer_rl.tasks.mazes.levels import Level, cell_position
+from proposer_rl.tasks.mazes.paths import cells_at_depth, depth_schedule, padded_index
 
 Generators = torch.Generator | None | Sequence[torch.Generator]
 
@@ -38,17 +38,17 @@ class Draws:
         self._group = group
 
     def rand(self, rows: int) -> Tensor:
-        """Uniform numbers in [0, 1), float32 ``[rows, C]``."""
+        """Returns uniform numbers in [0, 1), float32 ``[rows, C]``."""
         return self._columns(lambda n, g: torch.rand(rows, n, generator=g, device=self.device))
 
     def randint(self, high: int) -> Tensor:
-        """Uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
+        """Returns uniform whole numbers in 0 ... high - 1, int64 ``[1, C]``."""
         return self._columns(
             lambda n, g: torch.randint(high, (1, n), generator=g, device=self.device)
         )
 
     def of(self, kept: Tensor) -> Draws:
-        """The same for some of the candidates, whose ascending indices are given, int64 ``[A]``."""
+        """Returns the draws of some candidates, given by their ascending indices, int64 ``[A]``."""
         return Draws(self._generators, self._group[kept.cpu()], self.device)
 
     def _columns(self, draw: Callable[[int, torch.Generator | None], Tensor]) -> Tensor:
@@ -95,7 +95,7 @@ def draw_uniform(
 
 
 def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
-    """Uniform obstacles and a uniform free start.
+    """Draws uniform obstacles and a uniform free start.
 
     The obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
     3.4.2, algorithm S): a cell becomes one with probability (obstacles still needed) / (cells still
@@ -145,7 +145,7 @@ def draw_path_first(
 
 
 def _carve(path_length: Tensor, height: int, width: int, draws: Draws) -> tuple[Tensor, Tensor]:
-    """Random paths of which no two cells touch unless they are consecutive.
+    """Draws random paths of which no two cells touch unless they are consecutive.
 
     A path goes on to a uniform choice among the cells whose only carved neighbour is its end.
 
@@ -242,7 +242,7 @@ def _shortcut_rank(rank: Tensor, start: Tensor, goal: Tensor, path_length: Tenso
     spare = torch.full_like(reached, _NEVER)
     goal = padded_index(goal, width).unsqueeze(0)
     result = torch.full_like(rank[0, 0], _NEVER)
-    for first, end in schedule((path_length - 2).clamp(min=0)):
+    for first, end in depth_schedule((path_length - 2).clamp(min=0)):
         here, following = reached[..., first:], spare[1:-1, 1:-1, first:]
         torch.minimum(here[:-2, 1:-1], here[2:, 1:-1], out=following)
         torch.minimum(following, here[1:-1, :-2], out=following)

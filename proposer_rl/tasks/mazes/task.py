@@ -12,16 +12,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings
 from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
 from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
-from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
-from proposer_rl.tasks.mazes.env import MazeEnv
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
+    episode_law,
     optimal_return,
     policy_path,
     worst_mean,
@@ -29,24 +28,23 @@ from proposer_rl.tasks.mazes.evaluation import (
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.level_files import RECORD, SUFFIXES, read_levels
 from proposer_rl.tasks.mazes.levels import Level, planes
-from proposer_rl.tasks.mazes.network import (
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
+from proposer_rl.tasks.mazes.maze_settings import (
     ACTIONS,
     PLANES,
+    Channels,
+    DistributionSettings,
+    MazeEvaluationSettings,
+    MazeSettings,
+    SpaceSettings,
+    UNetSettings,
     check_level_size,
     check_network,
     faster_precision,
     unet,
 )
-from proposer_rl.tasks.mazes.occupancy import episode_law
+from proposer_rl.tasks.mazes.paths import shortest_path_length
 from proposer_rl.tasks.mazes.rendering import EPISODE, draw_level
-from proposer_rl.tasks.mazes.settings import (
-    Channels,
-    DistributionSettings,
-    EvaluationSettings,
-    MazeSettings,
-    NetworkSettings,
-    SpaceSettings,
-)
 
 WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
@@ -82,9 +80,9 @@ class MazeTask(GridTask):
         distributions: dict[str, DistributionSettings],
         target: str,
         space: SpaceSettings,
-        network: NetworkSettings,
+        network: UNetSettings,
         encoder_channels: Channels,
-        evaluation: EvaluationSettings,
+        evaluation: MazeEvaluationSettings,
         solver: SolverSettings,
         context: ComputeContext,
         make_network: Callable[[], nn.Module] | None = None,
@@ -130,29 +128,29 @@ class MazeTask(GridTask):
     def make_distribution(
         self, settings: DistributionSettings, height: int, width: int
     ) -> LevelDistribution:
-        """The levels of a distribution's settings on a grid."""
+        """Returns the levels of a distribution's settings on a grid."""
         kind = (settings.specifications, settings.mechanism)
         return LevelDistribution(*kind, height, width, self.device)
 
     def make_space(self, settings: SpaceSettings) -> SpecificationSpace:
-        """The Proposer's bins."""
+        """Returns the Proposer's bins."""
         axes = (settings.obstacle_fractions, settings.path_lengths)
         return SpecificationSpace(*axes, settings.mechanism, *self.grid, self.device)
 
     @property
     def target_shares(self) -> Tensor:
-        """The target's specifications, each rounded to the nearest bin, float [N]."""
+        """Returns the target's share in each bin, its specifications rounded to bins: float [N]."""
         nearest = self.space.nearest(self.target.specifications)
         return nearest.bincount(minlength=self.space.size) / len(nearest)
 
     @property
     def metrics(self) -> list[str]:
-        """The names of what :meth:`measure` gives."""
+        """Returns the names of what :meth:`measure` gives."""
         kinds = ("success", "return", "success_worst10", "greedy_success", "greedy_return")
         return [f"{name}_{kind}" for name in self.evaluated_on for kind in kinds]
 
     def environment(self, levels: Level) -> EnvBase:
-        """Mazes to be played."""
+        """Returns an environment of mazes."""
         max_steps, step_penalty = self._rules
         return MazeEnv(
             levels,
@@ -162,38 +160,38 @@ class MazeTask(GridTask):
         )
 
     def network(self) -> nn.Module:
-        """The network of one Solver."""
+        """Returns the network of one Solver."""
         if self._make_network is not None:
             return self._make_network()
         return unet(self._network, PLANES + self.maze.observe_agent)
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """K networks that map a maze to logits and values of its cells."""
+        """Returns K networks that map a maze to logits and values of its cells."""
         return map_actor_critic(population, per_step=self.maze.observe_agent)
 
     def performance(
         self, agent: ActorCritic, levels: Level, generator: torch.Generator
     ) -> TensorDictBase:
-        """Return and success of K Solvers on levels [E] or [K, E], as the settings ask for it."""
+        """Evaluates K Solvers on levels [E] or [K, E], exactly or by episodes, as it is set."""
         return self._evaluator(*_with_logits(agent, levels), generator)
 
     def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
-        """Exact return and success of K Solvers, each on its own levels [K, E], with gradients."""
+        """Evaluates K Solvers exactly, each on its own levels [K, E], with gradients."""
         logits = cell_logits(agent, planes(levels), gradients=torch.is_grad_enabled())
         return self._sampled(levels, logits)
 
     def optimal_return(self, levels: Level) -> Tensor:
-        """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
+        """Returns the largest expected return of any policy on levels [*B]: float [*B]."""
         return optimal_return(levels, *self._rules)
 
     def episode_law(self, agent: ActorCritic, levels: Level) -> EpisodeLaw:
-        """Exactly what K Solvers' episodes can be, each on its own levels [K, E]."""
+        """Returns the exact law of K Solvers' episodes, each on its own levels [K, E]."""
         logits, values = cell_maps(agent, planes(levels))
         policy = logits.softmax(-3, dtype=torch.float64)
         return episode_law(levels, policy, values.squeeze(-3), *self._rules)
 
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
-        """Planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
+        """Returns planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""
         if not levels.batch_size.numel():
             shown = planes(for_copies(agent, levels))
             return shown.new_zeros(*shown.shape[:2], self.probe_planes, *shown.shape[-2:])
@@ -201,7 +199,7 @@ class MazeTask(GridTask):
         return torch.cat([planes(copies), logits], -3)
 
     def measure(self, agent: ActorCritic) -> TensorDict:
-        """Exact means over the fixed levels of each distribution measured on, each [K].
+        """Returns exact means over the evaluation levels of each distribution, each [K].
 
         Entries, by the distribution's name: ``<name>_success``, ``<name>_return`` of the sampled
         policy and ``<name>_greedy_success``, ``<name>_greedy_return`` of the greedy one; and
@@ -217,26 +215,26 @@ class MazeTask(GridTask):
         return TensorDict(means, [agent.copies])
 
     def _exactly(self, levels: Level, logits: Tensor, max_steps: int) -> dict[str, Tensor]:
-        """What the sampled policy reaches, and as ``greedy_...`` the greedy one, each [K, n]."""
+        """Evaluates the sampled policy, and as ``greedy_...`` the greedy one, each [K, n]."""
         penalty = self.maze.step_penalty
         sampled = ExactEvaluator(max_steps, penalty)(levels, logits)
         greedy = ExactEvaluator(max_steps, penalty, greedy=True)(levels, logits)
         return {**sampled, **{f"greedy_{kind}": values for kind, values in greedy.items()}}
 
     def evaluate(self, agent: ActorCritic) -> dict[str, TensorDictBase]:
-        """The sampled policy's exact performance on every evaluation level."""
+        """Returns the sampled policy's exact performance on every evaluation level."""
         return {
             name: self._sampled(*_with_logits(agent, levels))
             for name, levels in self.evaluated_on.items()
         }
 
     def check_level(self, name: str, level: Level) -> None:
-        """Refuse a level that the U-Net cannot see; what another network sees, nobody knows."""
+        """Refuses a level that the U-Net cannot see; of other networks it is not known."""
         if self._make_network is None:
             check_level_size(name, level.walls.shape, self._network)
 
     def at_once(self, cells: int) -> int:
-        """How many levels of so many cells are evaluated together."""
+        """Returns how many levels of so many cells are evaluated together."""
         return CELLS_AT_ONCE // cells
 
     @torch.no_grad()
@@ -247,7 +245,7 @@ class MazeTask(GridTask):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """What K Solvers reach on levels [n] of any one size, exactly.
+        """Yields exactly what K Solvers reach on levels [n] of any one size.
 
         ``success`` and ``return`` of the sampled policy, and of the greedy one, which takes the
         most probable actions, ``greedy_success`` (1 or 0) and ``greedy_return``.
@@ -256,13 +254,13 @@ class MazeTask(GridTask):
         performance = self._exactly(copies, logits, max_steps)
         paths = policy_path(copies, logits, max_steps)  # [K, n, max_steps + 1, 2]
         for k in range(len(copies)):
-            for i, (name, told) in enumerate(about.items()):
+            for i, (name, known) in enumerate(about.items()):
                 results = {key: float(value[k, i]) for key, value in performance.items()}
                 away = (paths[k, i] != levels[i].goal).any(-1)
                 path = paths[k, i, : int(away.sum()) + 1].tolist()  # the goal is not left again
                 moves = f"greedy {len(path) - 1}" if results["greedy_success"] else "greedy fails"
-                note = f"shortest {told[self.steps_name]}, {moves}"
-                yield LevelResult(name, k, told, results, note, partial(_picture, levels[i], path))
+                note = f"shortest {known[self.steps_name]}, {moves}"
+                yield LevelResult(name, k, known, results, note, partial(_picture, levels[i], path))
 
 
 def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:
@@ -270,6 +268,6 @@ def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
-    """Levels [E], the same for all K Solvers, or [K, E]; [K, E] with the logits of every cell."""
+    """Returns levels [E] or [K, E] as [K, E], and the K Solvers' logits at every cell."""
     copies = for_copies(agent, levels)
     return copies, cell_logits(agent, planes(copies))

@@ -10,13 +10,11 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.play.board import CellKind
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.board import Drawings
-from proposer_rl.tasks.mazes.dynamics import MOVES, shortest_way, successors
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import FREE, GOAL, WALL, cell_index
-from proposer_rl.tasks.view_mazes.distance import fewest_actions
-from proposer_rl.tasks.view_mazes.env import PENALTY
-from proposer_rl.tasks.view_mazes.evaluation import walks
-from proposer_rl.tasks.view_mazes.levels import AGENTS, AHEAD, ViewLevel
+from proposer_rl.tasks.mazes.paths import MOVES, shortest_way, successors
+from proposer_rl.tasks.view_mazes.view_env import PENALTY, fewest_actions, walks
+from proposer_rl.tasks.view_mazes.view_levels import AGENTS, AHEAD, ViewLevel
 
 SHOWN = 20  # sampled episodes that can be watched
 Node = list[int]  # row, column and direction

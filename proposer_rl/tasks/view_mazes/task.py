@@ -12,29 +12,32 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.episodes import mean_performance
-from proposer_rl.learning.settings import SolverSettings
+from proposer_rl.learning import SolverSettings, mean_performance
 from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import planes
+from proposer_rl.tasks.mazes.maze_settings import Channels
 from proposer_rl.tasks.mazes.rendering import draw_level
-from proposer_rl.tasks.mazes.settings import Channels
 from proposer_rl.tasks.view_mazes.board import ViewBoard
-from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
-from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import visits, walks
-from proposer_rl.tasks.view_mazes.level_files import SUFFIXES, read_view_levels
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
-from proposer_rl.tasks.view_mazes.network import OBSERVED, view_network
-from proposer_rl.tasks.view_mazes.settings import (
-    DistributionSettings,
-    EvaluationSettings,
-    SpaceSettings,
+from proposer_rl.tasks.view_mazes.view_distributions import ViewDistribution, ViewSpace
+from proposer_rl.tasks.view_mazes.view_env import (
+    ViewMazeEnv,
+    fewest_actions,
+    optimal_view_return,
+    visits,
+    walks,
+)
+from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
+from proposer_rl.tasks.view_mazes.view_settings import (
+    VIEW_ENTRIES,
+    ViewDistributionSettings,
+    ViewEvaluationSettings,
     ViewMazeSettings,
     ViewNetworkSettings,
+    ViewSpaceSettings,
+    view_network,
 )
 
 LOCATING = 4096  # levels by which the target is located among the bins
@@ -56,7 +59,7 @@ class ViewMazeTask(GridTask):
     """
 
     level = ViewLevel
-    suffixes = SUFFIXES
+    suffixes = VIEW_SUFFIXES
     read_file = staticmethod(read_view_levels)
     fewest_steps = staticmethod(fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
@@ -70,12 +73,12 @@ class ViewMazeTask(GridTask):
         self,
         *,
         maze: ViewMazeSettings,
-        distributions: dict[str, DistributionSettings],
+        distributions: dict[str, ViewDistributionSettings],
         target: str,
-        space: SpaceSettings,
+        space: ViewSpaceSettings,
         network: ViewNetworkSettings,
         encoder_channels: Channels,
-        evaluation: EvaluationSettings,
+        evaluation: ViewEvaluationSettings,
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
@@ -96,46 +99,46 @@ class ViewMazeTask(GridTask):
         self.board = ViewBoard(self, self._named_episodes, self._draws)
 
     def make_distribution(
-        self, settings: DistributionSettings, height: int, width: int
+        self, settings: ViewDistributionSettings, height: int, width: int
     ) -> ViewDistribution:
-        """The levels of a distribution's settings on a grid."""
+        """Returns the levels of a distribution's settings on a grid."""
         return ViewDistribution(settings, height, width, self.device)
 
-    def make_space(self, settings: SpaceSettings) -> ViewSpace:
-        """The Proposer's bins."""
+    def make_space(self, settings: ViewSpaceSettings) -> ViewSpace:
+        """Returns the Proposer's bins."""
         return ViewSpace(settings, *self.grid, self.device)
 
     @property
     def target_shares(self) -> Tensor:
-        """The bins nearest to each of many levels of the target, as shares of the bins: [N]."""
+        """Returns the share of the target's levels that is nearest to each bin: float [N]."""
         levels = self.target.sample(LOCATING, Streams(0, "target_shares").generator())
         shares: Tensor = self.space.shares(levels)
         return shares
 
     def environment(self, levels: ViewLevel) -> EnvBase:
-        """Mazes to be played."""
+        """Returns an environment of mazes."""
         return ViewMazeEnv(levels, max_steps=self.maze.max_steps)
 
     def network(self) -> MemoryNetwork:
-        """The network of one Solver."""
+        """Returns the network of one Solver."""
         return view_network(self._network)
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """K networks with memory."""
-        return memory_actor_critic(population, OBSERVED, self._network.memory)
+        """Returns K networks with memory."""
+        return memory_actor_critic(population, VIEW_ENTRIES, self._network.memory)
 
     def optimal_return(self, levels: ViewLevel) -> Tensor:
-        """The largest expected return of any policy on levels [*B], solvable or not: float [*B]."""
-        return optimal_return(levels, self.maze.max_steps)
+        """Returns the largest expected return of any policy on levels [*B]: float [*B]."""
+        return optimal_view_return(levels, self.maze.max_steps)
 
     def probe(self, agent: ActorCritic, levels: ViewLevel) -> Tensor:
-        """Planes of levels [C], and where the most probable actions lead: float [K, C, 4, H, W]."""
+        """Returns planes of levels [C] with the K Solvers' visits: float [K, C, 4, H, W]."""
         drawn = planes(for_copies(agent, levels))
         went = visits(agent, levels, self.maze.max_steps)
         return torch.cat([drawn, went.unsqueeze(-3)], -3)
 
     def at_once(self, cells: int) -> int:
-        """How many levels are evaluated together."""
+        """Returns how many levels are evaluated together."""
         return EPISODES_AT_ONCE // self._named_episodes
 
     def results_on(
@@ -145,7 +148,7 @@ class ViewMazeTask(GridTask):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """What K Solvers reach on levels [n] of any one size, by episodes.
+        """Yields what K Solvers reach in episodes on levels [n] of any one size.
 
         ``success``, the share of episodes that reached the goal, with the bounds of its 95 %
         interval (Wilson 1927), ``success_low`` and ``success_high``, and ``return``, the mean.
@@ -161,7 +164,7 @@ class ViewMazeTask(GridTask):
             episodes=episodes,
             drop_finished=self.drop_finished,
         ).cpu()
-        for i, (name, told) in enumerate(about.items()):
+        for i, (name, known) in enumerate(about.items()):
             for k in range(len(copies)):
                 reached = round(float(performance["success"][k, i]) * episodes)
                 interval = scipy.stats.binomtest(reached, episodes).proportion_ci(method="wilson")
@@ -171,15 +174,15 @@ class ViewMazeTask(GridTask):
                     "success_high": float(interval.high),
                     "return": float(performance["return"][k, i]),
                 }
-                fewest = f"fewest actions {told[self.steps_name]}"
+                fewest = f"fewest actions {known[self.steps_name]}"
                 note = f"{reached} of {episodes} episodes, {fewest}"
                 picture = partial(self._picture, agent, k, levels[i], max_steps)
-                yield LevelResult(name, k, told, results, note, picture)
+                yield LevelResult(name, k, known, results, note, picture)
 
     def _picture(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int
     ) -> NDArray[np.uint8]:
-        """A level, and one episode of one Solver there."""
+        """Draws a level, and one episode of one Solver there."""
         noise = torch.rand(max_steps, 1, generator=self._draws.generator("picture"))
         went, steps = walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
         path = went[solver, 0, : int(steps[solver, 0]) + 1, :2]

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
-from proposer_rl.models import Population, draw, joint_categorical, normal
+from proposer_rl.models import Population, draw_at, joint_categorical, normal
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork
 from proposer_rl.tasks.gymnasium.settings import NetworkSettings
 from proposer_rl.tasks.gymnasium.spaces import plain
@@ -70,7 +70,7 @@ def test_the_first_policies_are_wide() -> None:
     even = SolverNetwork([NUMBERS], FOUR, SETTINGS)(seen)[0].softmax(-1)
     assert ((even - 0.25).abs() < 0.02).all()
     distribution = normal(SolverNetwork([NUMBERS], TWO, SETTINGS)(seen)[0])
-    drawn = draw(distribution, torch.rand(50, 2))
+    drawn = draw_at(distribution, torch.rand(50, 2))
     assert drawn.shape == (50, 2) and 0.4 < drawn.std() < 0.8
 
 
@@ -79,7 +79,7 @@ def test_of_several_choices_none_is_drawn_that_there_is_not() -> None:
     acts = MultiCategorical([2, 5, 3])
     logits, _ = SolverNetwork([NUMBERS], acts, SETTINGS)(torch.rand(4000, 5))
     distribution = joint_categorical(logits)
-    drawn = draw(distribution, torch.rand(4000, 3))
+    drawn = draw_at(distribution, torch.rand(4000, 3))
     assert [set(column.tolist()) for column in drawn.T] == [{0, 1}, set(range(5)), {0, 1, 2}]
     parts = [
         torch.distributions.Categorical(logits=logits[:, i, :n]) for i, n in enumerate((2, 5, 3))

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from proposer_rl.learning.settings import PPOSettings, SolverSettings
+from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
 from proposer_rl.tasks.gymnasium.settings import (
     EvaluationSettings,

@@ -15,7 +15,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, planes
 from proposer_rl.tasks.mazes.board import shortest_path
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
-from proposer_rl.tasks.mazes.settings import MazeSettings
+from proposer_rl.tasks.mazes.maze_settings import MazeSettings
 from proposer_rl.tasks.mazes.task import MazeTask
 from tests.tasks.mazes.oracles import moved, path_length, random_levels
 from tests.tiny import mountain_cars, tiny_task

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from proposer_rl.tasks.mazes import Level, validate_levels
-from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.tasks.mazes.generation import edit_levels
 from tests.tasks.mazes.oracles import random_levels
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6)).filter(lambda size: size[0] * size[1] > 1)

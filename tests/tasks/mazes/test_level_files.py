@@ -163,7 +163,7 @@ def test_bad_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(ValueError, match=r"binary.txt: .*utf-8"):
         read_levels(tmp_path / "binary.txt")
-    monkeypatch.setattr(format_, "LARGEST_FILE", 10)
+    monkeypatch.setattr(format_, "LARGEST_FILE_BYTES", 10)
     (tmp_path / "large.txt").write_text(HALLS)
     with pytest.raises(ValueError, match=r"large.txt: is larger than 10 bytes"):
         read_levels(tmp_path / "large.txt")
@@ -291,7 +291,7 @@ def test_what_would_take_minutes_is_refused(text: str, message: str, tmp_path: P
 
 
 def test_ways_that_would_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(format_, "MOST_STEPS", 9 * 9 * 48)  # cells and moves of the first
+    monkeypatch.setattr(format_, "MOST_FILE_STEPS", 9 * 9 * 48)  # cells and moves of the first
     first, both = f"[a]\n{serpentine(9)}\n", f"[a]\n{serpentine(9)}\n[b]\nSG\n"
     assert list(levels_from_text(first)) == ["a"]
     with pytest.raises(ValueError, match="level 'b': up to here, cells times moves of the"):

@@ -13,8 +13,8 @@ from proposer_rl.task import LevelResult
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import RolloutEvaluator
 from proposer_rl.tasks.mazes.level_files import levels_from_text
+from proposer_rl.tasks.mazes.maze_settings import MazeSettings
 from proposer_rl.tasks.mazes.rendering import draw_level
-from proposer_rl.tasks.mazes.settings import MazeSettings
 from tests.tasks.mazes.oracles import random_levels
 from tests.tiny import tiny_task
 

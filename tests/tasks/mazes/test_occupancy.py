@@ -10,8 +10,12 @@ import pytest
 import torch
 
 from proposer_rl.tasks.mazes import Level
-from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
-from proposer_rl.tasks.mazes.occupancy import episode_law, expected_visits, success_from_cells
+from proposer_rl.tasks.mazes.evaluation import (
+    ExactEvaluator,
+    episode_law,
+    expected_visits,
+    success_from_cells,
+)
 from tests.tasks.mazes.oracles import moved, play, random_levels
 
 STEPS = 9

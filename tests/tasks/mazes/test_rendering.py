@@ -14,7 +14,7 @@ from proposer_rl.tasks.mazes.rendering import (
     START_COLOUR,
     WALL_COLOUR,
 )
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 
 LEVEL = Level.from_text("S.#\n..G")
 COLOURS = {"S": START_COLOUR, "G": GOAL_COLOUR, "#": WALL_COLOUR, ".": FREE_COLOUR}

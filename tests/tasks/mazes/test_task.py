@@ -16,12 +16,12 @@ from proposer_rl.models import Population
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, EditableTask, OptimalTask
 from proposer_rl.tasks.mazes import Level
-from proposer_rl.tasks.mazes.settings import (
+from proposer_rl.tasks.mazes.maze_settings import (
     DistributionSettings,
-    EvaluationSettings,
+    MazeEvaluationSettings,
     MazeSettings,
-    NetworkSettings,
     SpaceSettings,
+    UNetSettings,
 )
 from proposer_rl.tasks.mazes.task import MazeTask, faster_precision
 from tests.host_reads import NoHostReads
@@ -56,7 +56,7 @@ def test_another_network_takes_the_unets_place() -> None:
             maps = super().forward(planes.flatten(0, -4)).unflatten(0, planes.shape[:-3])
             return maps.split([4, 1], -3)
 
-    unused = NetworkSettings(channels=[64, 128, 256, 512])
+    unused = UNetSettings(channels=[64, 128, 256, 512])
     own = tiny_task(
         make_network=Convolution, network=unused, context=ComputeContext(precision="auto")
     )
@@ -180,7 +180,7 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
     [
         ({"target": "far"}, r"target: must be among \['id'\], got 'far'"),
         (
-            {"evaluation": EvaluationSettings(distributions=["far"], levels=2)},
+            {"evaluation": MazeEvaluationSettings(distributions=["far"], levels=2)},
             r"evaluation.distributions: must be among \['id'\], got 'far'",
         ),
         (
@@ -194,16 +194,16 @@ def test_edited_levels_are_trained_on_and_recorded_like_others() -> None:
                     "far": DistributionSettings(specifications=[(0.0, 8)]),
                 },
                 "maze": MazeSettings(height=5, width=5, max_steps=7),
-                "evaluation": EvaluationSettings(distributions=["id", "far"], levels=2),
+                "evaluation": MazeEvaluationSettings(distributions=["id", "far"], levels=2),
             },
             "maze.max_steps=7 must be at least 8, the path length of distributions.far",
         ),
         (
-            {"network": NetworkSettings(channels=[12], groups=8)},
+            {"network": UNetSettings(channels=[12], groups=8)},
             r"network.channels=\[12\] must be multiples of network.groups=8",
         ),
         (
-            {"network": NetworkSettings(channels=[8] * 4, groups=4)},
+            {"network": UNetSettings(channels=[8] * 4, groups=4)},
             "halve a 5x5 maze to nothing",
         ),
         (

@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.envs import check_env_specs
 
 from proposer_rl.models import population
-from proposer_rl.tasks.point_masses.env import PointMassEnv
+from proposer_rl.tasks.point_masses.task import PointMassEnv
 
 DOWN, UP, RIGHT = (0.0, -1.0), (0.0, 1.0), (1.0, 0.0)
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from proposer_rl.tasks.mazes.levels import cell_position
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 
 
 def random_levels(count: int, side: int = 13, seed: int = 0) -> ViewLevel:

@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.tasks.view_mazes.env import AGENT, GOAL, ViewMazeEnv
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_env import AGENT_PLACE, GOAL_OBJECT, ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from research.benchmarks.minigrid_env import MiniGridMaze
 from tests.tasks.view_mazes.oracles import random_levels
 
@@ -94,12 +94,12 @@ def test_what_is_seen_turns_with_the_agent() -> None:
     level = ViewLevel.from_text("G....\n.....\n>....")
     env = ViewMazeEnv(level)
     state = env.reset()
-    across, along = AGENT
+    across, along = AGENT_PLACE
     # Looking right, the goal is two cells to the left of the agent, in line with it.
-    assert (state["view"] == GOAL).nonzero().tolist() == [[across - 2, along]]
+    assert (state["view"] == GOAL_OBJECT).nonzero().tolist() == [[across - 2, along]]
     state = env.step(state.set("action", torch.tensor(0)))["next"]
     # After a turn to the left it is straight ahead.
-    assert (state["view"] == GOAL).nonzero().tolist() == [[across, along - 2]]
+    assert (state["view"] == GOAL_OBJECT).nonzero().tolist() == [[across, along - 2]]
 
 
 def test_a_goal_at_the_limit_is_reached_and_not_cut_off() -> None:

@@ -12,12 +12,10 @@ from torch import Tensor
 from proposer_rl.learning import RolloutPolicy
 from proposer_rl.models import ActorCritic, categorical
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.view_mazes.distance import optimal_return
-from proposer_rl.tasks.view_mazes.env import FORWARD, ViewMazeEnv
-from proposer_rl.tasks.view_mazes.evaluation import visits
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
-from proposer_rl.tasks.view_mazes.settings import EvaluationSettings, ViewMazeSettings
 from proposer_rl.tasks.view_mazes.task import ViewMazeTask
+from proposer_rl.tasks.view_mazes.view_env import FORWARD, ViewMazeEnv, optimal_view_return, visits
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_settings import ViewEvaluationSettings, ViewMazeSettings
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.tiny import tiny_view_task
 
@@ -30,7 +28,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def task(episodes: int) -> ViewMazeTask:
     """A task that plays so many episodes on each named level."""
-    evaluation = EvaluationSettings(distributions=["id"], levels=4, named_episodes=episodes)
+    evaluation = ViewEvaluationSettings(distributions=["id"], levels=4, named_episodes=episodes)
     return tiny_view_task(evaluation=evaluation)
 
 
@@ -70,7 +68,7 @@ def performance(
     """Of levels [E], or [K, E], of any size."""
     task = tiny_view_task(
         maze=ViewMazeSettings(height=5, width=5, max_steps=limit),
-        evaluation=EvaluationSettings(distributions=["id"], levels=4, episodes=episodes),
+        evaluation=ViewEvaluationSettings(distributions=["id"], levels=4, episodes=episodes),
     )
     return task.performance(agent, levels, draws)
 
@@ -116,7 +114,7 @@ def test_memory_reaches_the_next_step() -> None:
     levels = ViewLevel.from_text(["G..<", "G..>"])
     found = performance(counting, levels, 10, 2, generator())
     assert found["success"].tolist() == [[0.0, 1.0]]
-    torch.testing.assert_close(found["return"][0, 1], optimal_return(levels, 10)[1])
+    torch.testing.assert_close(found["return"][0, 1], optimal_view_return(levels, 10)[1])
 
 
 def test_visits_are_the_cells_of_the_best_actions() -> None:

@@ -13,8 +13,7 @@ from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 
 from proposer_rl.tasks.mazes.level_files import shipped_levels
 from proposer_rl.tasks.mazes.rendering import level_records
-from proposer_rl.tasks.view_mazes.level_files import read_view_levels
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel, read_view_levels
 from research.benchmarks.minigrid_env import MiniGridMaze
 from tests.tasks.view_mazes.oracles import random_levels
 

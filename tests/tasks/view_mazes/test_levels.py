@@ -12,23 +12,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.levels import validate_levels
-from proposer_rl.tasks.view_mazes.distance import fewest_actions, optimal_return
-from proposer_rl.tasks.view_mazes.distributions import ViewDistribution, ViewSpace
-from proposer_rl.tasks.view_mazes.generation import (
+from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.view_mazes.view_distributions import (
+    ViewDistribution,
+    ViewSpace,
     four_rooms,
     perfect_mazes,
     scattered_walls,
     solvable,
 )
-from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
-from proposer_rl.tasks.view_mazes.settings import (
-    DistributionSettings,
+from proposer_rl.tasks.view_mazes.view_env import fewest_actions, optimal_view_return
+from proposer_rl.tasks.view_mazes.view_levels import AHEAD, ViewLevel
+from proposer_rl.tasks.view_mazes.view_settings import (
     PerfectSettings,
     RoomsSettings,
     ScatteredSettings,
-    SpaceSettings,
+    ViewDistributionSettings,
+    ViewSpaceSettings,
 )
 from tests.tasks.view_mazes.oracles import random_levels
 
@@ -122,8 +123,8 @@ def test_shortest_ways_are_found_without_waiting_at_each_step() -> None:
 
 def test_the_optimum_is_a_shortest_way_within_the_limit() -> None:
     levels = ViewLevel.from_text([">.G", "<.G", ">#G"])
-    torch.testing.assert_close(optimal_return(levels, 10), torch.tensor([0.82, 0.64, 0.0]))
-    torch.testing.assert_close(optimal_return(levels, 3), torch.tensor([0.4, 0.0, 0.0]))
+    torch.testing.assert_close(optimal_view_return(levels, 10), torch.tensor([0.82, 0.64, 0.0]))
+    torch.testing.assert_close(optimal_view_return(levels, 3), torch.tensor([0.4, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("draw", [perfect_mazes, four_rooms])
@@ -171,7 +172,7 @@ def ends(levels: ViewLevel) -> list[torch.Tensor]:
     "settings",
     [ScatteredSettings(fewest=2, most=9, solvable=True), PerfectSettings(), RoomsSettings()],
 )
-def test_distributions(settings: DistributionSettings) -> None:
+def test_distributions(settings: ViewDistributionSettings) -> None:
     levels = ViewDistribution(settings, 5, 5, CPU).sample(200, generator())
     assert levels.batch_size == (200,) and (shortest_path_length(levels) > 0).all()
     if isinstance(settings, ScatteredSettings):
@@ -180,7 +181,7 @@ def test_distributions(settings: DistributionSettings) -> None:
 
 
 def test_a_bin_has_its_walls_and_its_path() -> None:
-    space = ViewSpace(SpaceSettings(walls=[0, 5], path_lengths=[1, 3, 6]), 5, 5, CPU)
+    space = ViewSpace(ViewSpaceSettings(walls=[0, 5], path_lengths=[1, 3, 6]), 5, 5, CPU)
     assert space.axes == {"walls": (0, 5), "path length": (1, 3, 6)} and space.size == 6
     choices = torch.arange(6).repeat(2, 3)
     levels = space.generate(choices, [generator(), generator(1)])
@@ -191,7 +192,7 @@ def test_a_bin_has_its_walls_and_its_path() -> None:
 
 
 def test_without_lengths_a_goal_may_be_out_of_reach() -> None:
-    space = ViewSpace(SpaceSettings(walls=[0, 12]), 5, 5, CPU)
+    space = ViewSpace(ViewSpaceSettings(walls=[0, 12]), 5, 5, CPU)
     levels = space.sample(300, generator())
     walls = levels.walls.flatten(1).sum(1)
     assert set(walls.tolist()) == {0, 12}
@@ -211,10 +212,10 @@ def test_without_lengths_a_goal_may_be_out_of_reach() -> None:
             lambda: solvable(lambda n: ViewLevel.from_text([">#G"] * n), 2),
             "could not be reached",
         ),
-        (lambda: ViewSpace(SpaceSettings(walls=[3, 3]), 5, 5, CPU), "walls must be distinct"),
-        (lambda: ViewSpace(SpaceSettings(walls=[24]), 5, 5, CPU), "at most 23 walls"),
+        (lambda: ViewSpace(ViewSpaceSettings(walls=[3, 3]), 5, 5, CPU), "walls must be distinct"),
+        (lambda: ViewSpace(ViewSpaceSettings(walls=[24]), 5, 5, CPU), "at most 23 walls"),
         (
-            lambda: ViewSpace(SpaceSettings(walls=[0], path_lengths=[9]), 5, 5, CPU),
+            lambda: ViewSpace(ViewSpaceSettings(walls=[0], path_lengths=[9]), 5, 5, CPU),
             "path_length=9",
         ),
     ],

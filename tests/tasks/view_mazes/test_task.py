@@ -12,10 +12,10 @@ from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.train import main as train
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.edits import edit_levels
+from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.levels import validate_levels
-from proposer_rl.tasks.view_mazes.env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from tests.commands import call
 from tests.tiny import composed, tiny_view_task
 

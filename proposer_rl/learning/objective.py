@@ -1,6 +1,7 @@
-"""PPO's loss of K replicas at once: TorchRL's, without what would mix them or wait for a device.
+"""What PPO maximises, for K replicas at once: advantages, the clipped loss, clipped gradients.
 
-And what is told of it, and the clipping of its gradients, for each replica by itself.
+All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
+step is of each replica by itself.
 """
 
 from __future__ import annotations
@@ -14,8 +15,68 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent
 from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives.value import GAE
+from torchrl.objectives.value.functional import reward2go
 
 from proposer_rl.models import ActorCritic
+
+LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from none
+
+
+def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
+    """Returns TorchRL's generalised advantage estimation, of values that stand in the rollout."""
+    # Its vectorised form splits the batch where episodes end, which it has to look up.
+    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator.set_keys(value=value_key)
+    return estimator
+
+
+class LeaveOneOutBaseline(TensorDictModuleBase):
+    """The return to come, minus what the other replicas had to come at the same step.
+
+    Where all K episodes start from one state, the others' mean return is an unbiased estimate of
+    that state's value, and a far better one than a critic that has seen a few episodes
+    (Kool et al. 2019, "Buy 4 REINFORCE samples, get a baseline for free!", eq. 8). It takes the
+    place of :class:`torchrl.objectives.value.GAE`: the returns are the critic's targets.
+
+    Args:
+        gamma: discount.
+
+    Raises:
+        ValueError: when called on fewer than two replicas.
+
+    Example:
+        Three replicas, one step each:
+
+        >>> reward = torch.tensor([1.0, 2.0, 6.0]).view(3, 1, 1)
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"next": {"reward": reward, "done": reward > 0}}, [3, 1])
+        >>> LeaveOneOutBaseline(gamma=1.0)(rollout)["advantage"].flatten()
+        tensor([-3.0000, -1.5000,  4.5000])
+    """
+
+    def __init__(self, gamma: float) -> None:
+        super().__init__()
+        self.in_keys = [("next", "reward"), ("next", "done")]
+        self.out_keys = ["advantage", "value_target"]
+        self.gamma = gamma
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
+        copies = tensordict.batch_size[0]
+        if copies < 2:
+            raise ValueError("a baseline from the other copies needs at least 2 copies, got 1")
+        reward = tensordict["next", "reward"]
+        # TorchRL's sum breaks off where a power of the discount is lost in rounding: here before
+        # the first term.
+        following = reward.clone()
+        if self.gamma >= LEAST_DISCOUNT:
+            following = reward2go(reward, tensordict["next", "done"], self.gamma)
+        others = (following.sum(0, keepdim=True) - following) / (copies - 1)
+        tensordict.set("advantage", following - others)
+        return tensordict.set("value_target", following)
+
 
 ACTED_VALUE = "acted_value"
 """Entry of the values that the critic had when it acted, which a clipped value loss compares to."""
@@ -25,7 +86,7 @@ MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
 
 def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """The loss of an agent's actor and critic, reading the entries that the agent writes.
+    """Returns the loss of an agent's actor and critic, which reads what the agent writes.
 
     Raises:
         ValueError: if it reduces what belongs to different replicas.
@@ -73,7 +134,7 @@ class CopiesClipLoss(ClipPPOLoss):
             self.clip_value = numbers["clip_value"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms and diagnostics of transitions [*B, T]."""
+        """Returns the terms and diagnostics of transitions [*B, T]."""
         self._each: dict[str, Tensor] = {}
         return super().forward(tensordict).update(self._each)
 
@@ -85,7 +146,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return log_weight, distribution, kl_approx, correction
 
     def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
-        """The critic's term; the old values are not those that the caller has just written."""
+        """Returns the critic's term; its old values are those with which the agent acted."""
         self._acted_value = tensordict.get(ACTED_VALUE, None)
         return super().loss_critic(tensordict)
 
@@ -105,14 +166,14 @@ class CopiesClipLoss(ClipPPOLoss):
 
 
 def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
-    """Means over each replica's own batch, [K], without replicas []; a scalar is everybody's."""
+    """Returns means over each replica's batch, [K] or []; a scalar stands for all replicas."""
     if copies is not None and not numbers.ndim:
         return numbers.expand(copies)
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
 def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
-    """Share of the targets' variance that the values explain: [K], without replicas []."""
+    """Returns the share of the targets' variance that the values explain, [K] or []."""
     value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
@@ -120,7 +181,7 @@ def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None
 
 
 def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int | None) -> Tensor:
-    """Scale gradients (in place) so that no replica's norm over its parameters exceeds a largest.
+    """Scales gradients (in place) so that no replica's norm exceeds ``max_norm``.
 
     Returns:
         The norms before clipping, [K], without replicas [].

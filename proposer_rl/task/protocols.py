@@ -1,9 +1,9 @@
-"""What a task is made of, and what curricula may ask of some tasks beside.
+"""What a task is made of, and what curricula may ask of some tasks beyond that.
 
 K are Solvers, P the levels of one update, E validation levels, N bins. What a task takes as a level
 is its own business: a tensordict or tensorclass of any content, whose batch shape alone matters.
-Curricula that need more of a task than all of them have ask for it by name, with the optional parts
-at the end; a task has one by having its members.
+Curricula that need more than every task has ask for it by name, with the optional parts at the end;
+a task has one by having its members.
 """
 
 from __future__ import annotations
@@ -16,8 +16,12 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Categorical, MultiCategorical, TensorSpec
 
-from proposer_rl.models import ActorCritic
+from proposer_rl.models import ActorCritic, categorical, joint_categorical, normal
+from proposer_rl.settings import ArgumentError
+
+MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
 
 Levels = Any
 """A tensordict or tensorclass of levels."""
@@ -52,7 +56,7 @@ class Distribution(Protocol):
     """Levels to draw from."""
 
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
-        """Draw levels [count] on the task's device; the generator is one of the CPU."""
+        """Draws levels [count] on the task's device; the generator is one of the CPU."""
 
 
 class Space(Distribution, Protocol):
@@ -60,21 +64,21 @@ class Space(Distribution, Protocol):
 
     @property
     def axes(self) -> Mapping[str, Sequence[float]]:
-        """The values along each axis, by the axis's name.
+        """Returns the values along each axis, by the axis's name.
 
         The bins are their product, the last axis running fastest.
         """
 
     @property
     def size(self) -> int:
-        """The number N of bins."""
+        """Returns the number N of bins."""
 
     @property
     def coordinates(self) -> Tensor:
-        """Of each bin, scaled to [-1, 1] along every axis: float32 [N, D] on the CPU."""
+        """Returns each bin's place, -1 to 1 along every axis: float32 [N, D] on the CPU."""
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, P] of bins, int64 [K, P], on the task's device; row k from generator k."""
+        """Draws levels [K, P] of bins, int64 [K, P], on the task's device; row k by generator k."""
 
 
 class LevelResult(NamedTuple):
@@ -102,7 +106,7 @@ class DifferentiableTask(Protocol):
     """A task whose performance has gradients: first-order gain without sampling."""
 
     def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """Return and success of K Solvers, each on its own levels [K, E]: a tensordict [K, E].
+        """Computes return and success of K Solvers on their own levels [K, E], with gradients.
 
         Where gradients are enabled, with gradients towards the agent's parameters.
         """
@@ -124,7 +128,7 @@ class OptimalTask(Protocol):
     """A task that knows what could be reached: regret without an antagonist."""
 
     def optimal_return(self, levels: Levels) -> Tensor:
-        """The largest expected return that any policy reaches on levels [*B]: float [*B]."""
+        """Returns the largest expected return that a policy reaches on levels [*B]: float [*B]."""
 
 
 class EpisodeLaw(NamedTuple):
@@ -154,7 +158,7 @@ class EnumerableTask(Protocol):
     """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
 
     def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
-        """The law of the episodes of K Solvers, each on its own levels [K, E]."""
+        """Returns the law of the episodes of K Solvers, each on its own levels [K, E]."""
 
 
 @runtime_checkable
@@ -162,4 +166,84 @@ class EditableTask(Protocol):
     """A task whose levels can be changed a little."""
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
-        """Levels [K, n] after ``count`` small random edits each; replica k's from generator k."""
+        """Returns levels [K, n] after ``count`` small random edits; row k by generator k."""
+
+
+def space_features(space: Any, levels: Levels) -> Tensor:
+    """Returns features of levels by where they lie in a space, among the bins or beside them.
+
+    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
+    unless there are more than :data:`MANY_BINS`.
+
+    Args:
+        space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
+            coordinates of levels [*B]: float [*B, D].
+        levels: [*B].
+
+    Returns:
+        float64 [*B, 1 + 2 D + N] on the CPU.
+
+    Raises:
+        ArgumentError: if the space cannot locate levels, or has no axes.
+    """
+    if not hasattr(space, "locate"):
+        raise ArgumentError(
+            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
+            "from which a model of outcomes tells them apart"
+        )
+    c = space.locate(levels).double().cpu()
+    if not c.shape[-1]:
+        raise ArgumentError(
+            "space: must have axes, by which a model of outcomes tells levels apart; levels that "
+            "are seeds alone have none"
+        )
+    parts = [torch.ones_like(c[..., :1]), c, c.square()]
+    if space.size <= MANY_BINS:
+        places = space.coordinates.double()
+        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
+        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
+    return torch.cat(parts, -1)
+
+
+def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
+    """Returns what makes a policy's distribution of its logits, by the actions' spec."""
+    if isinstance(acts, MultiCategorical):
+        return joint_categorical
+    return categorical if isinstance(acts, Categorical) else normal
+
+
+def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
+    """Expands levels [E], which all K Solvers share, to [K, E]; returns [K, E] as they are."""
+    return levels.expand(agent.copies, levels.batch_size[-1])
+
+
+def check_distributions(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
+    """Refuses names of distributions that there are not.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    for key, names in (("target", [target]), ("evaluation.distributions", measured)):
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
+
+
+def refuse_single_bin(space: Space) -> None:
+    """Refuses a space in which there is nothing to choose.
+
+    Raises:
+        ValueError: if it has one bin.
+    """
+    if space.size < 2:
+        raise ValueError(
+            "the space has a single bin, so there is nothing to choose among; give its axes bins"
+        )
+
+
+def named(key: str, make: Any, *arguments: Any) -> Any:
+    """Makes something of arguments, and names their key in what is wrong with them."""
+    try:
+        return make(*arguments)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from error

@@ -1,12 +1,17 @@
-"""The settings of the partially observable maze."""
+"""The settings of the partially observable maze, and the network that they make."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import torch
 from annotated_types import Ge, Le, Len
+from torch import Tensor, nn
 
+from proposer_rl.models import MemoryNetwork
 from proposer_rl.settings import BY_KIND, settings
+from proposer_rl.tasks.view_mazes.view_env import FORWARD, VIEW
+from proposer_rl.tasks.view_mazes.view_levels import AHEAD, GOAL_OBJECT, WALL_OBJECT
 
 Walls = Annotated[int, Ge(0)]
 
@@ -53,11 +58,11 @@ class RoomsSettings:
     kind: Literal["four_rooms"] = "four_rooms"
 
 
-DistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
+ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
 
 
 @settings
-class SpaceSettings:
+class ViewSpaceSettings:
     """The Proposer's bins.
 
     Attributes:
@@ -88,7 +93,7 @@ class ViewNetworkSettings:
 
 
 @settings
-class EvaluationSettings:
+class ViewEvaluationSettings:
     """How the Solver is measured, apart from its training; always by playing.
 
     Attributes:
@@ -104,3 +109,52 @@ class EvaluationSettings:
     seed: Annotated[int, Ge(0)] = 0
     episodes: Annotated[int, Ge(1)] = 1
     named_episodes: Annotated[int, Ge(1)] = 100
+
+
+VIEW_ENTRIES = ("view", "direction")
+VIEW_ACTIONS = FORWARD + 1
+SCALE = 10  # that the field divides MiniGrid's numbers by
+GREY_COLOUR, GREEN_COLOUR = 5, 1  # MiniGrid's colours of walls and goal
+
+
+class ViewEncoder(nn.Module):
+    """Features of views and directions.
+
+    The convolution sees MiniGrid's numbers of objects and of their colours, a tenth of them, as in
+    the field. The third number, a door's state, is zero everywhere and left out.
+
+    Args:
+        channels: of the convolution.
+        direction: features of the direction.
+
+    Attributes:
+        features: number of features.
+    """
+
+    def __init__(self, channels: int = 16, direction: int = 5) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(2, channels, 3)
+        self.direction = nn.Embedding(len(AHEAD), direction)
+        nn.init.orthogonal_(self.direction.weight, 2**0.5)
+        self.features = channels * (VIEW - 2) ** 2 + direction
+
+    def codes(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns codes int64 [N], equal where both views and directions are equal."""
+        digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
+        base = 4 ** torch.arange(VIEW**2, device=view.device)
+        return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
+
+    def forward(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
+        colour = (view == WALL_OBJECT) * GREY_COLOUR + (view == GOAL_OBJECT) * GREEN_COLOUR
+        image = torch.stack([view, colour], 1) / SCALE
+        seen = torch.relu(self.convolution(image)).flatten(1)
+        return torch.cat([seen, self.direction(direction)], 1)
+
+
+def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
+    """Returns the network of one Solver."""
+    encoder = ViewEncoder(settings.channels, settings.direction)
+    return MemoryNetwork(
+        encoder, encoder.features, VIEW_ACTIONS, memory=settings.memory, head=settings.head
+    )

@@ -1,4 +1,4 @@
-"""The partially observable maze in TorchRL: an agent that turns, moves and sees 5x5 cells."""
+"""The partially observable maze in TorchRL, the fewest actions there, and where Solvers walk."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
+from proposer_rl.learning import play_episodes
+from proposer_rl.models import ActorCritic
 from proposer_rl.settings import signed
-from proposer_rl.tasks.mazes.level_env import LevelEnv
-from proposer_rl.tasks.mazes.levels import cell_index
-from proposer_rl.tasks.view_mazes.levels import AHEAD, ViewLevel
+from proposer_rl.tasks.mazes.levels import cell_index, cell_plane
+from proposer_rl.tasks.mazes.maze_env import LevelEnv
+from proposer_rl.tasks.mazes.paths import STEPS_BETWEEN_CHECKS
+from proposer_rl.tasks.view_mazes.view_levels import (
+    AHEAD,
+    EMPTY_OBJECT,
+    GOAL_OBJECT,
+    WALL_OBJECT,
+    ViewLevel,
+)
 
 LEFT, RIGHT, FORWARD = range(3)
-EMPTY, WALL, GOAL = 1, 2, 8
-"""Objects by MiniGrid's numbers."""
 
 VIEW = 5  # cells on a side of what is seen
 RIM = VIEW - 1  # of walls around the grid, so that all that is seen is in memory
-AGENT = (VIEW // 2, VIEW - 1)  # where the agent is in its view
+AGENT_PLACE = (VIEW // 2, VIEW - 1)  # where the agent is in its view
 PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
 
 
@@ -45,7 +52,7 @@ class ViewMazeEnv(LevelEnv):
       elsewhere.
 
     Args:
-        levels: As of :class:`~proposer_rl.tasks.mazes.level_env.LevelEnv`.
+        levels: As of :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
         max_steps: Step limit of an episode.
 
     Raises:
@@ -65,7 +72,7 @@ class ViewMazeEnv(LevelEnv):
         batch = self.batch_size
         self._specify(
             actions=FORWARD + 1,
-            view=Bounded(EMPTY, GOAL, (*batch, VIEW, VIEW), dtype=torch.uint8),
+            view=Bounded(EMPTY_OBJECT, GOAL_OBJECT, (*batch, VIEW, VIEW), dtype=torch.uint8),
             direction=Categorical(len(AHEAD), shape=batch),
             is_init=Binary(1, (*batch, 1), dtype=torch.bool),
         )
@@ -79,9 +86,9 @@ class ViewMazeEnv(LevelEnv):
         rows, width = (side + 2 * RIM for side in self._grid)
         self._width = width
         walls = pad(levels.walls, (RIM,) * 4, value=True).reshape(count, rows * width)
-        objects = torch.where(walls, WALL, EMPTY).to(torch.uint8)
+        objects = torch.where(walls, WALL_OBJECT, EMPTY_OBJECT).to(torch.uint8)
         goal = cell_index(levels.goal + RIM, width).reshape(count, 1)
-        self._objects = objects.scatter_(1, goal, GOAL).flatten()
+        self._objects = objects.scatter_(1, goal, GOAL_OBJECT).flatten()
         rim = RIM * (width + 1)  # before the first cell of a grid
         each = torch.arange(count, device=device).view(self.batch_size)
         self._origin = each * (rows * width) + rim
@@ -101,10 +108,10 @@ class ViewMazeEnv(LevelEnv):
         does = torch.add(tensordict.get("action"), tensordict.get("direction"), alpha=turn)
         place = self._place(agent)
         there = self._objects.take(place + self._ahead.take(does))
-        does = does.add_(there == WALL, alpha=len(self._ahead))
+        does = does.add_(there == WALL_OBJECT, alpha=len(self._ahead))
         does = self._meaning.index_select(0, does.flatten()).view(*does.shape, 4)
         direction, place = does[..., 0], place + does[..., 1]
-        terminated = (there == GOAL).unsqueeze(-1)
+        terminated = (there == GOAL_OBJECT).unsqueeze(-1)
         self._agent = agent + does[..., 2:]
         ends = self._after(terminated, tensordict)
         reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
@@ -128,13 +135,13 @@ class ViewMazeEnv(LevelEnv):
         cells = self._seen.index_select(0, direction.flatten())  # [N, 25]
         cells.add_(place.reshape(-1, 1).int())
         view = self._objects.index_select(0, cells.flatten()).view(*place.shape, VIEW, VIEW)
-        view[..., AGENT[0], AGENT[1]].fill_(EMPTY)
+        view[..., AGENT_PLACE[0], AGENT_PLACE[1]].fill_(EMPTY_OBJECT)
         return view
 
 
 @cache
 def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """What actions and directions mean in a line of grids of some width.
+    """Tabulates what actions and directions mean in a line of grids of some width.
 
     Made once: from numbers of the host, which a recorded reset must not ask for.
 
@@ -150,7 +157,7 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
     moves = torch.stack([none, none, ahead], 1).flatten(0, 1)
     right = ahead.roll(-1, 0)
     across, along = torch.meshgrid(
-        torch.arange(VIEW) - AGENT[0], AGENT[1] - torch.arange(VIEW), indexing="ij"
+        torch.arange(VIEW) - AGENT_PLACE[0], AGENT_PLACE[1] - torch.arange(VIEW), indexing="ij"
     )
     seen = right[:, None, None] * across[..., None] + ahead[:, None, None] * along[..., None]
     free = torch.cat([turned.view(-1, 1), cell_index(moves, width).unsqueeze(1), moves], 1)
@@ -159,3 +166,108 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
     # int32: half the memory to go through.
     seen = cell_index(seen, width).flatten(1).int()
     return meaning.to(device), changes.to(device), seen.to(device)
+
+
+def fewest_actions(levels: ViewLevel) -> Tensor:
+    """Returns how many actions, turns and moves, a shortest way to the goal has.
+
+    A frontier spreads over all pairs of a cell and a direction at once.
+
+    Args:
+        levels: Levels ``[*B]``.
+
+    Returns:
+        int64 ``[*B]``, -1 where the goal cannot be reached.
+
+    Example:
+        Three times a turn and a move:
+
+        >>> fewest_actions(ViewLevel.from_text('''
+        ... ^.#
+        ... #.G
+        ... '''))
+        tensor(6)
+    """
+    flat = levels.reshape(-1)
+    count, each = len(flat), torch.arange(len(flat), device=flat.walls.device)
+    free = pad(~flat.walls, (1, 1, 1, 1))  # [N, H + 2, W + 2]
+    frontier = torch.zeros(len(AHEAD), *free.shape, dtype=torch.bool, device=free.device)
+    frontier[flat.direction, each, flat.start[:, 0] + 1, flat.start[:, 1] + 1] = True
+    goal = (each, flat.goal[:, 0] + 1, flat.goal[:, 1] + 1)
+    reached, actions = frontier.clone(), torch.full((count,), -1, device=free.device)
+    for number in range(1, reached[:, :1].numel() + 1):
+        moved = [place.roll(ahead, (1, 2)) for place, ahead in zip(frontier, AHEAD, strict=True)]
+        frontier = (torch.stack(moved) & free) | frontier.roll(1, 0) | frontier.roll(-1, 0)
+        frontier &= ~reached
+        reached |= frontier
+        arrived = frontier.any(0)[goal] & (actions < 0)
+        actions = actions.masked_fill(arrived, number)
+        if number % STEPS_BETWEEN_CHECKS == 0 and not bool(
+            (frontier.flatten(2).any(2).any(0) & (actions < 0)).any()
+        ):
+            break
+    return actions.reshape(levels.batch_size)
+
+
+def optimal_view_return(levels: ViewLevel, max_steps: int = 250) -> Tensor:
+    """Returns the largest expected return of any policy, that of a shortest way within the limit.
+
+    Args:
+        levels: Levels ``[*B]``; the goal need not be reachable.
+        max_steps: Step limit of an episode.
+
+    Returns:
+        float32 ``[*B]``.
+    """
+    actions = fewest_actions(levels)
+    reached = (actions >= 0) & (actions <= max_steps)
+    return (1 - PENALTY / max_steps * actions).where(reached, 0.0)
+
+
+@torch.no_grad()
+def walks(
+    agent: ActorCritic, levels: ViewLevel, max_steps: int, noise: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Plays one episode of K Solvers on each level, and returns where they go.
+
+    Args:
+        agent: K Solvers.
+        levels: Levels ``[N]``.
+        max_steps: Step limit T of an episode.
+        noise: Of the actions, float ``[T, N]``, 0 to 1; None for the most probable ones.
+
+    Returns:
+        Row, column and direction before every step and at the end, int64 ``[K, N, T + 1, 3]``, and
+        the number of steps, int64 ``[K, N]``; what comes after them has no meaning.
+    """
+    every = levels.expand(agent.copies, *levels.batch_size)
+    first = torch.cat([every.start, every.direction.unsqueeze(-1)], -1)  # [K, N, 3]
+    went = first.unsqueeze(2).repeat(1, 1, max_steps + 1, 1)
+    steps = torch.zeros(every.batch_size, dtype=torch.int64, device=first.device)
+
+    def env(place: Tensor) -> ViewMazeEnv:
+        return ViewMazeEnv(every[:, place], max_steps=max_steps)
+
+    if not len(levels):  # of which there is no environment
+        return went, steps
+    begin = env(torch.arange(len(levels), device=first.device))
+    for step, (place, state, counts) in enumerate(
+        play_episodes(agent, begin, max_steps, noise, env), 1
+    ):
+        went[:, place, step] = torch.cat([state["agent"], state["direction"].unsqueeze(-1)], -1)
+        steps[:, place] += counts
+    return went, steps
+
+
+def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
+    """Returns which cells of levels [C] K Solvers visit by their most probable actions.
+
+    Returns:
+        Share of the steps of one episode after which an agent is in each cell, float32
+        ``[K, C, H, W]``.
+    """
+    went, steps = walks(agent, levels, max_steps)
+    seen = torch.zeros(*went.shape[:2], *levels.walls.shape[-2:], device=went.device)
+    for step, cells in enumerate(went[..., 1:, :2].unbind(2)):
+        seen += cell_plane(cells, seen.shape[-2:]) * (step < steps)[..., None, None]
+    return seen / steps[..., None, None].clamp(min=1)

@@ -1,4 +1,4 @@
-"""What environments on levels have in common: levels that are replaced, and resets to them."""
+"""The maze as a TorchRL environment, and the base of environments that play levels."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.envs import EnvBase
 
 from proposer_rl.models import population
-from proposer_rl.tasks.mazes.levels import Level
+from proposer_rl.settings import signed
+from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
+from proposer_rl.tasks.mazes.paths import MOVES, successors
+from proposer_rl.tasks.mazes.rendering import draw_level
 
-ENDS = ("done", "terminated", "truncated")
+END_KEYS = ("done", "terminated", "truncated")
 
 
 class LevelEnv(EnvBase):
@@ -60,11 +63,11 @@ class LevelEnv(EnvBase):
 
     @abstractmethod
     def _first(self) -> dict[str, Tensor]:
-        """What is observed when an episode begins, ``"agent"`` included; nobody writes into it."""
+        """Returns what is observed when an episode begins, ``"agent"`` too; do not write to it."""
 
     @property
     def levels(self) -> Level:
-        """The levels that are being played, ``[*B]``."""
+        """Returns the levels that are being played, ``[*B]``."""
         return self._levels
 
     def set_levels(self, levels: Level) -> None:
@@ -89,7 +92,7 @@ class LevelEnv(EnvBase):
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's, without its checks of what this environment has written itself."""
+        """Steps as TorchRL does, without checks of what this environment has written itself."""
         after, given = self._step(tensordict), tensordict.get("next", None)
         if given is not None:  # by the policy, such as what it remembers
             after.update(given.exclude(*after.keys()))
@@ -113,12 +116,12 @@ class LevelEnv(EnvBase):
             if key in after and key not in self._constant:
                 after[key] = self._begun(first, after[key], done, ended)
         after["step_count"] = after["step_count"] * ~done
-        after |= {key: torch.zeros_like(done) for key in ENDS}
+        after |= {key: torch.zeros_like(done) for key in END_KEYS}
         self._agent = after["agent"]
         return TensorDict(after, tensordict.batch_size, device=tensordict.device)
 
     def _begun(self, first: Tensor, standing: Tensor, done: Tensor, ended: Tensor | None) -> Tensor:
-        """What stands in mazes, as at first where they are done."""
+        """Returns an entry's values, those of the beginning where mazes are done."""
         each = first.shape[self.batch_dims :]
         if ended is None:
             return first.where(done.reshape(*self.batch_size, *[1] * len(each)), standing)
@@ -134,7 +137,7 @@ class LevelEnv(EnvBase):
         return self
 
     def _specify(self, actions: int, **observed: TensorSpec) -> None:
-        """Make the specifications: of one of so many actions, and of what else is observed."""
+        """Makes the specifications of ``actions`` choices and of further observations."""
         batch, (height, width) = self.batch_size, self._grid
         last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
         self.observation_spec = Composite(
@@ -146,7 +149,7 @@ class LevelEnv(EnvBase):
         self.action_spec = Categorical(actions, shape=batch, device=self.device)
         self.reward_spec = Unbounded((*batch, 1), device=self.device)
         flag = Binary(1, (*batch, 1), dtype=torch.bool, device=self.device)
-        ends = {key: flag.clone() for key in ENDS}
+        ends = {key: flag.clone() for key in END_KEYS}
         self.done_spec = Composite(ends, shape=batch, device=self.device)
 
     def _play(self, levels: Level) -> None:
@@ -166,14 +169,14 @@ class LevelEnv(EnvBase):
         start = self._levels.start
         self._agent = start if mask is None else start.where(mask.unsqueeze(-1), self._agent)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
-        ends = {key: none.clone() for key in ENDS}
+        ends = {key: none.clone() for key in END_KEYS}
         first = {k: x if k in self._constant else x.clone() for k, x in self._first().items()}
         # Of these TorchRL takes over only the entries of the mazes that are reset.
         state = {**first, "step_count": none.long(), **ends}
         return TensorDict(state, self.batch_size, device=self.device)
 
     def _after(self, terminated: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Count of the steps, and whether the episode has ended, after a step.
+        """Returns the count of steps, and whether the episode has ended, after a step.
 
         A step that reaches the goal at the limit is terminated and not truncated, since nothing was
         cut off.
@@ -193,3 +196,106 @@ class LevelEnv(EnvBase):
 
 def _describe(batch: torch.Size, grid: torch.Size, device: torch.device) -> str:
     return f"{list(batch)}, {grid[0]}x{grid[1]}, {device}"
+
+
+@signed
+class MazeEnv(LevelEnv):
+    """A batch of mazes, one agent in each.
+
+    - Action: int64 ``[*B]``, 0 up, 1 down, 2 left, 3 right. A move into an obstacle or out of the
+      grid leaves the agent where it is.
+    - Observation: ``"planes"``, float32 ``[*B, 3, H, W]``: obstacles, start, goal (with
+      ``observe_agent`` a fourth plane, the agent); ``"agent"``, int64 ``[*B, 2]``: row and column
+      of the agent; ``"step_count"``, int64 ``[*B, 1]``: steps taken in this episode.
+    - Reward: float32 ``[*B, 1]``, 1 on entering the goal, minus ``step_penalty`` at every step, the
+      last one included.
+    - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
+      elsewhere. A step that reaches the goal at the limit is terminated and not truncated, since
+      nothing was cut off. ``done`` is either.
+
+    Args:
+        levels: As of :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
+        max_steps: Step limit of an episode.
+        step_penalty: Cost of a step.
+        observe_agent: Whether the planes show the agent.
+
+    Raises:
+        ValueError: If ``max_steps`` is less than 1.
+
+    Example:
+        >>> from proposer_rl import Level
+        >>> env = MazeEnv(Level.from_text("S.G"))
+        >>> state = env.reset()
+        >>> for _ in range(2):
+        ...     state = env.step(state.set("action", torch.tensor(3)))["next"]
+        >>> state["reward"], state["terminated"]
+        (tensor([0.9900]), tensor([True]))
+    """
+
+    def __init__(
+        self,
+        levels: Level,
+        *,
+        max_steps: int = 25,
+        step_penalty: float = 0.01,
+        observe_agent: bool = False,
+    ) -> None:
+        self.step_penalty = step_penalty
+        self.observe_agent = observe_agent
+        self._constant = () if observe_agent else ("planes",)
+        super().__init__(levels, max_steps)
+        shape = (*self.batch_size, 3 + observe_agent, *self._grid)
+        self._specify(actions=len(MOVES), planes=Bounded(0.0, 1.0, shape))
+
+    def render(self, mode: str = "rgb_array", cell: int = 16) -> Any:
+        """Draws the mazes as they are now.
+
+        Args:
+            mode: ``"rgb_array"`` or ``"ansi"``.
+            cell: Side of a cell in pixels.
+
+        Returns:
+            uint8 ``[*B, H', W', 3]``; or text (a list of texts for a batch) in which ``A`` is the
+            agent.
+
+        Raises:
+            ValueError: If the mode is another.
+        """
+        if mode not in ("rgb_array", "ansi"):
+            raise ValueError(f"mode must be 'rgb_array' or 'ansi', got {mode!r}")
+        levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
+        if mode == "ansi":
+            places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character
+            texts = zip(levels.to_text(), places, strict=True)
+            marked = [f"{text[:place]}A{text[place + 1 :]}" for text, place in texts]
+            return marked if self.batch_dims else marked[0]
+        pictures = [
+            draw_level(level, agent=agent.tolist(), cell=cell)
+            for level, agent in zip(levels, agents, strict=True)
+        ]
+        return torch.stack(pictures).reshape(*self.batch_size, *pictures[0].shape)
+
+    def _tabulate(self, levels: Level) -> None:
+        self._planes = planes(levels)
+        self._successors = successors(levels).flatten(-2)  # [*B, 4 * H*W]
+        self._goal = cell_index(levels.goal, self._grid[1]).unsqueeze(-1)  # [*B, 1]
+
+    def _first(self) -> dict[str, Tensor]:
+        return self._observe(self._levels.start)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        (height, width), action = self._grid, tensordict.get("action")
+        cell = cell_index(tensordict.get("agent"), width)
+        move = (action * (height * width) + cell).unsqueeze(-1)
+        cell = self._successors.gather(-1, move)  # [*B, 1]
+        terminated = cell == self._goal
+        self._agent = cell_position(cell.squeeze(-1), width)
+        reward = terminated.float() - self.step_penalty
+        after = {**self._observe(self._agent), **self._after(terminated, tensordict)}
+        return TensorDict({**after, "reward": reward}, self.batch_size, device=self.device)
+
+    def _observe(self, agent: Tensor) -> dict[str, Tensor]:
+        drawn = self._planes
+        if self.observe_agent:
+            drawn = torch.cat([drawn, cell_plane(agent, self._grid).unsqueeze(-3)], dim=-3)
+        return {"planes": drawn, "agent": agent}

@@ -1,4 +1,4 @@
-"""The user's files of levels with directions: drawings, jaxued's module, MiniGrid's encodings."""
+"""Levels in which an agent looks in a direction, and the files that users have of them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.tasks.mazes.level_files import (
-    LARGEST_FILE,
+    LARGEST_FILE_BYTES,
     RECORD,
     check_count,
     check_size,
@@ -23,16 +25,69 @@ from proposer_rl.tasks.mazes.level_files import (
     named_levels,
     read_levels,
 )
-from proposer_rl.tasks.mazes.levels import FREE, WALL, drawn_rows
-from proposer_rl.tasks.mazes.levels import GOAL as GOAL_MARK
-from proposer_rl.tasks.view_mazes.env import EMPTY, GOAL
-from proposer_rl.tasks.view_mazes.env import WALL as WALL_NUMBER
-from proposer_rl.tasks.view_mazes.levels import AGENTS, ViewLevel
+from proposer_rl.tasks.mazes.levels import FREE, GOAL, START, WALL, Level, drawn_rows
 
-SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
+AGENTS = (">", "v", "<", "^")
+"""The agent in a drawing, by its direction: 0 right, 1 down, 2 left, 3 up."""
+
+AHEAD = ((0, 1), (1, 0), (0, -1), (-1, 0))
+"""Change of row and column on moving forward, by direction."""
+
+VIEW_SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
 LARGEST_MODULE = 10**6  # bytes
-FLOOR, AGENT = 3, 10  # MiniGrid's numbers of further objects
-MARKS = {EMPTY: FREE, FLOOR: FREE, WALL_NUMBER: WALL, GOAL: GOAL_MARK}
+EMPTY_OBJECT, WALL_OBJECT, FLOOR_OBJECT, GOAL_OBJECT, AGENT_OBJECT = 1, 2, 3, 8, 10
+"""Objects by MiniGrid's numbers."""
+
+OBJECT_MARKS = {EMPTY_OBJECT: FREE, FLOOR_OBJECT: FREE, WALL_OBJECT: WALL, GOAL_OBJECT: GOAL}
+
+
+class ViewLevel(Level):
+    """Mazes whose agent begins in a direction, of any batch shape ``[*B]``.
+
+    In a drawing the start is one of ``>``, ``v``, ``<`` and ``^``, the direction in which the agent
+    looks; with an ``S`` it looks to the right.
+
+    Attributes:
+        direction: int64 ``[*B]``, 0 right, 1 down, 2 left, 3 up.
+    """
+
+    direction: Tensor
+
+    @classmethod
+    def _parse(cls, drawing: str) -> ViewLevel:
+        marks = [mark for mark in drawing if mark in AGENTS]
+        for mark in AGENTS:
+            drawing = drawing.replace(mark, START)
+        direction = AGENTS.index(marks[0]) if marks else 0
+        return directed(Level.from_text(drawing), torch.tensor(direction))
+
+    def to_text(self) -> Any:
+        """Draws the levels with one character per cell; the inverse of :meth:`from_text`.
+
+        Example:
+            >>> level = ViewLevel.from_text('''
+            ... v.#
+            ... #.G
+            ... ''')
+            >>> level.direction
+            tensor(1)
+            >>> print(level.to_text())
+            v.#
+            #.G
+        """
+        text = super().to_text()
+        return text if self.batch_dims else text.replace(START, AGENTS[int(self.direction)])
+
+
+def directed(level: Level, direction: Tensor) -> ViewLevel:
+    """Returns levels [*B] with the directions in which their agents begin, int64 [*B]."""
+    return ViewLevel(
+        walls=level.walls,
+        start=level.start,
+        goal=level.goal,
+        direction=direction,
+        batch_size=level.batch_size,
+    )
 
 
 def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
@@ -56,8 +111,8 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
         StorageError: If it cannot be read.
     """
     path = Path(path)
-    check_suffix(path, SUFFIXES)
-    content = read_bounded(path, LARGEST_FILE)
+    check_suffix(path, VIEW_SUFFIXES)
+    content = read_bounded(path, LARGEST_FILE_BYTES)
     a_list = path.suffix == ".json" and content.lstrip().startswith(b"[")
     encoded = a_list or path.suffix == ".npy"
     if not encoded and path.suffix != ".py":
@@ -71,7 +126,7 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
 
 
 def _assigned(content: bytes) -> dict[str, list[str]]:
-    """Rows of the drawings that a module assigns to names."""
+    """Reads the drawings that a module assigns to names, as rows."""
     try:
         if len(content) > LARGEST_MODULE:
             raise ValueError(f"is larger than {LARGEST_MODULE:,} bytes, for a module")
@@ -92,11 +147,13 @@ def _assigned(content: bytes) -> dict[str, list[str]]:
 
 def _is_drawing(text: str) -> bool:
     marks = set("".join(text.split()))
-    return GOAL_MARK in marks and bool(marks & set(AGENTS)) and marks <= {*AGENTS, *MARKS.values()}
+    return (
+        GOAL in marks and bool(marks & set(AGENTS)) and marks <= {*AGENTS, *OBJECT_MARKS.values()}
+    )
 
 
 def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
-    """Rows of MiniGrid's encodings."""
+    """Reads MiniGrid's encodings, as rows of drawings."""
     try:
         if path.suffix == ".npy":
             array: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
@@ -120,22 +177,23 @@ def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
 
 
 def _drawn(grid: NDArray[Any], name: str) -> Iterator[str]:
-    """Rows of one grid [W, H, 3] of objects, colours and states."""
+    """Yields the rows of a drawing of one grid [W, H, 3] of objects, colours and states."""
     objects, states = grid[..., 0].T, grid[..., 2].T  # [H, W]
     border = [objects[0], objects[-1], objects[:, 0], objects[:, -1]]
-    if min(objects.shape) > 2 and all((side == WALL_NUMBER).all() for side in border):
+    if min(objects.shape) > 2 and all((side == WALL_OBJECT).all() for side in border):
         objects, states = objects[1:-1, 1:-1], states[1:-1, 1:-1]
-    if (objects == AGENT).sum() != 1:
+    if (objects == AGENT_OBJECT).sum() != 1:
         raise ValueError(
-            f"level {name!r}: must have one agent (object {AGENT}), as FullyObsWrapper shows it"
+            f"level {name!r}: must have one agent (object {AGENT_OBJECT}), as "
+            "FullyObsWrapper shows it"
         )
     for row, state in zip(objects.tolist(), states.tolist(), strict=True):
         marks = []
         for number, direction in zip(row, state, strict=True):
-            if number == AGENT and 0 <= direction < len(AGENTS):
+            if number == AGENT_OBJECT and 0 <= direction < len(AGENTS):
                 marks.append(AGENTS[direction])
-            elif number in MARKS:
-                marks.append(MARKS[number])
+            elif number in OBJECT_MARKS:
+                marks.append(OBJECT_MARKS[number])
             else:
                 raise ValueError(
                     f"level {name!r}: object {number} with state {direction} is none of this maze's"

@@ -1,0 +1,282 @@
+"""What levels are drawn from: named kinds of them, and the Proposer's bins.
+
+Drawn levels ``[N]`` are on the CPU, with height x width cells; so is the generator ``draw``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from proposer_rl.tasks.mazes.generation import generate_levels
+from proposer_rl.tasks.mazes.levels import cell_position
+from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.view_mazes.view_levels import AHEAD, ViewLevel, directed
+from proposer_rl.tasks.view_mazes.view_settings import (
+    PerfectSettings,
+    RoomsSettings,
+    ScatteredSettings,
+    ViewDistributionSettings,
+    ViewSpaceSettings,
+)
+
+ENDPOINTS = 2  # cells that are no walls: start and goal
+
+
+class ViewDistribution:
+    """Levels of one kind.
+
+    Args:
+        settings: the kind.
+        height, width: of the grid.
+        device: where the levels are returned.
+
+    Raises:
+        ValueError: if there are no such levels on this grid.
+    """
+
+    def __init__(
+        self, settings: ViewDistributionSettings, height: int, width: int, device: torch.device
+    ) -> None:
+        if isinstance(settings, ScatteredSettings):
+            if settings.fewest > settings.most:
+                raise ValueError(f"fewest={settings.fewest} must be at most most={settings.most}")
+            _check_walls(settings.most, height, width)
+        self._settings, self._grid, self._device = settings, (height, width), device
+        self.sample(1, torch.Generator().manual_seed(0))
+
+    def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
+        """Draws levels [count]; the generator is one of the CPU."""
+        return self._draw(count, generator).to(self._device)
+
+    def _draw(self, count: int, generator: torch.Generator) -> ViewLevel:
+        settings = self._settings
+        if isinstance(settings, PerfectSettings):
+            return perfect_mazes(count, *self._grid, generator)
+        if isinstance(settings, RoomsSettings):
+            return four_rooms(count, *self._grid, generator)
+
+        def scattered(number: int) -> ViewLevel:
+            ends = (settings.fewest, settings.most + 1)
+            walls = torch.randint(*ends, (number,), generator=generator)
+            return scattered_walls(walls, *self._grid, generator)
+
+        return solvable(scattered, count) if settings.solvable else scattered(count)
+
+    def __str__(self) -> str:
+        kind = self._settings
+        if not isinstance(kind, ScatteredSettings):
+            return kind.kind.replace("_", " ")
+        solvable = ", solvable" if kind.solvable else ""
+        return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
+
+
+class ViewSpace:
+    """Bins of levels: every number of walls, or each of these with every length of the path.
+
+    Without lengths start and goal are anywhere, and may have no path between them: levels drawn
+    uniformly from all bins are domain randomization as in PLR, ACCEL and SFL. With lengths every
+    level has a shortest path of exactly so many moves.
+
+    Args:
+        settings: numbers and lengths.
+        height, width: of the grid.
+        device: where the levels are returned.
+
+    Attributes:
+        axes: the values along each axis, by name.
+        size: number N of bins.
+        coordinates: of each bin, scaled to [-1, 1] along every axis, 0 where it has one value,
+            float32 [N, D].
+
+    Raises:
+        ValueError: if a value is repeated or there are no levels of a bin.
+    """
+
+    def __init__(
+        self, settings: ViewSpaceSettings, height: int, width: int, device: torch.device
+    ) -> None:
+        self.axes: dict[str, Sequence[float]] = {"walls": tuple(settings.walls)}
+        if settings.path_lengths is not None:
+            self.axes["path length"] = tuple(settings.path_lengths)
+        for name, values in self.axes.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} must be distinct, got {list(values)}")
+        _check_walls(max(settings.walls), height, width)
+        self._grid, self._device = (height, width), device
+        self._values = torch.tensor(list(product(*self.axes.values())))  # int64 [N, D]
+        self.size = len(self._values)
+        middle = (self._values.amax(0) + self._values.amin(0)) / 2
+        self._middle, self._reach = middle, (self._values.amax(0) - middle).clamp(min=0.5)
+        self.coordinates = self._scaled(self._values)
+        self.generate(torch.arange(self.size).unsqueeze(0), [torch.Generator().manual_seed(0)])
+
+    def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
+        """Draws levels [count] uniformly from the bins."""
+        choices = torch.randint(self.size, (1, count), generator=generator)
+        return self.generate(choices, [generator])[0]
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> ViewLevel:
+        """Draws levels [K, P] of bins, int64 [K, P]; row k by generator k."""
+        pairs = zip(choices.cpu(), generators, strict=True)
+        levels = [self._generate(self._values[index], draw) for index, draw in pairs]
+        return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
+
+    def locate(self, levels: ViewLevel) -> Tensor:
+        """Returns where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
+
+        A goal that cannot be reached counts as far away as there are cells.
+        """
+        counts = self._counts(levels)
+        return self._scaled(counts.where(counts >= 0, math.prod(self._grid)))
+
+    def shares(self, levels: ViewLevel) -> Tensor:
+        """Returns the share of levels [n] nearest to each bin, float32 [N], of solvable ones.
+
+        Without lengths all of the levels count.
+        """
+        counts = self._counts(levels)
+        distance = torch.cdist(self._scaled(counts), self.coordinates)
+        nearest = distance.argmin(1)[counts[:, -1] >= 0]
+        return nearest.bincount(minlength=self.size) / len(nearest)
+
+    def _counts(self, levels: ViewLevel) -> Tensor:
+        """Returns levels' walls, and path lengths (-1 for none) if an axis: int64 [*B, D]."""
+        counts = [levels.walls.flatten(-2).sum(-1)]
+        if "path length" in self.axes:
+            counts.append(shortest_path_length(levels))
+        return torch.stack(counts, -1).cpu()
+
+    def _scaled(self, values: Tensor) -> Tensor:
+        return (values - self._middle) / self._reach
+
+    def _generate(self, values: Tensor, draw: torch.Generator) -> ViewLevel:
+        walls = values[:, 0]
+        if values.shape[1] == 1:
+            return scattered_walls(walls, *self._grid, draw)
+        fraction = walls.double() / math.prod(self._grid)
+        levels = generate_levels(fraction, values[:, 1], *self._grid, generator=draw)
+        return directed(levels, torch.randint(len(AHEAD), (len(walls),), generator=draw))
+
+
+def _check_walls(most: int, height: int, width: int) -> None:
+    if most > height * width - ENDPOINTS:
+        raise ValueError(
+            f"{height}x{width} cells have at most {height * width - ENDPOINTS} walls beside "
+            f"start and goal, got {most}"
+        )
+
+
+MOST_DRAWS = 1000  # of a level whose goal is to be reachable
+
+
+def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws levels with exact numbers of walls; all cells and the direction are uniform.
+
+    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's. The
+    numbers are int64 ``[N]`` on the CPU, at most height * width - 2.
+    """
+    order = torch.rand(len(count), height * width, generator=draw).argsort(1)
+    # The first two cells of a random order are start and goal, the next ones walls.
+    wall = torch.arange(height * width) < count.unsqueeze(1) + 2
+    walls = torch.zeros_like(wall).scatter(1, order, wall)
+    walls.scatter_(1, order[:, :2], False)
+    return _level_of(walls.unflatten(1, (height, width)), order[:, :2], draw)
+
+
+def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws mazes with one path between any two free cells, by a random depth-first search.
+
+    The cells of even row and column are all free; the search opens the cells between them. Start,
+    goal and direction are uniform.
+
+    Raises:
+        ValueError: If a side is even.
+    """
+    if height % 2 == 0 or width % 2 == 0:
+        raise ValueError(f"perfect mazes have odd sides, got {height}x{width}")
+    rows, columns = height // 2 + 1, width // 2 + 1
+    levels = torch.arange(number)
+    step = torch.tensor(AHEAD)  # [4, 2]
+    new = torch.ones(number, rows + 2, columns + 2, dtype=torch.bool)  # with a rim that is not new
+    new[:, [0, -1]], new[:, :, [0, -1]] = False, False
+    free = torch.zeros(number, height, width, dtype=torch.bool)
+    first = [torch.randint(1, side + 1, (number,), generator=draw) for side in (rows, columns)]
+    here = torch.stack(first, 1)
+    trail = torch.empty(rows * columns, number, 2, dtype=torch.int64)  # from the first cell to here
+    depth = torch.zeros(number, dtype=torch.int64)
+    new[levels, here[:, 0], here[:, 1]] = False
+    free[:, ::2, ::2] = True
+    # Every cell is entered once and left once.
+    for _ in range(2 * rows * columns - 2):
+        beside = here.unsqueeze(1) + step  # [N, 4, 2]
+        open_ = new[levels.unsqueeze(1), beside[..., 0], beside[..., 1]]
+        chance = torch.rand(number, len(AHEAD), generator=draw)
+        moved = step[chance.where(open_, -1.0).argmax(1)]
+        on = open_.any(1)
+        trail[depth, levels] = here
+        depth = torch.where(on, depth + 1, (depth - 1).clamp(min=0))
+        there = torch.where(on.unsqueeze(1), here + moved, trail[depth, levels])
+        between = 2 * here - 2 + moved * on.unsqueeze(1)
+        free[levels, between[:, 0], between[:, 1]] = True
+        new[levels, there[:, 0], there[:, 1]] = False
+        here = there
+    return _placed(~free, draw)
+
+
+def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws four rooms around a cross of walls, each of whose arms has a random door.
+
+    Start, goal and direction are uniform.
+
+    Raises:
+        ValueError: If a side is less than 3.
+    """
+    if min(height, width) < 3:
+        raise ValueError(f"four rooms need at least 3x3 cells, got {height}x{width}")
+    middle = (height // 2, width // 2)
+    walls = torch.zeros(number, height, width, dtype=torch.bool)
+    walls[:, middle[0]], walls[:, :, middle[1]] = True, True
+    levels = torch.arange(number)
+    for arm, first, last in (
+        (walls[:, middle[0]], 0, middle[1]),
+        (walls[:, middle[0]], middle[1] + 1, width),
+        (walls[:, :, middle[1]], 0, middle[0]),
+        (walls[:, :, middle[1]], middle[0] + 1, height),
+    ):
+        arm[levels, torch.randint(first, last, (number,), generator=draw)] = False
+    return _placed(walls, draw)
+
+
+def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
+    """Draws levels until the goal of each can be reached."""
+    levels = draw_levels(number)
+    for _ in range(MOST_DRAWS):
+        bad = (shortest_path_length(levels) < 0).nonzero().squeeze(1)
+        if not len(bad):
+            return levels
+        levels[bad] = draw_levels(len(bad))
+    raise ValueError(f"in {MOST_DRAWS} draws of a level its goal could not be reached")
+
+
+def _placed(walls: Tensor, draw: torch.Generator) -> ViewLevel:
+    """Returns levels of walls [N, H, W] with different uniform free cells as start and goal."""
+    chance = torch.rand(walls.flatten(1).shape, generator=draw)
+    ends = chance.where(~walls.flatten(1), -1.0).topk(2, 1).indices
+    return _level_of(walls, ends, draw)
+
+
+def _level_of(walls: Tensor, ends: Tensor, draw: torch.Generator) -> ViewLevel:
+    """Returns levels of walls [N, H, W] and ends [N, 2], start and goal, in random directions."""
+    start, goal = cell_position(ends, walls.shape[-1]).unbind(1)
+    return ViewLevel(
+        walls=walls,
+        start=start,
+        goal=goal,
+        direction=torch.randint(len(AHEAD), (len(walls),), generator=draw),
+        batch_size=[len(walls)],
+    )
