@@ -10,7 +10,10 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
+
+from tensordict import TensorDict
 
 from proposer_rl.curricula import (
     Curriculum,
@@ -35,9 +38,8 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula.proposer import load_proposer
 from proposer_rl.curricula.scores import Source
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
@@ -49,6 +51,7 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings, worker_env
 from proposer_rl.models import ActorCritic
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
@@ -220,7 +223,7 @@ def proposer(
             :func:`frozen_proposer`. None to begin anew.
 
     Raises:
-        CheckpointError: if the checkpoint cannot be read.
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
         TypeError: if the reward is no function.
         ProposerError: for settings of the Proposer that do not go together.
         ValueError: for several seeds.
@@ -241,10 +244,7 @@ def proposer(
             f"observes={config.observes}: this task does not tell {', '.join(unknown)}; return and "
             "progress are available"
         )
-    with streams.as_default("weights"):
-        agent = proposer_agent(task, config)
-    if checkpoint:
-        load_proposer(agent, checkpoint, config.observes)
+    agent = _agent(components, config, checkpoint)
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
@@ -273,8 +273,8 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
 
     Raises:
-        ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
-        CheckpointError: if it cannot be read.
+        ArgumentError: if nothing is named, it holds no such Proposer, or cannot be read.
+        ValueError: for several seeds.
     """
     _one_solver(components)
     if not checkpoint:
@@ -283,10 +283,8 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
             "Proposer"
         )
     task, config = components.task, components.proposer
-    agent = proposer_agent(task, config)
-    load_proposer(agent, checkpoint, config.observes)
     return ProposerCurriculum(
-        agent,
+        _agent(components, config, checkpoint),
         solver_view(task, config),
         proposer_actions(task, config),
         meta_episode_length=config.meta_episode_length,
@@ -412,14 +410,50 @@ def _problem_policy(
     action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()
     if action.ratio == "joint":
         raise ProposerError("action.ratio=joint: here each draw is rewarded by itself")
-    with Streams(components.seeds[0], "proposer").as_default("weights"):
-        agent = proposer_agent(task, replace(config, observes=[], action=action))
-    if checkpoint:
-        load_proposer(agent, checkpoint, [])
+    agent = _agent(components, replace(config, observes=[], action=action), checkpoint)
     numbers = replace(
         config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
     return task.space, task.target, agent, PPOSettings(horizon=1, **asdict(numbers))
+
+
+def _agent(components: Components, config: ProposerSettings, checkpoint: str | None) -> ActorCritic:
+    """Makes a Proposer, with the weights of one that has learnt with the same network if any.
+
+    Args:
+        components: the task, and the seed of new weights.
+        config: the network, and what it observes.
+        checkpoint: of a run, its ``proposer.pt``, or its folder; None for new weights.
+
+    Raises:
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
+    """
+    with Streams(components.seeds[0], "proposer").as_default("weights"):
+        agent = proposer_agent(components.task, config)
+    if not checkpoint:
+        return agent
+    try:
+        learnt = _with_proposer(load_curriculum(Path(checkpoint)))
+        observed = [name for name in learnt["observed"] if name != "probes"]
+        load_agent(agent, TensorDict(learnt["proposer"]))
+    except CheckpointError as error:
+        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
+        ) from error
+    if observed != config.observes:
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
+            f"{config.observes}"
+        )
+    return agent
+
+
+def _with_proposer(state: State) -> State:
+    """Returns the state of the part that has a Proposer, where curricula hold others."""
+    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
+    return state if "proposer" in state else next(filter(None, inner), {})
 
 
 def _one_solver(components: Components) -> None:
