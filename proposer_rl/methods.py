@@ -43,13 +43,15 @@ from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
+    ProblemSettings,
+    ProposerSettings,
     meta_env,
     proposer_actions,
     proposer_agent,
     solver_view,
 )
-from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
-from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings, worker_env
+from proposer_rl.meta.replicas import ReplicasInWorkers, worker_env
+from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
@@ -248,12 +250,12 @@ def proposer(
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
-    copies = None
+    replicas = None
     if components.workers is not None:
         settings, make_task = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
-        copies = CopiesInWorkers(learner, make_env, settings)
-    return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
+        replicas = ReplicasInWorkers(learner, make_env, settings)
+    return ProposerTrainer(learner, replicas, config.advance).curriculum(config.own_action)
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:

@@ -11,7 +11,7 @@ import torch
 from annotated_types import Interval
 
 from proposer_rl.learning.settings import SolverSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, arguments, checked
 
 

@@ -10,8 +10,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.bins import BinCurriculum, Probes, along_axes, means_of_bins, tell_cost
-from proposer_rl.curricula.bins import Measure as Outcome
+from proposer_rl.curricula.bins import (
+    BinCurriculum,
+    Measure,
+    Probes,
+    along_axes,
+    means_of_bins,
+    tell_cost,
+)
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.student import Student
 from proposer_rl.curricula.transport import (
@@ -20,7 +26,7 @@ from proposer_rl.curricula.transport import (
     shares_of_bins,
     squared_distances,
 )
-from proposer_rl.meta.first_order import Measure, bin_scores, scaled
+from proposer_rl.meta.first_order import TargetMeasure, bin_scores, scaled
 from proposer_rl.settings import Count, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
@@ -78,7 +84,7 @@ class FirstOrderCurriculum(_AlignedBins):
         step: Positive = 1.0,
         temperature: Positive = 0.1,
         smoothing: Decay = 0.9,
-        measure: Measure = "log_success",
+        measure: TargetMeasure = "log_success",
     ) -> None:
         super().__init__(space, every, temperature, smoothing)
         tell_cost(space, candidates, "candidates")
@@ -154,7 +160,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         every: Count = 1,
         delta: float = 0.2,
         probes: Count = 4,
-        measure: Outcome = "success",
+        measure: Measure = "success",
         temperature: Positive = 0.1,
         smoothing: Decay = 0.9,
         exploration: Share = 0.2,

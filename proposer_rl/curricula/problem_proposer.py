@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
-from proposer_rl.curricula.bins import Measure as Outcome
-from proposer_rl.curricula.bins import along_axes, counts_of_bins
+from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
 from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
 from proposer_rl.curricula.proposer import learnt_proposer
@@ -22,7 +21,7 @@ from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import load_agent, located
 from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.settings import PPOSettings
-from proposer_rl.meta.first_order import Measure
+from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
@@ -203,7 +202,7 @@ class FirstOrderProposer(_RewardedAtOnce):
         probe_levels: int = 16,
         target_levels: Count = 256,
         step: Positive = 1.0,
-        measure: Measure = "log_success",
+        measure: TargetMeasure = "log_success",
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
         self._target_levels, self._step, self._measure = target_levels, step, measure
@@ -257,7 +256,7 @@ class SampledFirstOrderProposer(ProblemProposer):
         probe_levels: int = 16,
         delta: float = 0.2,
         probes: Count = 4,
-        measure: Outcome = "success",
+        measure: Measure = "success",
         smoothing: Decay = 0.9,
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)

@@ -14,9 +14,8 @@ from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedC
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
-from proposer_rl.meta.copies import Copies
-from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.view import SolverView
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
+from proposer_rl.meta.replicas import Replicas
 from proposer_rl.models import ActorCritic, draw
 from proposer_rl.streams import Streams
 
@@ -117,7 +116,7 @@ class ProposerCurriculum(LearnedCurriculum):
     def close(self) -> None:
         """Let go of the replicas that are elsewhere."""
         if self.trainer is not None:
-            self.trainer.copies.close()
+            self.trainer.replicas.close()
 
     def _act(self, student: Student, stream: Streams) -> Tensor:
         # A cycle may be longer than the episodes that it learnt in: then another one begins.
@@ -140,8 +139,7 @@ class ProposerTrainer:
     Args:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
             horizon is the number of steps of that environment's episodes.
-        copies: where the replicas are rolled out; None for the learner's own environment, in this
-            process.
+        replicas: trains the replicas; None for the learner's own environment, in this process.
         advance: ``"train"``: the student trains on new proposals; ``"best"`` or ``"random"``: it
             becomes the replica with the greatest total reward, or any, with its optimiser.
 
@@ -152,7 +150,7 @@ class ProposerTrainer:
     def __init__(
         self,
         learner: PPO,
-        copies: Copies | None = None,
+        replicas: Replicas | None = None,
         advance: Literal["train", "best", "random"] = "train",
     ) -> None:
         env = learner.env
@@ -165,7 +163,7 @@ class ProposerTrainer:
             )
         self.learner = learner
         self.env = env
-        self.copies = copies or Copies(learner)
+        self.replicas = replicas or Replicas(learner)
         self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
@@ -184,18 +182,18 @@ class ProposerTrainer:
     def train(self, student: Student, stream: Streams) -> Improvement:
         """Roll K replicas of the student out and train the Proposer on their rewards."""
         env = self.env
-        rollout = self.copies.roll_out(student.snapshot()[0], stream)
+        rollout = self.replicas.roll_out(student.snapshot()[0], stream)
         with located("the Proposer"):
             training = self.learner.optimise(rollout)
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
-        copies = len(rewards)
+        replicas = len(rewards)
         # A replica that the student becomes is the student's own training.
-        trained = copies - (self.advance != "train")
+        trained = replicas - (self.advance != "train")
         student.spend(
             frames=trained * env.frames_per_update * env.meta_episode_length,
             # Every replica after each of its actions, and all of them once at the start.
-            evaluations=copies * (env.steps + 1) * env.view.validation_levels,
+            evaluations=replicas * (env.steps + 1) * env.view.validation_levels,
         )
         metrics = self._metrics(rollout, rewards, training)
         return Improvement(metrics, self._advance(student, rewards, stream))
@@ -207,7 +205,7 @@ class ProposerTrainer:
         if self.advance == "random":
             generator = stream.generator("advance")
             best = int(torch.randint(len(rewards), (), generator=generator))
-        trained = self.copies.trained(best)
+        trained = self.replicas.trained(best)
         student.restore(trained.solver)
         return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 

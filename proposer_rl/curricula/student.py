@@ -22,6 +22,7 @@ from proposer_rl.learning.advantages import gae
 from proposer_rl.learning.rollout import RolloutCollector
 from proposer_rl.meta.first_order import (
     Direction,
+    LevelGradients,
     alignment,
     exact_alignment,
     exact_direction,
@@ -30,7 +31,6 @@ from proposer_rl.meta.first_order import (
     over_steps,
     surrogate,
 )
-from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.task import (
     DifferentiableTask,
     EnumerableTask,

@@ -15,7 +15,7 @@ from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import PPO
 from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.learning.snapshot import agent_weights, load_agent
-from proposer_rl.meta.gradient_norms import LevelGradients
+from proposer_rl.meta.first_order import LevelGradients
 from proposer_rl.models.normalization import LARGEST, RunningMoments
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
