@@ -215,14 +215,14 @@ def proposer(
     loss: MakeLoss | None = None,
     checkpoint: str | None = None,
 ) -> ProposerCurriculum:
-    """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
+    """Makes the paper's curriculum: a Proposer that is rewarded for each of the Solver's updates.
 
     Args:
         components: the task, and the Proposer's settings.
-        reward: of an update.
+        reward: from an update to a number for each replica of the Solver.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.PPO`.
         checkpoint: of a Proposer that has learnt, which goes on learning; see
-            :func:`frozen_proposer`. None to begin anew.
+            :func:`frozen_proposer`. None for a new one.
 
     Raises:
         ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
@@ -259,15 +259,15 @@ def proposer(
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:
-    """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
+    """Makes the paper's ablation: a Proposer that is rewarded for the Solver's failures.
 
-    The paper's ablation; no other reward can be put in its place.
+    No other reward can be put in the place of this one.
     """
     return proposer(components, rewards.task_difficulty, checkpoint=checkpoint)
 
 
 def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerCurriculum:
-    """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
+    """Makes a curriculum of a Proposer that has learnt in another run, and learns no more.
 
     Args:
         components: the task, and the settings of the Proposer's network and actions, which must be
@@ -333,15 +333,15 @@ def first_order_proposer(
     checkpoint: str | None = None,
     **numbers: Any,
 ) -> FirstOrderProposer:
-    """Train on the draws of a policy that is rewarded for each problem, to first order.
+    """Makes a Proposer that is rewarded for each problem with its first-order share of the gain.
 
     Args:
-        components: the task, and the Proposer's settings: of them the probes, the network, and of
-            PPO how far a step goes (``adam_eps``, ``clip_epsilon``, ``max_grad_norm``).
+        components: the task, and the Proposer's settings, of which probes, network, and PPO's
+            ``adam_eps``, ``clip_epsilon`` and ``max_grad_norm`` count.
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
         entropy_coeff: of the policy.
-        checkpoint: of such a policy that has learnt; None to begin anew.
+        checkpoint: of such a policy that has learnt; None for a new one.
         numbers: see :class:`FirstOrderProposer`.
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
@@ -357,7 +357,7 @@ def first_order_proposer_sampled(
     checkpoint: str | None = None,
     **numbers: Any,
 ) -> SampledFirstOrderProposer:
-    """The same from the Solver's own training episodes, without an oracle.
+    """Makes a Proposer that is rewarded by the Solver's own training episodes, without an oracle.
 
     The arguments are those of :func:`first_order_proposer`; ``numbers`` those of
     :class:`SampledFirstOrderProposer`.
@@ -379,7 +379,7 @@ def paired(
     entropy_coeff: NotNegative,
     checkpoint: str | None = None,
 ) -> PairedProposer:
-    """Train on the draws of a policy that is rewarded for the regret against a second Solver.
+    """Makes a Proposer that is rewarded for each problem with the regret against a second Solver.
 
     The arguments are those of :func:`first_order_proposer`.
 
@@ -406,7 +406,7 @@ def _problem_policy(
     entropy_coeff: float,
     checkpoint: str | None,
 ) -> tuple[Space, Distribution, ActorCritic, PPOSettings]:
-    """Space and target, a policy that draws each problem by itself, and how it learns."""
+    """Returns space, target, a policy that draws each problem by itself, and its PPO's numbers."""
     _one_solver(components)
     task, config = components.task, components.proposer
     action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()

@@ -21,22 +21,22 @@ from proposer_rl.streams import Streams
 
 
 class ProposerCurriculum(LearnedCurriculum):
-    """The student trains on the proposals of an agent, which learns from replicas of the student.
+    """Trains the student on the proposals of an agent that learns from replicas of the student.
 
     With a trainer, before each cycle K replicas of the student go through one episode of the
-    meta-environment, and the Proposer's PPO learns from them. Without one it is frozen. Then the
-    student itself trains on the Proposer's proposals.
+    meta-environment, and the Proposer's PPO learns from them. Without a trainer the Proposer is
+    frozen. Then the student itself trains on the Proposer's proposals.
 
     Args:
         agent: the Proposer.
-        view: what it sees of the student; new levels at every cycle.
-        actions: the levels that its actions stand for.
+        view: what it sees of the student; its levels are new at every cycle.
+        actions: from its actions to levels.
         meta_episode_length: updates L of the episodes in which it learns or has learnt, from which
             it knows how far a cycle has gone.
         action_repeat: batches for which an action holds.
         own_action: the action for the student itself: a ``"sample"`` of the policy, or its
             ``"mode"``, without exploration.
-        trainer: how it learns; None to leave it as it is.
+        trainer: trains the Proposer; None to leave it as it is.
     """
 
     remembers = ("_proposed", "_action")
@@ -59,7 +59,7 @@ class ProposerCurriculum(LearnedCurriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
-        # What it sees; and while it learns, what becomes of replicas.
+        # To see the student; and while the Proposer learns, to make replicas.
         self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
         if self.trains_replicas:
@@ -68,7 +68,7 @@ class ProposerCurriculum(LearnedCurriculum):
         self._action: Tensor | None = None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Draw the levels through which the student is seen, and let the trainer train."""
+        """Draws the levels through which the student is seen, and lets the trainer train."""
         (stream,) = streams
         self._proposed = 0
         if self.trainer is not None:
@@ -78,7 +78,7 @@ class ProposerCurriculum(LearnedCurriculum):
 
     @torch.no_grad()
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n] of the Proposer's policy, given what it sees of the student."""
+        """Draws levels [1, n] from the Proposer's policy, given what it sees of the student."""
         (stream,) = streams
         if self._action is None:  # the first batch can come within a cycle
             self._proposed = 0
@@ -89,11 +89,11 @@ class ProposerCurriculum(LearnedCurriculum):
         return Batch(levels, TensorDict({}, (1, count)))
 
     def learnt(self) -> dict[str, Any]:
-        """The Proposer, without its optimiser; nothing if it is frozen: others have it then."""
+        """Returns the Proposer without its optimiser; nothing if it is frozen and not new."""
         return {} if self.trainer is None else learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the cycle's levels come from, and the agent, too."""
+        """Returns also the address of the cycle's streams, and the agent."""
         agent = (
             agent_weights(self.agent) if self.trainer is None else self.trainer.learner.snapshot()
         )
@@ -104,7 +104,7 @@ class ProposerCurriculum(LearnedCurriculum):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on within a cycle."""
+        """Puts back what :meth:`state_dict` returned, also within a cycle."""
         super().load_state_dict(state)
         self.view.draw_levels(Streams(*state["streams"]))
         agent = TensorDict(state["proposer"], batch_size=[])
@@ -114,7 +114,7 @@ class ProposerCurriculum(LearnedCurriculum):
             self.trainer.learner.restore(agent)
 
     def close(self) -> None:
-        """Let go of the replicas that are elsewhere."""
+        """Ends the processes in which replicas are trained."""
         if self.trainer is not None:
             self.trainer.replicas.close()
 
@@ -134,14 +134,15 @@ class ProposerCurriculum(LearnedCurriculum):
 
 
 class ProposerTrainer:
-    """Trains a Proposer on what its proposals do to K replicas of the student.
+    """Trains a Proposer by what its proposals do to K replicas of the student.
 
     Args:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
             horizon is the number of steps of that environment's episodes.
         replicas: trains the replicas; None for the learner's own environment, in this process.
-        advance: ``"train"``: the student trains on new proposals; ``"best"`` or ``"random"``: it
-            becomes the replica with the greatest total reward, or any, with its optimiser.
+        advance: what becomes of the student then: with ``"train"`` it trains on new proposals,
+            with ``"best"`` or ``"random"`` it becomes the replica with the greatest total reward,
+            or any, with its optimiser.
 
     Raises:
         ValueError: for an environment of another kind, or a horizon other than the episode's.
@@ -167,7 +168,7 @@ class ProposerTrainer:
         self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
-        """The curriculum of this Proposer while it learns."""
+        """Returns the curriculum of this Proposer while it learns."""
         env = self.env
         return ProposerCurriculum(
             self.learner.agent,
@@ -180,7 +181,7 @@ class ProposerTrainer:
         )
 
     def train(self, student: Student, stream: Streams) -> Improvement:
-        """Roll K replicas of the student out and train the Proposer on their rewards."""
+        """Trains K replicas of the student for an episode, and the Proposer on their rewards."""
         env = self.env
         rollout = self.replicas.roll_out(student.snapshot()[0], stream)
         with located("the Proposer"):
@@ -228,5 +229,5 @@ class ProposerTrainer:
 
 
 def learnt_proposer(agent: ActorCritic) -> dict[str, Any]:
-    """A Proposer's weights and what it observes, as its curriculum's state has them."""
+    """Returns a Proposer's weights and what it observes, for its curriculum's state."""
     return {"proposer": agent_weights(agent).to_dict(), "observed": agent.in_keys}
