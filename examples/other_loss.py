@@ -24,7 +24,7 @@ from torchrl.objectives import A2CLoss, ReinforceLoss
 from proposer_rl import ComputeContext, PPOSettings, SolverSettings, Streams, performance_gain
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import LearningSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, proposer
 
 UPDATES = 20

@@ -1,7 +1,7 @@
 """Learners of your own in the meta-environment: softmax regression, without PPO and episodes.
 
 The meta-environment trains K learners side by side on what a policy proposes, and rewards it for
-what they have learnt. What it asks of learners is :class:`proposer_rl.meta.learner.Learner`, and of
+what they have learnt. What it asks of learners is :class:`proposer_rl.meta.env.Learner`, and of
 a task no more than is here. A level is an example to learn from, a bin its class.
 
     python examples/own_learner.py

@@ -20,7 +20,7 @@ from proposer_rl import (
     Streams,
 )
 from proposer_rl.learning import LearningSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.tasks.mazes.maze_settings import (
     DistributionSettings,

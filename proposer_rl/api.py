@@ -26,9 +26,8 @@ from proposer_rl.curricula import (
 from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, SolverSettings
 from proposer_rl.meta.actions import Mixture, ProblemChoices
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import log_success_gain, performance_gain, task_difficulty
-from proposer_rl.meta.view import SolverView
 from proposer_rl.models import (
     ActorCritic,
     MapEncoder,

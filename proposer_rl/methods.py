@@ -10,7 +10,10 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
+
+from tensordict import TensorDict
 
 from proposer_rl.curricula import (
     Curriculum,
@@ -35,19 +38,21 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula.proposer import load_proposer
 from proposer_rl.curricula.scores import Source
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings, load_agent
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
+    ProblemSettings,
+    ProposerSettings,
     meta_env,
     proposer_actions,
     proposer_agent,
     solver_view,
 )
-from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
-from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings, worker_env
+from proposer_rl.meta.replicas import ReplicasInWorkers, worker_env
+from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic
+from proposer_rl.runs.checkpoint import CheckpointError, State, load_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
@@ -209,17 +214,17 @@ def proposer(
     loss: MakeLoss | None = None,
     checkpoint: str | None = None,
 ) -> ProposerCurriculum:
-    """Train on the proposals of an agent that is rewarded for each of the Solver's updates.
+    """Makes the paper's curriculum: a Proposer that is rewarded for each of the Solver's updates.
 
     Args:
         components: the task, and the Proposer's settings.
-        reward: of an update.
+        reward: from an update to a number for each replica of the Solver.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.PPO`.
         checkpoint: of a Proposer that has learnt, which goes on learning; see
-            :func:`frozen_proposer`. None to begin anew.
+            :func:`frozen_proposer`. None for a new one.
 
     Raises:
-        CheckpointError: if the checkpoint cannot be read.
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
         TypeError: if the reward is no function.
         ProposerError: for settings of the Proposer that do not go together.
         ValueError: for several seeds.
@@ -240,31 +245,28 @@ def proposer(
             f"observes={config.observes}: this task does not tell {', '.join(unknown)}; return and "
             "progress are available"
         )
-    with streams.as_default("weights"):
-        agent = proposer_agent(task, config)
-    if checkpoint:
-        load_proposer(agent, checkpoint, config.observes)
+    agent = _agent(components, config, checkpoint)
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
     advantage = LeaveOneOutBaseline(numbers.gamma) if config.advantage == "leave_one_out" else None
     learner = PPO(env, agent, numbers, advantage=advantage, loss=loss)
-    copies = None
+    replicas = None
     if components.workers is not None:
         settings, make_task = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
-        copies = CopiesInWorkers(learner, make_env, settings)
-    return ProposerTrainer(learner, copies, config.advance).curriculum(config.own_action)
+        replicas = ReplicasInWorkers(learner, make_env, settings)
+    return ProposerTrainer(learner, replicas, config.advance).curriculum(config.own_action)
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:
-    """Train on the proposals of an agent that is rewarded for the Solver's failures on them.
+    """Makes the paper's ablation: a Proposer that is rewarded for the Solver's failures.
 
-    The paper's ablation; no other reward can be put in its place.
+    No other reward can be put in the place of this one.
     """
     return proposer(components, rewards.task_difficulty, checkpoint=checkpoint)
 
 
 def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerCurriculum:
-    """Train on the proposals of a Proposer that has learnt in another run, and learns no more.
+    """Makes a curriculum of a Proposer that has learnt in another run, and learns no more.
 
     Args:
         components: the task, and the settings of the Proposer's network and actions, which must be
@@ -272,8 +274,8 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
 
     Raises:
-        ValueError: if nothing is named, it holds no such Proposer, or there are several seeds.
-        CheckpointError: if it cannot be read.
+        ArgumentError: if nothing is named, it holds no such Proposer, or cannot be read.
+        ValueError: for several seeds.
     """
     _one_solver(components)
     if not checkpoint:
@@ -282,10 +284,8 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
             "Proposer"
         )
     task, config = components.task, components.proposer
-    agent = proposer_agent(task, config)
-    load_proposer(agent, checkpoint, config.observes)
     return ProposerCurriculum(
-        agent,
+        _agent(components, config, checkpoint),
         solver_view(task, config),
         proposer_actions(task, config),
         meta_episode_length=config.meta_episode_length,
@@ -332,15 +332,15 @@ def first_order_proposer(
     checkpoint: str | None = None,
     **numbers: Any,
 ) -> FirstOrderProposer:
-    """Train on the draws of a policy that is rewarded for each problem, to first order.
+    """Makes a Proposer that is rewarded for each problem with its first-order share of the gain.
 
     Args:
-        components: the task, and the Proposer's settings: of them the probes, the network, and of
-            PPO how far a step goes (``adam_eps``, ``clip_epsilon``, ``max_grad_norm``).
+        components: the task, and the Proposer's settings, of which probes, network, and PPO's
+            ``adam_eps``, ``clip_epsilon`` and ``max_grad_norm`` count.
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
         entropy_coeff: of the policy.
-        checkpoint: of such a policy that has learnt; None to begin anew.
+        checkpoint: of such a policy that has learnt; None for a new one.
         numbers: see :class:`FirstOrderProposer`.
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
@@ -356,7 +356,7 @@ def first_order_proposer_sampled(
     checkpoint: str | None = None,
     **numbers: Any,
 ) -> SampledFirstOrderProposer:
-    """The same from the Solver's own training episodes, without an oracle.
+    """Makes a Proposer that is rewarded by the Solver's own training episodes, without an oracle.
 
     The arguments are those of :func:`first_order_proposer`; ``numbers`` those of
     :class:`SampledFirstOrderProposer`.
@@ -378,7 +378,7 @@ def paired(
     entropy_coeff: NotNegative,
     checkpoint: str | None = None,
 ) -> PairedProposer:
-    """Train on the draws of a policy that is rewarded for the regret against a second Solver.
+    """Makes a Proposer that is rewarded for each problem with the regret against a second Solver.
 
     The arguments are those of :func:`first_order_proposer`.
 
@@ -405,20 +405,56 @@ def _problem_policy(
     entropy_coeff: float,
     checkpoint: str | None,
 ) -> tuple[Space, Distribution, ActorCritic, PPOSettings]:
-    """Space and target, a policy that draws each problem by itself, and how it learns."""
+    """Returns space, target, a policy that draws each problem by itself, and its PPO's numbers."""
     _one_solver(components)
     task, config = components.task, components.proposer
     action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()
     if action.ratio == "joint":
         raise ProposerError("action.ratio=joint: here each draw is rewarded by itself")
-    with Streams(components.seeds[0], "proposer").as_default("weights"):
-        agent = proposer_agent(task, replace(config, observes=[], action=action))
-    if checkpoint:
-        load_proposer(agent, checkpoint, [])
+    agent = _agent(components, replace(config, observes=[], action=action), checkpoint)
     numbers = replace(
         config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
     return task.space, task.target, agent, PPOSettings(horizon=1, **asdict(numbers))
+
+
+def _agent(components: Components, config: ProposerSettings, checkpoint: str | None) -> ActorCritic:
+    """Makes a Proposer, with the weights of one that has learnt with the same network if any.
+
+    Args:
+        components: the task, and the seed of new weights.
+        config: the network, and what it observes.
+        checkpoint: of a run, its ``proposer.pt``, or its folder; None for new weights.
+
+    Raises:
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
+    """
+    with Streams(components.seeds[0], "proposer").as_default("weights"):
+        agent = proposer_agent(components.task, config)
+    if not checkpoint:
+        return agent
+    try:
+        learnt = _with_proposer(load_curriculum(Path(checkpoint)))
+        observed = [name for name in learnt["observed"] if name != "probes"]
+        load_agent(agent, TensorDict(learnt["proposer"]))
+    except CheckpointError as error:
+        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
+        ) from error
+    if observed != config.observes:
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
+            f"{config.observes}"
+        )
+    return agent
+
+
+def _with_proposer(state: State) -> State:
+    """Returns the state of the part that has a Proposer, where curricula hold others."""
+    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
+    return state if "proposer" in state else next(filter(None, inner), {})
 
 
 def _one_solver(components: Components) -> None:

@@ -22,10 +22,9 @@ from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.first_order import bin_scores, exact_alignment, exact_direction
 from proposer_rl.meta.rewards import log_success, log_success_gain
-from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
 from proposer_rl.task import DifferentiableTask
 from research.common import Rows, answer, checkpoints, parser_of

@@ -19,10 +19,9 @@ from torch import Tensor
 from proposer_rl.cli.arguments import number
 from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.assembly import MixtureSettings
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import log_success, performance_gain
-from proposer_rl.meta.settings import MixtureSettings
-from proposer_rl.meta.view import SolverView
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 from research.common import Rows, answer, checkpoints, parser_of

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from proposer_rl.learning import Update
 from proposer_rl.meta.actions import Actions, Mixture
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import TrainingStep, performance_gain
-from proposer_rl.meta.view import SolverView
 
 RATE = 0.5
 

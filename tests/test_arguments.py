@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, arguments, checked
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.cli.help import needs
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.meta.rewards import performance_gain
-from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, proposer
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv

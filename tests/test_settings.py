@@ -14,7 +14,7 @@ from proposer_rl.cli.config import ComputeSettings
 from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
-from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, ProposerSettings
+from proposer_rl.meta.assembly import MixtureSettings, ProblemSettings, ProposerSettings
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.signals import StopSignals
 from proposer_rl.streams import Streams

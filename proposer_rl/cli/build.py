@@ -16,7 +16,8 @@ from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, re
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO, SolverSettings
-from proposer_rl.meta.workers import WorkerSettings, shares
+from proposer_rl.meta.replicas import shares
+from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
 from proposer_rl.models import available_cores, use_device
 from proposer_rl.runs.folder import RunFolder

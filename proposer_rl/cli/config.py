@@ -21,7 +21,7 @@ from proposer_rl.cli.arguments import settings_file
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import ArgumentError, arguments, settings
 

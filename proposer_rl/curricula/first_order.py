@@ -1,4 +1,4 @@
-"""Curricula in closed form: train on what raises the target's performance to first order."""
+"""Curricula in closed form: train on bins that raise the target's performance to first order."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.bins import BinCurriculum, Probes, along_axes, means_of_bins, tell_cost
-from proposer_rl.curricula.bins import Measure as Outcome
+from proposer_rl.curricula.bins import (
+    BinCurriculum,
+    Measure,
+    Probes,
+    along_axes,
+    means_of_bins,
+    tell_cost,
+)
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.student import Student
 from proposer_rl.curricula.transport import (
@@ -20,14 +26,14 @@ from proposer_rl.curricula.transport import (
     shares_of_bins,
     squared_distances,
 )
-from proposer_rl.meta.first_order import Measure, bin_scores, scaled
+from proposer_rl.meta.first_order import TargetMeasure, bin_scores, scaled
 from proposer_rl.settings import Count, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
 
 
 class _AlignedBins(BinCurriculum):
-    """Draws each student's batch from bins by their scores.
+    """Draws each student's batch from bins by a softmax over their averaged scores.
 
     With s_n the exponential moving average of the n-th bin's score, its share of the batch is
 
@@ -39,7 +45,7 @@ class _AlignedBins(BinCurriculum):
         self._temperature, self.smoothing = temperature, smoothing
 
     def shares(self) -> Tensor:
-        """Of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [K, N]."""
         score = self.scores["score"]
         largest = score.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(score.dtype).tiny)
         return (score / (self._temperature * largest)).softmax(-1)
@@ -48,7 +54,9 @@ class _AlignedBins(BinCurriculum):
 class FirstOrderCurriculum(_AlignedBins):
     """Scores each bin with the mean alignment of fresh levels of it, which nobody plays.
 
-    What a level returns is exact (:mod:`proposer_rl.meta.first_order`): no frames are spent.
+    The alignment of a level is the slope of its return along the direction of the parameters that
+    raises the target's performance fastest (:mod:`proposer_rl.meta.first_order`). Returns are
+    exact: no frames are spent.
 
     Args:
         space: that has the bins.
@@ -78,7 +86,7 @@ class FirstOrderCurriculum(_AlignedBins):
         step: Positive = 1.0,
         temperature: Positive = 0.1,
         smoothing: Decay = 0.9,
-        measure: Measure = "log_success",
+        measure: TargetMeasure = "log_success",
     ) -> None:
         super().__init__(space, every, temperature, smoothing)
         tell_cost(space, candidates, "candidates")
@@ -86,7 +94,7 @@ class FirstOrderCurriculum(_AlignedBins):
         self._candidates, self._step, self._measure = candidates, step, measure
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Score every bin."""
+        """Scores every bin by fresh levels, and averages the scores over time."""
         size, each = self.space.size, self._candidates
         target = fresh_levels(self._target, self._target_levels, streams, "target")
         reached, direction = student.target_direction(target, self._measure)
@@ -103,33 +111,34 @@ class FirstOrderCurriculum(_AlignedBins):
         }
 
     def log(self) -> dict[str, Any]:
-        """Besides, the scores' standard errors, and the target's performance when last scored."""
-        told = super().log()
-        if told:
-            told["target_performance"] = self.scores["target"].tolist()
-        if told and self._candidates > 1:
-            told["score_error"] = along_axes(self.scores["variance"].sqrt(), self.space)
-        return told
+        """Returns also the target's performance when last scored, and the scores' errors."""
+        record = super().log()
+        if record:
+            record["target_performance"] = self.scores["target"].tolist()
+        if record and self._candidates > 1:
+            record["score_error"] = along_axes(self.scores["variance"].sqrt(), self.space)
+        return record
 
 
 class SampledFirstOrderCurriculum(_AlignedBins):
-    """The same from the student's own training episodes, with any environment.
+    """Scores each bin with the mean alignment of the student's own training episodes on it.
 
-    Where the target is never solved, episodes on it tell no direction. An interim target takes its
-    place: the nearest distribution on bins that are mastered, in which the student's performance is
-    at least delta (:func:`~proposer_rl.curricula.transport.interim_target`). The direction is the
-    policy gradient of the episodes that the student was trained on, each weighted by the interim
-    target's share of its bin, averaged as the scores are. The score of a bin is the mean alignment
-    of the training episodes on it with the direction before them. No episode is played for either,
-    so that a part of each batch goes to all bins alike. Where training standardises the advantages
-    of a batch, so do the scores, over what comes in of it between two proposals.
+    It needs no exact returns, and so works with any environment. Where the target is never solved,
+    episodes on it show no direction. An interim target takes its place: the nearest distribution on
+    bins that are mastered, in which the student's performance is at least delta
+    (:func:`~proposer_rl.curricula.transport.interim_target`). The direction is the policy gradient
+    of the episodes that the student was trained on, each weighted by the interim target's share of
+    its bin, averaged as the scores are. The score of a bin is the mean alignment of the training
+    episodes on it with the direction before them. No episode is played for either, so that a part
+    of each batch goes to all bins alike. Where training standardises the advantages of a batch, so
+    do the scores, over what comes in of it between two proposals.
 
     Args:
         space: that has the bins.
         target_shares: the target as shares of the bins, float [N].
         every: batches between two scoring passes.
         delta: least performance of a bin that the interim target lies on.
-        probes: levels of each bin by which performance is told.
+        probes: levels of each bin on which performance is measured.
         measure: of performance, ``"success"`` or ``"return"``.
         temperature: the share of bin n is proportional to exp(s_n / (temperature * max |s|)), with
             s its averaged score.
@@ -154,7 +163,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         every: Count = 1,
         delta: float = 0.2,
         probes: Count = 4,
-        measure: Outcome = "success",
+        measure: Measure = "success",
         temperature: Positive = 0.1,
         smoothing: Decay = 0.9,
         exploration: Share = 0.2,
@@ -167,7 +176,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         self._gradient: dict[str, Tensor] = {}  # of what came in since the last scoring pass
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Move the direction by the gradient of what came in, and the interim target."""
+        """Moves the interim target, and the direction by the gradient of what came in."""
         performance = self._probes.performance(student, streams)
         allowed = mastered(performance, self._delta)
         nothing = torch.zeros_like(performance)
@@ -185,7 +194,15 @@ class SampledFirstOrderCurriculum(_AlignedBins):
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
     ) -> dict[str, Tensor]:
-        """The alignments with the present direction, as the student stands after its update.
+        """Returns the alignments of a batch with the present direction, after the student's update.
+
+        Args:
+            student: after it has trained on the batch.
+            batch: as it was proposed, or a part of it.
+            outcome: of the batch, with a ``rollout`` [K, n, T].
+
+        Returns:
+            What :func:`alignments` reads, each [K, n]; nothing before there is a direction.
 
         Raises:
             ValueError: if the outcome has no rollout.
@@ -205,7 +222,7 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         return {**dict(parts.items()), "steps": outcome["steps"]}
 
     def learn(self, evidence: TensorDict) -> None:
-        """Score the bins that were trained on."""
+        """Averages the alignments of the levels that were trained on into their bins' scores."""
         score = self.scores["score"]
         aligned = alignments(evidence).to(score)
         means, counts = means_of_bins(evidence["bins"], aligned, score.shape[-1])
@@ -213,16 +230,18 @@ class SampledFirstOrderCurriculum(_AlignedBins):
         self.scores = {**self.scores, "score": torch.where(counts > 0, averaged, score)}
 
     def shares(self) -> Tensor:
-        """Of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [K, N]."""
         shares = super().shares()
         return (1 - self._exploration) * shares + self._exploration / shares.shape[-1]
 
 
 def alignments(evidence: TensorDict) -> Tensor:
-    """Of the levels of a batch [K, m], with advantages as training has them, by its evidence.
+    """Returns the alignments of m levels of a batch, float [K, m].
+
+    Where training standardises advantages over a batch, theirs are standardised over these levels.
 
     Args:
-        evidence: of a :class:`SampledFirstOrderCurriculum`.
+        evidence: as :meth:`SampledFirstOrderCurriculum.evidence` returns it, [K, m].
     """
     aligned: Tensor = evidence["slope"]
     if "drift" not in evidence.keys():

@@ -13,15 +13,14 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
-from proposer_rl.curricula.bins import Measure as Outcome
-from proposer_rl.curricula.bins import along_axes, counts_of_bins
+from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
 from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import PPOSettings, load_agent, located
 from proposer_rl.learning.divergence import require_finite
-from proposer_rl.meta.first_order import Measure
+from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
@@ -29,21 +28,21 @@ from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
 
 
 class ProblemProposer(Curriculum):
-    """Draws each of P problems from a policy over probes, and learns from the reward of each.
+    """Draws each of P problems from a policy, and trains it by the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
-    gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7),
-    with no critic.
+    gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7).
+    It has no critic.
 
     Args:
         space: that has the bins.
-        target: the distribution through whose levels the student is seen.
+        target: the distribution of the levels through which the student is seen.
         agent: from ``probes`` [K, C, ...] to logits [K, P, N] of independent categoricals, as
             :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
-        settings: of these, ``epochs``, ``learning_rate``, ``adam_eps``, ``clip_epsilon``,
-            ``entropy_coeff`` and ``max_grad_norm`` count.
-        probe_levels: probes C.
+        settings: PPO's numbers, of which ``epochs``, ``learning_rate``, ``adam_eps``,
+            ``clip_epsilon``, ``entropy_coeff`` and ``max_grad_norm`` count.
+        probe_levels: number C of probe levels.
 
     Raises:
         ValueError: if the space has a single bin.
@@ -85,7 +84,11 @@ class ProblemProposer(Curriculum):
     def _draw(
         self, student: Student, count: int, streams: Sequence[Streams]
     ) -> tuple[TensorDict, TensorDict, Tensor, Levels]:
-        """What the policy sees, its choices [times, 1, P], their bins and levels [1, times * P]."""
+        """Draws at least ``count`` levels, P at a time, by choices [times, 1, P] of the policy.
+
+        Returns:
+            What the policy sees [1], the choices, and their bins and levels [1, times * P].
+        """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
         (stream,), agent = streams, self.agent
@@ -104,28 +107,28 @@ class ProblemProposer(Curriculum):
         return seen, TensorDict(drawn, choices.shape), bins, levels
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Count the levels."""
+        """Counts the levels that came back."""
         self._inbox.check(batch, outcome)
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
 
     def log(self) -> dict[str, Any]:
-        """The last metrics of the policy, and counts."""
+        """Returns the last metrics of the policy, and how many levels of each bin came back."""
         if not self._metrics:
             return {}
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {**self._metrics, "histogram": along_axes(counts, self.space)}
 
     def learnt(self) -> dict[str, Any]:
-        """The Proposer, without its optimiser."""
+        """Returns the Proposer, without its optimiser."""
         return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights and Adam's state, too."""
-        adam = deepcopy(self._adam.state_dict())
-        return super().state_dict() | learnt_proposer(self.agent) | {"adam": adam}
+        """Returns also the Proposer and Adam's state."""
+        own = learnt_proposer(self.agent) | {"adam": deepcopy(self._adam.state_dict())}
+        return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
+        """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
@@ -133,7 +136,7 @@ class ProblemProposer(Curriculum):
     def _learn(
         self, seen: TensorDict, played: TensorDict, problems: Tensor | slice = slice(None)
     ) -> None:
-        """A few steps on draws [times, 1, m] of problems [m]: the clipped objective of each."""
+        """Makes a few gradient steps on draws [times, 1, m] of these problems, int64 [m]."""
         steps = []
         for _ in range(self._settings.epochs):
             logits = self.agent(seen.copy())[self.agent.logits_key][:, problems]  # [K, m, N]
@@ -154,18 +157,16 @@ class ProblemProposer(Curriculum):
 
 
 class _RewardedAtOnce(ProblemProposer):
-    """Learns from all that it drew before anybody trains, also where levels are filtered."""
+    """A policy that learns from all that it drew before anybody trains on any of it."""
 
     @abstractmethod
     def reward(
         self, student: Student, levels: Levels, stream: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Of each of the levels [1, E], on which nobody has trained: float [1, E]; and metrics."""
+        """Returns the rewards of levels [1, E], float [1, E], and metrics."""
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n] of the policy's draws, from all of which it has learnt already.
-
-        The policy draws P problems at once: as many times as it takes for n.
+        """Draws levels [1, n] from the policy, which learns from them at once.
 
         Raises:
             ValueError: for several students: a Proposer learns from one.
@@ -179,12 +180,15 @@ class _RewardedAtOnce(ProblemProposer):
 
 
 class FirstOrderProposer(_RewardedAtOnce):
-    """A problem's reward is its alignment with the target direction.
+    """Rewards each problem with its alignment, its first-order share of the target's gain.
+
+    The alignment of a level is the slope of its return along the direction of the parameters that
+    raises the target's performance fastest (:mod:`proposer_rl.meta.first_order`).
 
     Args:
-        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
         target_levels: fresh levels E of the target that the direction is taken from.
-        step: of the differences that tell the alignments, in learning rates.
+        step: of the differences that give the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
     """
@@ -202,7 +206,7 @@ class FirstOrderProposer(_RewardedAtOnce):
         probe_levels: int = 16,
         target_levels: Count = 256,
         step: Positive = 1.0,
-        measure: Measure = "log_success",
+        measure: TargetMeasure = "log_success",
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
         self._target_levels, self._step, self._measure = target_levels, step, measure
@@ -210,7 +214,7 @@ class FirstOrderProposer(_RewardedAtOnce):
     def reward(
         self, student: Student, levels: Levels, stream: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """The alignment of each level, which is evaluated on either side of the student."""
+        """Returns the alignment of each level, by evaluations on either side of the student."""
         target = self.target.sample(self._target_levels, stream.generator("target"))
         reached, direction = student.target_direction(target.unsqueeze(0), self._measure)
         aligned = student.alignment(direction, levels, self._step)
@@ -222,20 +226,20 @@ class FirstOrderProposer(_RewardedAtOnce):
 
 
 class SampledFirstOrderProposer(ProblemProposer):
-    """A problem's reward is its training episodes' alignment with an interim target's direction.
+    """Rewards each problem with the alignment of its training episodes.
 
-    Both are of the student's own episodes, and nothing is played for them
-    (:class:`~proposer_rl.curricula.first_order.SampledFirstOrderCurriculum`). So the reward comes
-    after the training: before it proposes again the policy learns from all that came back, of
-    filtered levels from those that were trained on. Of a batch, the levels that come in between two
-    proposals are compared; what is still out when 32 newer batches have been proposed counts no
-    more.
+    Alignments and direction are those of
+    :class:`~proposer_rl.curricula.first_order.SampledFirstOrderCurriculum`, from the student's own
+    episodes; nothing is played for them. So the reward comes after the training: before it proposes
+    again, the policy learns from the levels that came back. Those of a batch that come in between
+    the same two proposals are compared; what is still out when 32 newer batches have been proposed
+    counts no more.
 
     Args:
-        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
         target_shares: the target as shares of the bins, float [N].
         delta: least performance of a bin that the interim target lies on.
-        probes: levels of each bin by which performance is told.
+        probes: levels of each bin on which performance is measured.
         measure: of performance, ``"success"`` or ``"return"``.
         smoothing: share of the old in the direction's average.
     """
@@ -256,7 +260,7 @@ class SampledFirstOrderProposer(ProblemProposer):
         probe_levels: int = 16,
         delta: float = 0.2,
         probes: Count = 4,
-        measure: Outcome = "success",
+        measure: Measure = "success",
         smoothing: Decay = 0.9,
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
@@ -266,13 +270,13 @@ class SampledFirstOrderProposer(ProblemProposer):
         self._drawn: dict[int, dict[str, Tensor]] = {}  # by the batch: what was seen, and choices
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n], when the policy has learnt from those that came back.
+        """Lets the policy learn from the levels that came back, and draws levels [1, n] from it.
 
         Raises:
             ValueError: for several students.
             DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
         """
-        self._learn_of_episodes()
+        self._learn_from_episodes()
         seen, drawn, bins, levels = self._draw(student, count, streams)
         self._credit.score(student, count, streams)
         which = torch.arange(count).unsqueeze(0)
@@ -283,13 +287,13 @@ class SampledFirstOrderProposer(ProblemProposer):
         return batch
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Count the levels, and put their alignments aside."""
+        """Counts the levels, and puts their alignments aside."""
         super().observe(student, batch, outcome)
         if evidence := self._credit.evidence(student, batch, outcome):
             self._inbox.put(batch, which=batch.notes["which"], **evidence)
 
-    def _learn_of_episodes(self) -> None:
-        """From the levels that came back, with those of the same batch that did so beside them."""
+    def _learn_from_episodes(self) -> None:
+        """Trains the policy on the levels that came back, batch by batch."""
         device = self._parameters[0].device  # what a checkpoint holds is on the CPU
         for evidence in self._inbox.take():
             drawn = self._drawn.get(int(evidence["number"][0, 0]))
@@ -309,20 +313,20 @@ class SampledFirstOrderProposer(ProblemProposer):
 
 
 class PairedProposer(_RewardedAtOnce):
-    """A problem's reward is what another student, the antagonist, gets more on it.
+    """Rewards each problem with the regret between two students.
 
     PAIRED (Dennis et al. 2020, arXiv 2012.02096, algorithm 1): protagonist and antagonist train on
-    the same levels, and the generator is rewarded
+    the same levels, and the generator of a level is rewarded
 
         max(0, J(antagonist, level) - J(protagonist, level)).
 
-    Of the students' performance, which may be exact; published are the antagonist's best and the
-    protagonist's mean episode. The levels are draws from the space's bins rather than built cell by
-    cell, each rewarded by itself. The antagonist trains on a batch when all of it has come back, or
-    32 newer ones have been proposed.
+    J is a student's performance, which may be exact; published are the antagonist's best and the
+    protagonist's mean episode. The levels are drawn from the space's bins, each rewarded by itself,
+    rather than built cell by cell. The antagonist trains on a batch when all of it has come back,
+    or 32 newer ones have been proposed.
 
     Args:
-        space, target, agent, settings, probe_levels: as of :class:`ProblemProposer`.
+        space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
         antagonist: the second student.
     """
 
@@ -343,7 +347,7 @@ class PairedProposer(_RewardedAtOnce):
         self._inbox = Inbox(target.sample(1, torch.Generator())[0])
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n], when the antagonist has trained on those that came back.
+        """Lets the antagonist train on the levels that came back, and draws levels [1, n].
 
         Raises:
             ValueError: for several students.
@@ -358,7 +362,7 @@ class PairedProposer(_RewardedAtOnce):
     def reward(
         self, student: Student, levels: Levels, stream: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """The regret of each level."""
+        """Returns the regret of each level."""
         antagonist, protagonist = (
             each.performance(levels, stream.generator("regret"))["return"]
             for each in (self.antagonist, student)
@@ -371,27 +375,27 @@ class PairedProposer(_RewardedAtOnce):
         }
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Put the levels aside for the antagonist; it takes as many steps on them."""
+        """Puts the levels aside for the antagonist, which takes as many steps on them."""
         super().observe(student, batch, outcome)
         student.spend(frames=int(outcome["steps"][0].sum()))
         self._inbox.put(batch, level=batch.levels, seed=batch.notes["seed"])
 
     def log(self) -> dict[str, Any]:
-        """As of :class:`ProblemProposer`, when the antagonist has trained."""
+        """Returns metrics and counts, when the antagonist has trained."""
         self._train_antagonist()
         return super().log()
 
     def _train_antagonist(self) -> None:
-        """On the batches that are complete."""
+        """Trains the antagonist on the batches that are complete."""
         for evidence in self._inbox.take(whole=True):
             generator = torch.Generator().manual_seed(int(evidence["seed"][0, 0]))
             self.antagonist.train(evidence["level"], [generator])
 
     def state_dict(self) -> dict[str, Any]:
-        """The antagonist, too."""
+        """Returns also the antagonist."""
         return {**super().state_dict(), "antagonist": self.antagonist.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
+        """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self.antagonist.restore(TensorDict(state["antagonist"], [1]))

@@ -1,9 +1,8 @@
-"""A Proposer as a curriculum, how it learns to be one, and what of that other runs take up."""
+"""A Proposer as a curriculum, and how it learns to be one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -15,33 +14,29 @@ from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedC
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
-from proposer_rl.meta.copies import Copies
-from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.view import SolverView
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
+from proposer_rl.meta.replicas import Replicas
 from proposer_rl.models import ActorCritic, draw_at
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_checkpoint, load_latest
-from proposer_rl.runs.folder import PROPOSER
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 
 
 class ProposerCurriculum(LearnedCurriculum):
-    """The student trains on the proposals of an agent, which learns from replicas of the student.
+    """Trains the student on the proposals of an agent that learns from replicas of the student.
 
     With a trainer, before each cycle K replicas of the student go through one episode of the
-    meta-environment, and the Proposer's PPO learns from them. Without one it is frozen. Then the
-    student itself trains on the Proposer's proposals.
+    meta-environment, and the Proposer's PPO learns from them. Without a trainer the Proposer is
+    frozen. Then the student itself trains on the Proposer's proposals.
 
     Args:
         agent: the Proposer.
-        view: what it sees of the student; new levels at every cycle.
-        actions: the levels that its actions stand for.
+        view: what it sees of the student; its levels are new at every cycle.
+        actions: from its actions to levels.
         meta_episode_length: updates L of the episodes in which it learns or has learnt, from which
             it knows how far a cycle has gone.
         action_repeat: batches for which an action holds.
         own_action: the action for the student itself: a ``"sample"`` of the policy, or its
             ``"mode"``, without exploration.
-        trainer: how it learns; None to leave it as it is.
+        trainer: trains the Proposer; None to leave it as it is.
     """
 
     remembers = ("_proposed", "_action")
@@ -64,7 +59,7 @@ class ProposerCurriculum(LearnedCurriculum):
         self.action_repeat = action_repeat
         self.own_action = own_action
         self.trainer = trainer
-        # What it sees; and while it learns, what becomes of replicas.
+        # To see the student; and while the Proposer learns, to make replicas.
         self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
         if self.trains_replicas:
@@ -73,7 +68,7 @@ class ProposerCurriculum(LearnedCurriculum):
         self._action: Tensor | None = None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Draw the levels through which the student is seen, and let the trainer train."""
+        """Draws the levels through which the student is seen, and lets the trainer train."""
         (stream,) = streams
         self._proposed = 0
         if self.trainer is not None:
@@ -83,7 +78,7 @@ class ProposerCurriculum(LearnedCurriculum):
 
     @torch.no_grad()
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [1, n] of the Proposer's policy, given what it sees of the student."""
+        """Draws levels [1, n] from the Proposer's policy, given what it sees of the student."""
         (stream,) = streams
         if self._action is None:  # the first batch can come within a cycle
             self._proposed = 0
@@ -94,11 +89,11 @@ class ProposerCurriculum(LearnedCurriculum):
         return Batch(levels, TensorDict({}, (1, count)))
 
     def learnt(self) -> dict[str, Any]:
-        """The Proposer, without its optimiser; nothing if it is frozen: others have it then."""
+        """Returns the Proposer without its optimiser; nothing if it is frozen and not new."""
         return {} if self.trainer is None else learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the cycle's levels come from, and the agent, too."""
+        """Returns also the address of the cycle's streams, and the agent."""
         agent = (
             agent_weights(self.agent) if self.trainer is None else self.trainer.learner.snapshot()
         )
@@ -109,7 +104,7 @@ class ProposerCurriculum(LearnedCurriculum):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on within a cycle."""
+        """Puts back what :meth:`state_dict` returned, also within a cycle."""
         super().load_state_dict(state)
         self.view.draw_levels(Streams(*state["streams"]))
         agent = TensorDict(state["proposer"], batch_size=[])
@@ -119,9 +114,9 @@ class ProposerCurriculum(LearnedCurriculum):
             self.trainer.learner.restore(agent)
 
     def close(self) -> None:
-        """Let go of the replicas that are elsewhere."""
+        """Ends the processes in which replicas are trained."""
         if self.trainer is not None:
-            self.trainer.copies.close()
+            self.trainer.replicas.close()
 
     def _act(self, student: Student, stream: Streams) -> Tensor:
         # A cycle may be longer than the episodes that it learnt in: then another one begins.
@@ -141,15 +136,15 @@ class ProposerCurriculum(LearnedCurriculum):
 
 
 class ProposerTrainer:
-    """Trains a Proposer on what its proposals do to K replicas of the student.
+    """Trains a Proposer by what its proposals do to K replicas of the student.
 
     Args:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
             horizon is the number of steps of that environment's episodes.
-        copies: where the replicas are rolled out; None for the learner's own environment, in this
-            process.
-        advance: ``"train"``: the student trains on new proposals; ``"best"`` or ``"random"``: it
-            becomes the replica with the greatest total reward, or any, with its optimiser.
+        replicas: trains the replicas; None for the learner's own environment, in this process.
+        advance: what becomes of the student then: with ``"train"`` it trains on new proposals,
+            with ``"best"`` or ``"random"`` it becomes the replica with the greatest total reward,
+            or any, with its optimiser.
 
     Raises:
         ValueError: for an environment of another kind, or a horizon other than the episode's.
@@ -158,7 +153,7 @@ class ProposerTrainer:
     def __init__(
         self,
         learner: PPO,
-        copies: Copies | None = None,
+        replicas: Replicas | None = None,
         advance: Literal["train", "best", "random"] = "train",
     ) -> None:
         env = learner.env
@@ -171,11 +166,11 @@ class ProposerTrainer:
             )
         self.learner = learner
         self.env = env
-        self.copies = copies or Copies(learner)
+        self.replicas = replicas or Replicas(learner)
         self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
-        """The curriculum of this Proposer while it learns."""
+        """Returns the curriculum of this Proposer while it learns."""
         env = self.env
         return ProposerCurriculum(
             self.learner.agent,
@@ -188,20 +183,20 @@ class ProposerTrainer:
         )
 
     def train(self, student: Student, stream: Streams) -> Improvement:
-        """Roll K replicas of the student out and train the Proposer on their rewards."""
+        """Trains K replicas of the student for an episode, and the Proposer on their rewards."""
         env = self.env
-        rollout = self.copies.roll_out(student.snapshot()[0], stream)
+        rollout = self.replicas.roll_out(student.snapshot()[0], stream)
         with located("the Proposer"):
             training = self.learner.optimise(rollout)
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
-        copies = len(rewards)
+        replicas = len(rewards)
         # A replica that the student becomes is the student's own training.
-        trained = copies - (self.advance != "train")
+        trained = replicas - (self.advance != "train")
         student.spend(
             frames=trained * env.frames_per_update * env.meta_episode_length,
             # Every replica after each of its actions, and all of them once at the start.
-            evaluations=copies * (env.steps + 1) * env.view.validation_levels,
+            evaluations=replicas * (env.steps + 1) * env.view.validation_levels,
         )
         metrics = self._metrics(rollout, rewards, training)
         return Improvement(metrics, self._advance(student, rewards, stream))
@@ -213,7 +208,7 @@ class ProposerTrainer:
         if self.advance == "random":
             generator = stream.generator("advance")
             best = int(torch.randint(len(rewards), (), generator=generator))
-        trained = self.copies.trained(best)
+        trained = self.replicas.trained(best)
         student.restore(trained.solver)
         return Advance(self.env.meta_episode_length, trained.levels, trained.update)
 
@@ -236,52 +231,5 @@ class ProposerTrainer:
 
 
 def learnt_proposer(agent: ActorCritic) -> dict[str, Any]:
-    """A Proposer's weights and what it observes, as its curriculum's state has them."""
+    """Returns a Proposer's weights and what it observes, for its curriculum's state."""
     return {"proposer": agent_weights(agent).to_dict(), "observed": agent.in_keys}
-
-
-def load_proposer(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
-    """Give a Proposer the weights of one that has learnt with the same network.
-
-    Args:
-        agent: the Proposer.
-        checkpoint: of a run, its ``proposer.pt``, or its folder.
-        observes: what the Proposer observes beside the probes.
-
-    Raises:
-        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
-    """
-    try:
-        learnt = _with_proposer(_curriculum_state(Path(checkpoint)))
-        observed = [name for name in learnt["observed"] if name != "probes"]
-        load_agent(agent, TensorDict(learnt["proposer"]))
-    except CheckpointError as error:
-        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
-        ) from error
-    if observed != list(observes):
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
-            f"{list(observes)}"
-        )
-
-
-def _with_proposer(state: State) -> State:
-    """The state of the part that has a Proposer, where curricula hold others, as filtering does."""
-    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
-    return state if "proposer" in state else next(filter(None, inner), {})
-
-
-def _curriculum_state(path: Path) -> State:
-    """The curriculum's part of a checkpoint, or of a run's newest one, or what it left of it."""
-    if not path.exists():
-        raise CheckpointError("there is no such file or folder")
-    latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
-    if latest is None and (path / PROPOSER).exists():
-        latest = load_checkpoint(path / PROPOSER)
-    if latest is None:
-        raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
-    state: State = latest[1]["curriculum"]
-    return state

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 from proposer_rl.learning import PPO, RolloutCollector, gae
 from proposer_rl.meta.first_order import (
     Direction,
+    LevelGradients,
     alignment,
     exact_alignment,
     exact_direction,
@@ -28,7 +29,6 @@ from proposer_rl.meta.first_order import (
     over_steps,
     surrogate,
 )
-from proposer_rl.meta.gradient_norms import LevelGradients
 from proposer_rl.task import (
     DifferentiableTask,
     EnumerableTask,

@@ -18,7 +18,7 @@ from proposer_rl.task import Space, refuse_single_bin
 
 
 class Actions(ABC):
-    """The levels that actions of K copies stand for; a subclass defines the actions.
+    """Turns the actions of K students into levels; a subclass defines what an action is.
 
     Args:
         space: the bins, and the levels in them.
@@ -33,27 +33,27 @@ class Actions(ABC):
         self.bins = space.size
 
     @abstractmethod
-    def spec(self, copies: int, batch_size: int, device: torch.device) -> TensorSpec:
-        """The specification of actions for batches of P levels, batch [K]."""
+    def spec(self, students: int, batch_size: int, device: torch.device) -> TensorSpec:
+        """Returns the specification of actions [K, ...], each for a batch of P levels."""
 
     @abstractmethod
     def draw(
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Bins int64 [K, P]; what chance decides, copy k draws from the k-th generator."""
+        """Returns bins int64 [K, P]; student k draws from the k-th generator where it draws."""
 
     def levels(
         self, action: Tensor, batch_size: int, streams: Sequence[Streams]
     ) -> tuple[Any, Tensor]:
-        """Levels [K, P] of actions [K, ...], and their bins int64 [K, P].
+        """Draws levels [K, P] of actions [K, ...]; returns them, and their bins int64 [K, P].
 
         Both are drawn on the host, where level generators work; the device meanwhile finishes what
         it has to do.
 
         Args:
-            action: of K copies.
+            action: of K students.
             batch_size: number P of levels.
-            streams: one for each copy, from which its bins and levels are drawn.
+            streams: of each student, from which its bins and levels are drawn.
         """
         draws, levels = (
             [stream.generator(purpose) for stream in streams] for purpose in ("choices", "levels")
@@ -69,7 +69,7 @@ class ProblemChoices(Actions):
     a batch varies by about 1 / sqrt(P) only.
 
     Example:
-        Of a space only the number of its bins is asked, until levels are generated:
+        Until levels are generated, only the number of the space's bins matters:
 
         >>> from types import SimpleNamespace
         >>> choices = ProblemChoices(SimpleNamespace(size=4))
@@ -77,14 +77,14 @@ class ProblemChoices(Actions):
         tensor([[0, 3, 3]])
     """
 
-    def spec(self, copies: int, batch_size: int, device: torch.device) -> TensorSpec:
-        """Categorical, int64 [K, P]."""
-        return Categorical(self.bins, (copies, batch_size), dtype=torch.int64, device=device)
+    def spec(self, students: int, batch_size: int, device: torch.device) -> TensorSpec:
+        """Returns a categorical specification, int64 [K, P]."""
+        return Categorical(self.bins, (students, batch_size), dtype=torch.int64, device=device)
 
     def draw(
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """The action itself, as often as it takes for the batch: nothing is left to chance."""
+        """Returns the action itself, repeated if the batch is larger; nothing is drawn."""
         return action.repeat(1, -(-batch_size // action.shape[1]))[:, :batch_size]
 
 
@@ -127,23 +127,23 @@ class Mixture(Actions):
             )
         self.directions = directions.cpu()
 
-    def spec(self, copies: int, batch_size: int, device: torch.device) -> TensorSpec:
-        """Unbounded, float [K, D]."""
-        return Unbounded((copies, self.directions.shape[0]), device=device)
+    def spec(self, students: int, batch_size: int, device: torch.device) -> TensorSpec:
+        """Returns an unbounded specification, float [K, D]."""
+        return Unbounded((students, self.directions.shape[0]), device=device)
 
     def shares(self, action: Tensor) -> Tensor:
-        """The mixture of actions [*B, D]: shares that add up to one, [*B, N]."""
+        """Returns the mixtures of actions [*B, D]: shares [*B, N] that add up to one."""
         return (action @ self.directions).softmax(-1)
 
     def draw(
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Systematic draws from the mixture of actions [K, D]."""
+        """Draws bins int64 [K, P] systematically from the mixtures of actions [K, D]."""
         return systematic_draw(self.shares(action), batch_size, generators)
 
 
 def systematic_draw(shares: Tensor, count: int, generators: Sequence[torch.Generator]) -> Tensor:
-    """Bins that occur as often as their shares of ``count`` draws say, rounded up or down.
+    """Draws bins that occur as often as their shares of ``count`` say, rounded up or down.
 
     Systematic sampling: one random offset, then a mark in each ``count``-th part of the cumulated
     shares; in random order.
@@ -151,7 +151,7 @@ def systematic_draw(shares: Tensor, count: int, generators: Sequence[torch.Gener
     Args:
         shares: float [K, N], on the CPU.
         count: number P of draws.
-        generators: one for each copy.
+        generators: K of them.
 
     Returns:
         int64 [K, P].

@@ -1,17 +1,19 @@
-"""A Proposer's network, its actions and its environment, put together from its settings."""
+"""A Proposer from its settings: its network, its actions and its environment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import field
+from typing import Annotated, Literal
 
+from annotated_types import Ge, Gt
 from torch import nn
 from torch.distributions import Distribution
 
-from proposer_rl.meta import rewards
+from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
-from proposer_rl.meta.env import SolverTrainingEnv
-from proposer_rl.meta.settings import MixtureSettings, ProblemSettings, ProposerSettings
-from proposer_rl.meta.view import SolverView
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
+from proposer_rl.meta.rewards import Reward
 from proposer_rl.models import (
     ActorCritic,
     MixtureHead,
@@ -22,20 +24,94 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
+from proposer_rl.settings import BY_KIND, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
+
+
+@settings
+class MixtureSettings:
+    """The settings of actions that are mixtures of bins, from which whole batches are drawn.
+
+    Attributes:
+        spread: standard deviation of the first policy.
+    """
+
+    kind: Literal["mixture"] = "mixture"
+    spread: Annotated[float, Gt(0)] = 1.5
+
+
+@settings
+class ProblemSettings:
+    """The settings of actions that name the bin of every level (the paper's Proposer).
+
+    Attributes:
+        ratio: PPO's ratio over the P draws together, or for each draw.
+        bands: frequencies of the problem index's Fourier encoding.
+    """
+
+    kind: Literal["problems"] = "problems"
+    ratio: Literal["joint", "per_problem"] = "per_problem"
+    bands: Annotated[int, Ge(1)] = 16
+
+
+@settings
+class ProposerSettings:
+    """The settings of a Proposer and its meta-environment: not the paper's, but what learns best.
+
+    Attributes:
+        rollouts: number K of replicas of the Solver that are trained side by side.
+        meta_episode_length: updates L of a meta-episode.
+        action_repeat: updates for which an action holds; divides L.
+        validation_levels: size E of the batch that the gain is measured on.
+        probe_levels: number C of target levels through which the Solver is seen; at most E.
+        observes: numbers that are observed beside the probes.
+        action: what an action means.
+        own_action: what the Solver itself trains on: a sample of the policy or its mode.
+        advance: what becomes of the Solver after a meta-episode: it trains by itself, or becomes
+            the best replica, or a random one.
+        advantage: against the mean of the other replicas, or by a critic.
+        context, hidden: widths of the network.
+        ppo: PPO's numbers; the horizon is the number of actions of a meta-episode.
+    """
+
+    rollouts: Annotated[int, Ge(1)] = 16
+    meta_episode_length: Annotated[int, Ge(1)] = 50
+    action_repeat: Annotated[int, Ge(1)] = 50
+    validation_levels: Annotated[int, Ge(1)] = 512
+    probe_levels: Annotated[int, Ge(0)] = 16
+    observes: list[Literal["return", "log_success", "progress"]] = field(
+        default_factory=lambda: ["log_success", "progress"]
+    )
+    action: Annotated[MixtureSettings | ProblemSettings, BY_KIND] = MixtureSettings()
+    own_action: Literal["sample", "mode"] = "mode"
+    advance: Literal["train", "best", "random"] = "train"
+    advantage: Literal["leave_one_out", "gae"] = "leave_one_out"
+    context: Annotated[int, Ge(1)] = 128
+    hidden: Annotated[int, Ge(1)] = 128
+    ppo: LearningSettings = LearningSettings(updates=3, epochs=16, gamma=1.0)
 
 
 def meta_env(
     task: Task,
     config: ProposerSettings,
     streams: Streams,
-    reward: rewards.Reward,
+    reward: Reward,
     share: range,
     on_update: Callable[[int], None] | None = None,
     kind: type[SolverTrainingEnv] = SolverTrainingEnv,
 ) -> SolverTrainingEnv:
-    """The environment in which those of a Solver's K replicas train whose numbers are ``share``."""
+    """Makes the environment in which some of a Solver's K replicas train.
+
+    Args:
+        task: makes the replicas and their levels.
+        config: the Proposer's settings.
+        streams: of the replicas' first weights.
+        reward: of an update.
+        share: the numbers of the replicas that train here.
+        on_update: called after every update; see :class:`SolverTrainingEnv`.
+        kind: the environment's class.
+    """
     return kind(
         task.learner([streams] * len(share)),
         view=solver_view(task, config),
@@ -43,26 +119,26 @@ def meta_env(
         reward=reward,
         meta_episode_length=config.meta_episode_length,
         action_repeat=config.action_repeat,
-        first_copy=share.start,
+        first_replica=share.start,
         on_update=on_update,
     )
 
 
 def solver_view(task: Task, config: ProposerSettings) -> SolverView:
-    """What a Proposer sees of a Solver."""
+    """Makes what a Proposer with these settings sees of a Solver."""
     return SolverView(
         task, validation_levels=config.validation_levels, probe_levels=config.probe_levels
     )
 
 
 def proposer_actions(task: Task, config: ProposerSettings) -> Actions:
-    """What its actions mean."""
+    """Makes what the actions of a Proposer with these settings mean."""
     kinds = {MixtureSettings: Mixture, ProblemSettings: ProblemChoices}
     return kinds[type(config.action)](task.space)
 
 
 def proposer_agent(task: Task, config: ProposerSettings) -> ActorCritic:
-    """The Proposer, with weights from torch's default generator."""
+    """Makes a Proposer's policy and critic, with weights from torch's default generator."""
     action, hidden = config.action, config.hidden
     width = config.context + len(config.observes)
     head: nn.Module

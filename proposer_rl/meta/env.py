@@ -1,8 +1,13 @@
-"""The meta-environment: one step trains K Solvers on proposed levels."""
+"""The meta-environment: one step trains K Solvers on proposed levels, and looks at them.
+
+From top to bottom: what is trained (:class:`Learner`), what a Proposer sees of it
+(:class:`SolverView`), and the environment itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,48 +16,163 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import make_composite_from_td
 
-from proposer_rl.learning import located
+from proposer_rl.learning import Update, located
 from proposer_rl.meta.actions import Actions
-from proposer_rl.meta.learner import Learner
-from proposer_rl.meta.rewards import Reward, TrainingStep
-from proposer_rl.meta.view import SolverView
+from proposer_rl.meta.rewards import Reward, TrainingStep, mean_log_success, mean_return
+from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError, signed
 from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+
+
+class Learner(Protocol):
+    """The interface of K learners, each of which trains on P levels at every update.
+
+    Each trains as if it were alone. :class:`~proposer_rl.learning.PPO` of a population is a
+    learner; ``examples/own_learner.py`` shows another kind.
+
+    Attributes:
+        env: with ``batch_size`` [K, P], ``device``, and ``set_levels(levels [K, P])``, which says
+            what the next update trains on.
+        agent: what the task's ``performance`` and ``probe`` take.
+        copies: the number K.
+        horizon: environment steps of an update on one level.
+    """
+
+    env: Any
+    agent: Any
+
+    @property
+    def copies(self) -> int | None: ...  # noqa: D102
+
+    @property
+    def horizon(self) -> int: ...  # noqa: D102
+
+    def update(self, generators: list[torch.Generator]) -> Update:
+        """Trains on the levels that are set; learner k draws from the k-th generator."""
+
+    def check(self, first: int = 0) -> None:
+        """Raises a DivergedError if a number of the last update is not finite.
+
+        Args:
+            first: number of the first learner, by which they are named.
+        """
+
+    def snapshot(self) -> TensorDict:
+        """Returns a copy of all that an update changes, batch [K]."""
+
+    def restore(self, snapshot: TensorDictBase) -> None:
+        """Puts a snapshot [K] back."""
+
+
+class SolverView:
+    """What a Proposer sees of Solvers: their performance and their answers on target levels.
+
+    The validation levels, on which performance is measured, and the probe levels, on which answers
+    are shown, are drawn anew for every cycle.
+
+    Args:
+        task: gives the target distribution, and evaluates Solvers on its levels.
+        validation_levels: number E of levels that performance is measured on.
+        probe_levels: number C of levels whose answers are shown; at most E.
+
+    Raises:
+        ValueError: if a size is out of range.
+    """
+
+    def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
+        if validation_levels < 1 or not 0 <= probe_levels <= validation_levels:
+            raise ValueError(
+                f"probe_levels={probe_levels} must be at least 0 and at most validation_levels="
+                f"{validation_levels}: the Proposer is shown no more than it is rewarded for"
+            )
+        self.task = task
+        self.validation_levels = validation_levels
+        self.probe_levels = probe_levels
+        self.draw_levels(Streams(0))
+
+    def draw_levels(self, streams: Streams) -> None:
+        """Draws the validation and probe levels of a cycle from its random streams."""
+        self.streams = streams
+        target = self.task.target
+        self.validation = target.sample(self.validation_levels, streams.generator("validation"))
+        self.probes = target.sample(self.probe_levels, streams.generator("probes"))
+
+    @torch.no_grad()
+    def performance(self, agent: ActorCritic, *place: int) -> TensorDictBase:
+        """Returns what K Solvers reach on the validation levels, a tensordict [K, E].
+
+        A task that evaluates by playing draws from a stream of its own for every ``place``, the
+        numbers that tell the evaluations of a cycle apart.
+        """
+        generator = self.streams.generator("evaluation", *place)
+        return self.task.performance(agent, self.validation, generator)
+
+    @torch.no_grad()
+    def probe(self, agent: ActorCritic) -> Tensor:
+        """Returns the answers of K Solvers on the probe levels, float [K, C, ...]."""
+        return self.task.probe(agent, self.probes)
+
+    def observation(
+        self, performance: TensorDictBase, probes: Tensor, progress: float
+    ) -> TensorDict:
+        """Returns the Proposer's observation of K Solvers.
+
+        Args:
+            performance: on the validation levels, [K, E].
+            probes: float [K, C, ...].
+            progress: the part of the meta-episode that is over, in [0, 1].
+
+        Returns:
+            A tensordict [K] of ``probes`` float [K, C, ...], and of numbers float [K, 1]: the
+            means over the validation levels of ``return`` and, where the task has a success, of
+            ``log_success``; ``progress``.
+        """
+        numbers = {"return": mean_return(performance)}
+        if "success" in performance.keys():
+            numbers["log_success"] = mean_log_success(performance)
+        numbers["progress"] = torch.full_like(numbers["return"], progress)
+        columns = {name: number.unsqueeze(-1) for name, number in numbers.items()}  # [K, 1]
+        return TensorDict({"probes": probes, **columns}, probes.shape[:1], device=self.task.device)
+
+    def observe(self, agent: ActorCritic, progress: float, *place: int) -> TensorDict:
+        """Evaluates K Solvers, and returns their :meth:`observation`."""
+        return self.observation(self.performance(agent, *place), self.probe(agent), progress)
 
 
 @signed
 class SolverTrainingEnv(EnvBase):
-    """Training K Solvers as a batch of K episodes (section 5 of the paper).
+    """An environment in which K Solvers train as a batch of K episodes (the paper's section 5).
 
-    An action says what the P levels of an update are to be; the step generates them, trains each
-    Solver on its own, and observes it. An episode is ``meta_episode_length`` updates of Solvers
-    that all start as the one given to :meth:`fork`. Nothing here knows what a level is.
+    An action says which P levels the Solvers train on. A step generates those levels, updates each
+    Solver on its own ones, and observes it. An episode is ``meta_episode_length`` updates of
+    Solvers that all start as the one given to :meth:`fork`. Nothing here knows what a level is.
 
     An action may be repeated for several updates, each on fresh levels. The episode then has fewer
-    steps, the Solvers are evaluated only between them, and what an action led to is more easily
+    steps, the Solvers are evaluated only between them, and the effect of an action is more easily
     told from chance.
 
-    Observations: those of :meth:`~proposer_rl.meta.view.SolverView.observation`, and ``proposed``
-    int64 [K, N], how often each bin was drawn in the step before. Actions: ``action``, as
-    ``actions`` defines them. Episodes end by ``terminated``.
+    Observations: those of :meth:`SolverView.observation`, and ``proposed`` int64 [K, N], how often
+    each bin was drawn in the step before. Actions: ``action``, as ``actions`` defines them.
+    Episodes end by ``terminated``.
 
     Args:
-        solvers: K of them; see :class:`~proposer_rl.meta.learner.Learner`.
+        solvers: the K Solvers, which train side by side.
         view: what is seen of the Solvers, and the validation levels that the gain is measured on.
-        actions: the levels that an action stands for.
-        reward: of an update; that of a step is the sum over its updates.
+        actions: from actions to levels.
+        reward: from an update to a number for each Solver; a step's is the sum over its updates.
         meta_episode_length: updates L of an episode.
         action_repeat: updates for which an action holds; divides L.
-        first_copy: number of the first of these Solvers, where others are trained elsewhere: a
-            copy's random numbers belong to its number.
+        first_replica: number of the first of these Solvers, where others are trained elsewhere: a
+            replica's random numbers belong to its number.
         on_update: called after every update with the number of those that the episode has had,
             e.g. by a progress bar; what it raises ends the episode.
 
     Attributes:
-        last_training: levels [K, P] of the last update, and what came of it.
+        last_training: levels [K, P] of the last update, and its rollout and metrics.
 
     Raises:
-        ValueError: if the Solvers are no population, or a length is out of range.
+        ValueError: if the Solvers are no population, or ``action_repeat`` does not divide L.
         ArgumentError: in a step, if the reward is not one number for each Solver.
     """
 
@@ -65,7 +185,7 @@ class SolverTrainingEnv(EnvBase):
         reward: Reward,
         meta_episode_length: int,
         action_repeat: int = 1,
-        first_copy: int = 0,
+        first_replica: int = 0,
         on_update: Callable[[int], None] | None = None,
     ) -> None:
         if solvers.copies is None:
@@ -75,8 +195,8 @@ class SolverTrainingEnv(EnvBase):
                 f"action_repeat={action_repeat} must divide "
                 f"meta_episode_length={meta_episode_length}"
             )
-        self._copies = range(first_copy, first_copy + solvers.copies)
-        super().__init__(device=solvers.env.device, batch_size=[len(self._copies)])
+        self._replicas = range(first_replica, first_replica + solvers.copies)
+        super().__init__(device=solvers.env.device, batch_size=[len(self._replicas)])
         self.solvers = solvers
         self.view = view
         self.actions = actions
@@ -89,29 +209,29 @@ class SolverTrainingEnv(EnvBase):
 
     @property
     def steps(self) -> int:
-        """Steps, that is actions, of an episode."""
+        """Returns the number of steps, that is of actions, of an episode."""
         return self.meta_episode_length // self.action_repeat
 
     @property
     def batch_of_levels(self) -> int:
-        """Levels P of an update."""
+        """Returns the number P of levels of an update."""
         return int(self.solvers.env.batch_size[1:].numel())
 
     @property
     def frames_per_update(self) -> int:
-        """Environment steps of one Solver's update."""
+        """Returns the number of environment steps of one Solver's update."""
         return self.batch_of_levels * self.solvers.horizon
 
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
-        """Start the next episodes from copies of one Solver, on new validation and probe levels.
+        """Lets the next episodes start from one Solver, on new validation and probe levels.
 
         Args:
-            solver: a snapshot of one Solver, batch [] (weights and Adam's state).
-            streams: where the randomness of the levels and of the Solvers' actions comes from.
+            solver: a snapshot of it, batch [] (weights and Adam's state).
+            streams: random streams of the levels and of the Solvers' actions.
         """
         self.streams = streams
         self.view.draw_levels(streams)
-        self._origin = solver.expand(len(self._copies))
+        self._origin = solver.expand(len(self._replicas))
         self.solvers.restore(self._origin)
         self._episode = -1
         self._updates = 0
@@ -132,17 +252,19 @@ class SolverTrainingEnv(EnvBase):
         rewards, choices = [], []
         for update in range(self.action_repeat):
             last = update == self.action_repeat - 1
-            reward, drawn = self._train(tensordict["action"], measure=last)
+            reward, chosen = self._train(tensordict["action"], measure=last)
             rewards.append(reward)
-            choices.append(drawn)
+            choices.append(chosen)
             self.on_update(self._updates)
-        proposed = _count(torch.cat(choices, -1), self.actions.bins).to(self.device)
+        drawn = torch.cat(choices, -1)  # [K, updates * P]
+        counts = drawn.new_zeros(*self.batch_size, self.actions.bins)  # [K, N]
+        proposed = counts.scatter_add_(1, drawn, torch.ones_like(drawn)).to(self.device)
         state = self._observation(*self._seen, proposed)
         return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))
 
     def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
-        """One update of every Solver: its reward [K], and the bins that were drawn [K, P]."""
-        streams = [self.streams.within(self._episode, self._updates, k) for k in self._copies]
+        """Updates every Solver; returns the rewards [K], and the bins that were drawn [K, P]."""
+        streams = [self.streams.within(self._episode, self._updates, k) for k in self._replicas]
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)
         generators = [stream.generator("actions") for stream in streams]
@@ -150,7 +272,7 @@ class SolverTrainingEnv(EnvBase):
         place = f"update {self._updates} of the episode of the Solver's copies"
         with torch.enable_grad(), located(place):
             update = self.solvers.update(generators)
-            self.solvers.check(self._copies.start)
+            self.solvers.check(self._replicas.start)
         self.last_training = (levels, update)
         self._updates += 1
         before, _ = self._seen
@@ -185,18 +307,12 @@ class SolverTrainingEnv(EnvBase):
         state = self._reset()
         self.observation_spec = make_composite_from_td(state.exclude(*flags))
         self.action_spec = self.actions.spec(self.batch_size[0], self.batch_of_levels, self.device)
-        told = state["return"]
-        self.reward_spec = Unbounded(told.shape, dtype=told.dtype, device=self.device)
+        like = state["return"]
+        self.reward_spec = Unbounded(like.shape, dtype=like.dtype, device=self.device)
         flag = Categorical(2, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         self.done_spec = Composite({key: flag.clone() for key in flags}, shape=self.batch_size)
 
 
-def action_generators(streams: Streams, copies: range) -> list[torch.Generator]:
-    """Of the Proposer's actions on copies of a cycle, each of which has its number."""
-    return [streams.generator("proposals", copy) for copy in copies]
-
-
-def _count(choices: Tensor, size: int) -> Tensor:
-    """How often each of ``size`` bins occurs along the last dimension, int64 [K, size]."""
-    counts = choices.new_zeros(choices.shape[0], size)
-    return counts.scatter_add_(1, choices, torch.ones_like(choices))
+def action_generators(streams: Streams, replicas: range) -> list[torch.Generator]:
+    """Returns the generator of the Proposer's actions on each of these replicas of a cycle."""
+    return [streams.generator("proposals", replica) for replica in replicas]

@@ -1,4 +1,4 @@
-"""First-order performance gain: what levels bring a Solver, without training replicas of it.
+"""What training on a level would do to a Solver, from gradients: no replica of it is trained.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 
@@ -28,15 +28,21 @@ the derivative (docs/explanation/first_order.md compares them).
 
 Relatives: gradients of training examples aligned with those of a validation set: TracIn (Pruthi et
 al. 2020, arXiv 2002.08484), example weights (Ren et al. 2018, arXiv 1803.09050); in curricula the
-mean gain over evaluation levels: SHED (arXiv 2310.00301), the norm |d|^2 without a direction: PACE
-(arXiv 2605.01358).
+mean gain over evaluation levels: SHED (arXiv 2310.00301).
+
+Without a target, :class:`LevelGradients` tells how much training on one level alone would change a
+Solver: |grad J_p(theta)|^2. It is zero where training would change nothing: on a level that the
+policy cannot fail, and on one that it cannot solve. PACE (arXiv 2605.01358) scores a level with
+|d|^2. Here it is the gradient of the return: no critic's loss is in it, no standardised advantages
+and no clipped norm, which hide how long it is, and it is not Adam's step, whose first one has a
+length of about rate * sqrt(number of parameters) whatever the gradient.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -44,40 +50,47 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import PPO, DivergedError
+from proposer_rl.learning import PPO, DivergedError, agent_values
 from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
-from proposer_rl.task import DifferentiableTask, Levels
+from proposer_rl.streams import Streams
+from proposer_rl.task import DifferentiableTask, Levels, Task
 
 SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 
 Direction = Mapping[str, Tensor]
-"""By the parameters' names, [K, ...]: a direction in which K Solvers can be moved."""
+"""A direction in which the parameters of K Solvers can be moved: by their names, [K, ...]."""
 
-Measure = Literal["log_success", "return"]
+TargetMeasure = Literal["log_success", "return"]
+
+LEVELS_AT_ONCE = 16
+"""Levels of :class:`LevelGradients`: as many networks, gradients and activations are in memory."""
+
+LevelValue = Callable[[ActorCritic, int, Tensor], Tensor]
+"""From m agents, a Solver's number k and places of m of its levels, int64 [m], to float [m]."""
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
-    """R of K Solvers from their performance on levels [K, E] of the target: float [K].
+    """Returns R of K Solvers, float [K], from their performance on levels [K, E] of the target.
 
     Args:
         performance: with ``return`` or ``success``, and gradients.
-        measure: ``"log_success"``, the mean of log(success + 0.001), which tells something from the
-            first update on, or ``"return"``.
+        measure: ``"log_success"``, the mean of log(success + 0.001), which differs between Solvers
+            from the first update on, or ``"return"``.
 
     Raises:
         DivergedError: if a Solver's success is exactly 0 on every level: then nothing points
             towards more of it.
-        NoSuccessError: if the task tells no success.
+        NoSuccessError: if the task has no success.
         ValueError: for another measure.
     """
     if measure == "return":
         return mean_return(performance)
-    if measure not in get_args(Measure):
-        known = " or ".join(get_args(Measure))
+    if measure not in get_args(TargetMeasure):
+        known = " or ".join(get_args(TargetMeasure))
         raise ValueError(f"measure={measure!r}: must be {known}")
     mean, success = mean_log_success(performance), performance["success"]
-    _refuse(
+    _require_none(
         (success <= 0).all(1),
         f"the probability of success is exactly 0 on each of {success.shape[1]} levels of the "
         "target, so that nothing points towards it; measure=return may",
@@ -86,7 +99,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
 
 
 def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
-    """The target direction of K Solvers, each scaled to a root mean square of 1.
+    """Returns the target direction of K Solvers, each scaled to a root mean square of 1.
 
     Args:
         learner: whose agent the performance is of.
@@ -97,14 +110,14 @@ def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
         DivergedError: if the gradient of a Solver is zero, or not finite.
     """
     direction = in_adams_units(learner, performance)
-    _refuse(root_mean_square(direction) == 0, "the target direction is zero")
+    _require_none(root_mean_square(direction) == 0, "the target direction is zero")
     return scaled(direction)
 
 
 def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
-    """The gradient of a performance, each parameter's divided by what Adam divides its step by.
+    """Returns the gradient of a performance, divided by what Adam divides its step by.
 
-    Before Adam's first step, when there is no second moment, it is the gradient itself.
+    Before Adam's first step there is no second moment, and nothing is divided.
 
     Args:
         learner: whose agent the performance is of, and whose Adam says how steps are scaled.
@@ -125,42 +138,42 @@ def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
 
 
 def trainable(agent: nn.Module) -> dict[str, nn.Parameter]:
-    """The parameters of an agent by their names, without those that are frozen."""
+    """Returns the parameters of an agent by their names, without those that are frozen."""
     return {name: p for name, p in agent.named_parameters() if p.requires_grad}
 
 
 def scaled(direction: Direction) -> dict[str, Tensor]:
-    """A direction of K Solvers, each brought to a root mean square of 1; what is zero stays.
+    """Returns a direction of K Solvers, each scaled to a root mean square of 1; zero stays zero.
 
     Raises:
         DivergedError: if that of a Solver is not finite.
     """
     size = root_mean_square(direction)
-    _refuse(~size.isfinite(), "the target direction is not finite")
+    _require_none(~size.isfinite(), "the target direction is not finite")
     size = torch.where(size > 0, size, torch.ones_like(size))
     return {name: entry / expand_as_right(size, entry) for name, entry in direction.items()}
 
 
-def _refuse(wrong: Tensor, why: str) -> None:
-    """Raise :class:`DivergedError` if anything is wrong with a Solver, bool [K]."""
+def _require_none(wrong: Tensor, why: str) -> None:
+    """Raises a DivergedError that names the Solvers with which something is wrong, bool [K]."""
     if bool(wrong.any()):
         which = ", ".join(map(str, torch.nonzero(wrong).flatten().tolist()))
         raise DivergedError(f"copy {which}: {why}")
 
 
 def squared_length(direction: Direction) -> Tensor:
-    """Sum of squares over all the parameters of each Solver: float [K]."""
+    """Returns the sum of squares over all parameters of each Solver, float [K]."""
     return torch.stack([entry.square().flatten(1).sum(1) for entry in direction.values()]).sum(0)
 
 
 def root_mean_square(direction: Direction) -> Tensor:
-    """Over all the parameters of each Solver: float [K]."""
+    """Returns the root mean square over all parameters of each Solver, float [K]."""
     return (squared_length(direction) / sum(e[0].numel() for e in direction.values())).sqrt()
 
 
 @contextmanager
-def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[None]:
-    """K Solvers that stand ``step`` along a direction; afterwards they are bit by bit as before."""
+def moved_along(agent: ActorCritic, direction: Direction, step: float) -> Iterator[None]:
+    """Moves K Solvers by ``step`` along a direction; afterwards they are bit by bit as before."""
     parameters = trainable(agent)
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
     try:
@@ -178,17 +191,17 @@ def moved(agent: ActorCritic, direction: Direction, step: float) -> Iterator[Non
 def alignment(
     agent: ActorCritic, direction: Direction, step: float, gained: Callable[[], Tensor]
 ) -> Tensor:
-    """The slope along a direction of what K Solvers get, by a central difference.
+    """Returns the slope along a direction of what K Solvers get, by a central difference.
 
-    Two forward passes do on any kind of network, also where neither forward-mode nor second
+    Two forward passes suffice on any kind of network, also where neither forward-mode nor second
     derivatives exist.
 
     Args:
         agent: the Solvers.
         direction: as :func:`target_direction` makes it.
         step: of the difference, such as the learning rate.
-        gained: what the agent gets as it stands, such as the exact return of levels, or
-            :func:`surrogate`: float [K, E].
+        gained: returns what the agent gets as it stands, float [K, E], such as the exact return of
+            levels, or :func:`surrogate`.
 
     Returns:
         float [K, E].
@@ -203,9 +216,9 @@ def alignment(
         >>> alignment(linear, {"module.weight": torch.ones(1, 1)}, 0.5, lambda: w.square())
         tensor([[6.]])
     """
-    with moved(agent, direction, step):
+    with moved_along(agent, direction, step):
         ahead = gained()
-    with moved(agent, direction, -step):
+    with moved_along(agent, direction, -step):
         behind = gained()
     return (ahead - behind) / (2 * step)
 
@@ -213,10 +226,10 @@ def alignment(
 def exact_direction(
     task: DifferentiableTask, learner: PPO, levels: Levels, measure: str
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Performance R of K Solvers on levels [K, E] of the target, float [K], and its direction.
+    """Returns R of K Solvers on levels [K, E] of the target, float [K], and their directions.
 
     Raises:
-        DivergedError: as :func:`target_performance` and :func:`target_direction`.
+        DivergedError: where :func:`target_performance` or :func:`target_direction` does.
     """
     with torch.enable_grad():
         performance = task.differentiable_performance(learner.agent, levels)
@@ -227,7 +240,7 @@ def exact_direction(
 def exact_alignment(
     task: DifferentiableTask, learner: PPO, direction: Direction, levels: Levels, step: float = 1.0
 ) -> Tensor:
-    """Alignment of levels [K, E], by differences of ``step`` learning rates: float [K, E]."""
+    """Returns the alignment of levels [K, E] by differences of ``step`` learning rates, [K, E]."""
     return alignment(
         learner.agent,
         direction,
@@ -237,12 +250,12 @@ def exact_alignment(
 
 
 def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
-    """Mean over the steps of each problem of A_t log pi(a_t | s_t): float [K, P].
+    """Returns the mean over the steps of each problem of A_t log pi(a_t | s_t), float [K, P].
 
     Its gradient is the policy gradient of each problem; the mean over problems is the batch's.
 
     Args:
-        agent: the Solvers, where gradients are enabled with gradients.
+        agent: the Solvers.
         rollout: what they played, [K, P, T].
         advantage: of every step, float [K, P, T].
     """
@@ -250,10 +263,10 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
 
 
 def over_steps(values: Tensor, rollout: TensorDictBase) -> Tensor:
-    """Mean over the steps of each problem, float [K, P], of values [K, P, T].
+    """Returns the mean over the steps of each problem, float [K, P], of values [K, P, T].
 
-    Episodes of several lengths are filled up to one rollout; its ``is_step``, bool [K, P, T], says
-    what is played. Without it all is.
+    Episodes of several lengths are filled up to one length; ``is_step`` of the rollout, bool
+    [K, P, T], says which steps were played. Without it all were.
     """
     if "is_step" not in rollout.keys():
         return values.mean(-1)
@@ -262,7 +275,7 @@ def over_steps(values: Tensor, rollout: TensorDictBase) -> Tensor:
 
 
 def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
-    """Log pi(a_t | s_t) of what K Solvers played, rollout [K, P, T]: float [K, P, T]."""
+    """Returns log pi(a_t | s_t) of K Solvers for each step of a rollout [K, P, T]."""
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
     with set_recurrent_mode(True):
         steps = agent.decode(rollout.select(*agent.step_keys), context)
@@ -272,15 +285,95 @@ def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
 
 
 def bin_scores(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Score of each bin, and its standard error, from its candidates' alignments.
+    """Returns the mean of each bin's alignments and its standard error, float [K, N] each.
 
     Args:
-        values: float [K, N, C] of C candidates of each of N bins.
-
-    Returns:
-        The means and their standard errors, float [K, N]; of one candidate the error is infinite.
+        values: alignments of C candidates of each of N bins, float [K, N, C]. The standard error of
+            a single one is infinite.
     """
     count = values.shape[-1]
     if count < 2:
         return values.mean(-1), torch.full_like(values[..., 0], torch.inf)
     return values.mean(-1), values.std(-1) / count**0.5
+
+
+class LevelGradients:
+    """Computes squared lengths of the gradients of single levels, many in one backward pass.
+
+    A population of :data:`LEVELS_AT_ONCE` networks gets the weights of the Solver whose levels are
+    scored, and each network a level of its own. So the sum of their values, differentiated once,
+    gives each the gradient of its level.
+
+    Args:
+        task: whose learners' levels are scored; the learners are left as they are.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._agent = task, task.learner([Streams(0)] * LEVELS_AT_ONCE).agent
+
+    def of_returns(self, learner: PPO, levels: Levels) -> Tensor:
+        """Returns |grad|^2 of the exact return of levels, of a differentiable task.
+
+        Args:
+            learner: of K Solvers.
+            levels: [K, n], each to be scored for its Solver.
+
+        Returns:
+            float [K, n], without gradients.
+        """
+        task = cast(DifferentiableTask, self._task)
+
+        def returns(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            some = levels[solver, which].unsqueeze(-1)
+            return task.differentiable_performance(agent, some)["return"].squeeze(-1)
+
+        return self.lengths(learner, returns, *levels.batch_size)
+
+    def of_rollouts(self, learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
+        """Returns |grad|^2 of the :func:`surrogate` of levels, from episodes on them.
+
+        An estimate of a gradient is longer than the gradient by its noise: short rollouts score
+        higher than the exact gradient, by the estimate's variance.
+
+        Args:
+            learner: of K Solvers.
+            rollout: what they played, [K, n, T].
+            advantage: float [K, n, T].
+
+        Returns:
+            float [K, n], without gradients.
+        """
+
+        def gained(agent: ActorCritic, solver: int, which: Tensor) -> Tensor:
+            steps = rollout[solver][which].unsqueeze(1)  # [m, 1, T]
+            return surrogate(agent, steps, advantage[solver, which].unsqueeze(1)).squeeze(-1)
+
+        return self.lengths(learner, gained, *rollout.batch_size[:2])
+
+    def lengths(self, learner: PPO, value: LevelValue, solvers: int, count: int) -> Tensor:
+        """Returns |grad|^2 of any value of a level, for K Solvers with n levels each, [K, n]."""
+        parameters = trainable(self._agent)
+        parts = []
+        for solver in range(solvers):
+            self._become(learner, solver)
+            for start in range(0, count, LEVELS_AT_ONCE):
+                # Filled up with the last one.
+                which = torch.arange(
+                    start, start + LEVELS_AT_ONCE, device=self._task.device
+                ).clamp_(max=count - 1)
+                with torch.enable_grad():
+                    gradients = torch.autograd.grad(
+                        value(self._agent, solver, which).sum(),
+                        list(parameters.values()),
+                        allow_unused=True,
+                        materialize_grads=True,
+                    )
+                named = dict(zip(parameters, gradients, strict=True))
+                parts.append(squared_length(named)[: count - start])
+        return torch.cat(parts).unflatten(0, (solvers, count))
+
+    @torch.no_grad()
+    def _become(self, learner: PPO, solver: int) -> None:
+        own = agent_values(self._agent)
+        for name, value in agent_values(learner.agent).items():
+            own[name].copy_(value[solver])

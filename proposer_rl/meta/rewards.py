@@ -13,11 +13,11 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.task import NoSuccessError
 
 LEAST_SUCCESS = 1e-3
-"""Below it, success hardly counts in :func:`log_success`."""
+"""A success rate that is small beside this hardly counts in :func:`log_success`."""
 
 
 class TrainingStep(NamedTuple):
-    """One PPO update of K Solvers, as a reward sees it.
+    """What a reward sees: one PPO update of K Solvers.
 
     Attributes:
         levels: what they trained on, batch [K, P].
@@ -40,7 +40,7 @@ Reward = Callable[[TrainingStep], Tensor]
 
 
 def performance_gain(step: TrainingStep) -> Tensor:
-    """How much the mean return on the validation levels went up: R(after) - R(before).
+    """Returns how much the mean return on the validation levels went up: R(after) - R(before).
 
     The paper's reward (its section on the method; docs/explanation/method.md).
 
@@ -57,39 +57,40 @@ def performance_gain(step: TrainingStep) -> Tensor:
 
 
 def log_success_gain(step: TrainingStep) -> Tensor:
-    """How much the mean of log(success + 0.001) on the validation levels went up.
+    """Returns how much the mean of log(success + 0.001) on the validation levels went up.
 
-    The default. A beginner's return on the target hardly moves, whatever it trains on: from one
-    success in five hundred to one in a hundred is a step of 0.008. Its logarithm moves by 1.6, and
-    shows what was due to the training.
+    This is the default. A beginner's return on the target hardly moves, whatever it trains on: from
+    one success in five hundred to one in a hundred is a step of 0.008. The logarithm of its success
+    moves by 1.6, and shows what was due to the training.
     """
     return mean_log_success(step.after) - mean_log_success(step.before)
 
 
 def task_difficulty(step: TrainingStep) -> Tensor:
-    """One minus the success rate on the levels just proposed (the paper's ablation).
+    """Returns one minus the success rate on the levels just proposed (the paper's ablation).
 
-    The rate is that of the Solver's own training episodes, the first on every level. Where episodes
-    go on from update to update, the first to end may have begun on a level of the update before.
+    It is the success rate of the Solver's own training episodes, the first on every level. Where
+    episodes go on from update to update, the first to end may have begun on a level of the update
+    before.
     """
     return 1.0 - first_episode_success(step.rollout).float().mean(1)
 
 
 def mean_return(performance: TensorDictBase) -> Tensor:
-    """Mean return over levels, float [K] from [K, E]."""
+    """Returns the mean return over levels, float [K] from [K, E]."""
     return performance["return"].mean(1)
 
 
 def mean_log_success(performance: TensorDictBase) -> Tensor:
-    """Mean of :func:`log_success` over levels, float [K] from [K, E]."""
+    """Returns the mean of :func:`log_success` over levels, float [K] from [K, E]."""
     return log_success(performance).mean(1)
 
 
 def log_success(performance: TensorDictBase) -> Tensor:
-    """log(success + 0.001) of every level, float [*B].
+    """Returns log(success + 0.001) of every level, float [*B].
 
     Raises:
-        NoSuccessError: if the task tells no success.
+        NoSuccessError: if the task has no success, only a return.
     """
     if "success" not in performance.keys():
         raise NoSuccessError(

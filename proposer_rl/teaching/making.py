@@ -10,7 +10,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, filtered, modelled
 from proposer_rl.recipes import Recipe, file_content, filter_content, recipe_function, yaml_file
 from proposer_rl.settings import ArgumentError, arguments

@@ -30,7 +30,7 @@ from proposer_rl.curricula import (
     TransportCurriculum,
 )
 from proposer_rl.learning import PPOSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (
     ActorCritic,

@@ -7,7 +7,7 @@ import torch
 
 from proposer_rl import methods
 from proposer_rl.learning import PPOSettings, SolverSettings
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams

@@ -17,7 +17,7 @@ from proposer_rl.curricula.transport import (
     interim_target,
     step_towards,
 )
-from proposer_rl.meta.settings import ProposerSettings
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, currot
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams

@@ -11,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.actions import Mixture, ProblemChoices
-from proposer_rl.meta.env import SolverTrainingEnv
+from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import (
     Reward,
     TrainingStep,
@@ -19,7 +19,6 @@ from proposer_rl.meta.rewards import (
     performance_gain,
     task_difficulty,
 )
-from proposer_rl.meta.view import SolverView
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
@@ -263,7 +262,7 @@ def test_progress_runs_from_zero_to_one() -> None:
 
 def test_a_share_of_the_copies_is_those_copies() -> None:
     """As in a worker, whose environment has copies 1 and 2 only."""
-    whole, share = meta_env(), meta_env(first_copy=1)
+    whole, share = meta_env(), meta_env(first_replica=1)
     every, last = played(whole), played(share)
     shifted = torch.cat([some_actions()[:, 1:], some_actions()[:, :1]], 1)
     share.fork(learners(1).snapshot()[0], Streams(4))
@@ -273,7 +272,7 @@ def test_a_share_of_the_copies_is_those_copies() -> None:
 
 
 def test_a_copy_that_diverges_has_its_number_among_all() -> None:
-    share = meta_env(first_copy=4)
+    share = meta_env(first_replica=4)
     first, second = some_actions()[:2]
     _, state = share.step_and_maybe_reset(share.reset().set("action", first))
     next(share.solvers.agent.parameters()).data[1] = torch.nan

@@ -16,7 +16,7 @@ from proposer_rl.learning import PPO, DivergedError, PPOSettings, gae
 from proposer_rl.meta.first_order import (
     alignment,
     bin_scores,
-    moved,
+    moved_along,
     root_mean_square,
     surrogate,
     target_direction,
@@ -97,7 +97,7 @@ def central_differences(
             for change in (1e-6, -1e-6):
                 one = {n: torch.zeros_like(p) for n, p in agent.named_parameters()}
                 one[name].flatten(1)[:, i] = change
-                with torch.no_grad(), moved(agent, one, 1.0):
+                with torch.no_grad(), moved_along(agent, one, 1.0):
                     values.append(value())
             yield name, i, (values[0] - values[1]) / 2e-6
 
@@ -177,7 +177,7 @@ def test_an_alignment_tells_what_a_small_step_changes() -> None:
     before = returns().detach()
     remainder = []
     for step in (1e-3, 1e-4):
-        with torch.no_grad(), moved(ppo.agent, direction, step):
+        with torch.no_grad(), moved_along(ppo.agent, direction, step):
             remainder.append((returns() - before - step * slope).abs().max())
     assert remainder[0] < 0.01 * (1e-3 * slope).abs().max()
     # Of second order: a tenth of the step leaves a hundredth of it.

@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import PPO
-from proposer_rl.meta import gradient_norms
-from proposer_rl.meta.gradient_norms import LevelGradients
+from proposer_rl.meta import first_order
+from proposer_rl.meta.first_order import LevelGradients
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level
@@ -58,7 +58,7 @@ def one_by_one(ppo: PPO, levels: Level) -> Tensor:
 def test_they_are_those_of_finite_differences(
     at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gradient_norms, "AT_ONCE", at_once)
+    monkeypatch.setattr(first_order, "LEVELS_AT_ONCE", at_once)
     ppo, levels = learner(some_levels(2, 1)), some_levels(2, 4)
     found = LevelGradients(Precise()).of_returns(ppo, levels)
     torch.testing.assert_close(found, numerical(ppo, levels), rtol=1e-6, atol=1e-12)

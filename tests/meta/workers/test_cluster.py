@@ -15,8 +15,8 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
+from proposer_rl.meta import workers as workers_module
 from proposer_rl.meta.workers import WorkersError, WorkerSettings
-from proposer_rl.meta.workers import engines as engines_module
 from tests.meta.workers.curricula import cycles, make
 from tests.meta.workers.test_workers import assert_near
 
@@ -65,9 +65,9 @@ def test_machines_that_are_too_small_are_told_at_once(cluster: Cluster) -> None:
 def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engines_module, "SECONDS_TO_SAY", 2.0)
-    monkeypatch.setattr(engines_module, "SECONDS_TO_START", 6.0)
-    begin = engines_module._wait_for_all
+    monkeypatch.setattr(workers_module, "SECONDS_TO_SAY", 2.0)
+    monkeypatch.setattr(workers_module, "SECONDS_TO_START", 6.0)
+    begin = workers_module._wait_for_all
     handler = signal(SIGTERM, lambda *_: None)
     ours = getsignal(SIGTERM)
 
@@ -76,7 +76,7 @@ def test_a_machine_that_is_lost_while_workers_begin_is_waited_for(
         cluster.remove_node(worker_machines(cluster)[-1])
         begin(collector, *arguments)
 
-    monkeypatch.setattr(engines_module, "_wait_for_all", lose_one_and_wait)
+    monkeypatch.setattr(workers_module, "_wait_for_all", lose_one_and_wait)
     try:
         with (
             pytest.warns(RuntimeWarning, match="workers=2 are waited for: the Ray cluster has 1"),

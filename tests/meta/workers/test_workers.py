@@ -15,9 +15,10 @@ import torch
 
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import DivergedError
+from proposer_rl.meta import replicas as replicas_module
+from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.rewards import Reward, TrainingStep, performance_gain
-from proposer_rl.meta.workers import WorkersError, shares
-from proposer_rl.meta.workers import copies as copies_module
+from proposer_rl.meta.workers import WorkersError
 from proposer_rl.streams import Streams
 from tests.meta.workers.curricula import COPIES, cycles, make, workers
 
@@ -66,12 +67,12 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
     fuse = tmp_path / "fuse"
     fuse.touch()
     task, curriculum = make(workers(engine), lethal(fuse))
-    copies: Any = curriculum.trainer.copies
+    replicas: Any = curriculum.trainer.replicas
     losses = iter([True, False])
 
     def kill_one_between_the_cycles() -> None:
         if engine == "multiprocess" and next(losses):
-            process = copies._collector.procs[1]
+            process = replicas._collector.procs[1]
             os.kill(process.pid, SIGKILL)
             process.join()
 
@@ -114,7 +115,7 @@ def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None
         started.append(1)
         raise RuntimeError("Traceback of the worker\nof many lines\nit fell off")
 
-    monkeypatch.setattr(copies_module, "start", start)
+    monkeypatch.setattr(replicas_module, "start", start)
     solver = task.learner([Streams(0, "solver")])
     with (
         pytest.warns(RuntimeWarning, match="lost .it fell off.; it is replaced"),

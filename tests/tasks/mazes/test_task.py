@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
+from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.meta.rewards import performance_gain, task_difficulty
-from proposer_rl.meta.settings import ProposerSettings
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import Population
 from proposer_rl.streams import Streams

@@ -1,4 +1,4 @@
-"""The collectors that start the workers: processes of this machine, or Ray's on any."""
+"""Starts and ends workers, by TorchRL's collectors: processes of this machine, or Ray's on any."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SECONDS_TO_CLOSE = 5.0
 SECONDS_TO_ANSWER = 60.0  # of a cluster
 SECONDS_TO_START = 300.0  # of workers, which others may keep from a cluster's processors
 SECONDS_TO_SAY = 20.0  # between two lines on what is waited for
-EVERY = 0.5  # seconds between two looks at whoever is waited for
+SECONDS_TO_POLL = 0.5  # between two looks at whoever is waited for
 
 
 class WorkersError(RuntimeError):
@@ -32,15 +32,15 @@ class WorkersError(RuntimeError):
 
 
 class WorkerSettings(NamedTuple):
-    """Where the replicas of the Solver are trained.
+    """Where the replicas of the Solver are trained, if not in this process.
 
     Attributes:
         engine: ``"multiprocess"``: processes of this machine, by TorchRL's
             :class:`~torchrl.collectors.MultiSyncCollector`; ``"ray"``: actors of a Ray cluster, by
             its :class:`~torchrl.collectors.distributed.RayCollector`.
         workers: their number.
-        devices: of the workers, in turn.
-        cores: of a processor, for each worker.
+        devices: torch's names, one for each worker in turn.
+        cores: how many of a processor each worker may use.
         ray_address: of a running cluster; None to start one on this machine.
     """
 
@@ -59,10 +59,15 @@ def start(
     check: Callable[[], None],
     patient: bool,
 ) -> BaseCollector:
-    """Start the workers, each of which collects so many frames in a batch.
+    """Starts the workers, and returns the collector that gives them orders.
 
-    Their factories can be pickled. While they are waited for there is a ``check``, which may raise;
-    the ``patient`` also wait for machines that are missing, as after one was lost.
+    Args:
+        settings: how many workers there are, and where.
+        environments: their factories, one for each worker; they can be pickled.
+        policies: likewise.
+        frames: how many of them a worker collects in a batch.
+        check: called again and again while workers are waited for; may raise.
+        patient: whether to wait for machines that are missing, as after one was lost.
 
     Raises:
         WorkersError: if there is no such cluster, it is too small, or its workers do not come up.
@@ -111,7 +116,7 @@ def start(
 
 
 def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
-    """What is raised where a worker is lost."""
+    """Returns the errors that a collector raises where a worker is lost."""
     if settings.engine != "ray":
         return LOST
     from ray.exceptions import RayError
@@ -120,7 +125,7 @@ def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
 
 
 def stop(collector: BaseCollector) -> None:
-    """End the workers, whatever state they are in, and with Ray's the connection to its cluster."""
+    """Ends the workers, whatever state they are in; of Ray's also the connection to the cluster."""
     with quiet(), suppress(Exception):  # of a collector whose workers are gone
         collector.shutdown(timeout=SECONDS_TO_CLOSE)
     if not isinstance(collector, MultiSyncCollector):
@@ -134,7 +139,7 @@ def stop(collector: BaseCollector) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Put back the number of threads, which TorchRL's collectors change, and hide two warnings.
+    """Puts back the number of threads, which TorchRL's collectors change; hides two warnings.
 
     Both say that a worker's policy gets no weights: they come with every order.
     """
@@ -151,7 +156,7 @@ def quiet() -> Iterator[None]:
 def _cluster_share(
     settings: WorkerSettings, check: Callable[[], None], patient: bool
 ) -> dict[str, Any]:
-    """Connect to the cluster, or start one, and say what of it a worker reserves.
+    """Connects to the cluster, or starts one; returns what of it a worker reserves.
 
     Raises:
         WorkersError: if it does not answer, or does not have as much.
@@ -188,7 +193,7 @@ def _cluster_share(
 
 
 def _short_of(share: dict[str, Any], workers: int) -> str | None:
-    """Why the cluster's machines have no place for so many workers; None where they have."""
+    """Returns why the cluster's machines have no room for the workers; None where they have."""
     import ray
 
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -209,14 +214,14 @@ def _short_of(share: dict[str, Any], workers: int) -> str | None:
 
 
 def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], None]) -> None:
-    """Wait until every worker has begun."""
+    """Waits until every worker has begun."""
     import ray
 
     workers = settings.workers
     begun = [one.get_distant_attr.remote("worker_idx") for one in collector.remote_collectors]
 
     def missing() -> str | None:
-        ready, waiting = ray.wait(begun, num_returns=workers, timeout=EVERY)
+        ready, waiting = ray.wait(begun, num_returns=workers, timeout=SECONDS_TO_POLL)
         ray.get(ready)  # raises what has kept a worker from beginning
         free = ray.available_resources().get("CPU", 0)
         if not waiting:
@@ -229,10 +234,10 @@ def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], 
 def _wait(
     reason: Callable[[], str | None], workers: int, limit: float, check: Callable[[], None]
 ) -> None:
-    """Wait until there is no reason to any more, and say so where it takes long.
+    """Waits until a function returns no reason to wait; warns of the reason where it takes long.
 
     Raises:
-        WorkersError: with the reason, where there still is one after so many seconds.
+        WorkersError: with the reason, where there still is one after ``limit`` seconds.
     """
     began = said = time.monotonic()
     while (why := reason()) is not None:
@@ -243,11 +248,11 @@ def _wait(
             said = now
             warnings.warn(f"workers={workers} are waited for: {why}", RuntimeWarning, stacklevel=2)
         check()
-        time.sleep(EVERY)
+        time.sleep(SECONDS_TO_POLL)
 
 
 def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
-    """Begin with Ray in another thread, which lives as long as the connection.
+    """Connects to a Ray cluster in another thread, which lives as long as the connection.
 
     Ray puts handlers of its own in the place of those that save before the process ends, but only
     in the main thread; and it goes on asking for a cluster for minutes. Linux ends the processes of
@@ -267,13 +272,13 @@ def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
         except BaseException as error:
             came.set_exception(error)
         while ray.is_initialized():
-            time.sleep(EVERY)
+            time.sleep(SECONDS_TO_POLL)
 
     threading.Thread(target=live, daemon=True).start()
     until = time.monotonic() + SECONDS_TO_ANSWER
     while True:
         with suppress(TimeoutError):
-            came.result(timeout=EVERY)
+            came.result(timeout=SECONDS_TO_POLL)
             return
         check()
         if time.monotonic() > until:
@@ -281,7 +286,7 @@ def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
 
 
 def _knock(address: str) -> None:
-    """Find out at once that nobody is there."""
+    """Raises a WorkersError at once if nothing answers at the address of a cluster."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         return  # a name that Ray itself resolves, such as auto

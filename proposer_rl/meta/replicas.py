@@ -1,0 +1,321 @@
+"""The K replicas of a cycle: in this process, or in workers by TorchRL's collectors.
+
+A worker, on this machine or another, holds and trains its own share of the replicas. Every random
+number belongs to a replica's number, so that its results are the same wherever it is computed, but
+for rounding.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import partial
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import BaseCollector
+
+from proposer_rl.learning import PPO, DivergedError, RolloutPolicy, Update
+from proposer_rl.meta.assembly import ProposerSettings, meta_env
+from proposer_rl.meta.env import SolverTrainingEnv, action_generators
+from proposer_rl.meta.rewards import Reward
+from proposer_rl.meta.workers import WorkersError, WorkerSettings, lost, quiet, start, stop
+from proposer_rl.models import ActorCritic, uniform_noise, use_device
+from proposer_rl.settings import ArgumentError
+from proposer_rl.streams import Streams
+from proposer_rl.task import Task
+
+
+class TrainedReplica(NamedTuple):
+    """One replica at the end of its episode.
+
+    Attributes:
+        solver: its snapshot, batch [1].
+        levels: those of its last update, [1, P].
+        update: the rollout [1, P, T] and the metrics [1] of its last update.
+    """
+
+    solver: TensorDictBase
+    levels: Any
+    update: Update
+
+    def to(self, device: torch.device | str) -> TrainedReplica:
+        """Returns it on another device."""
+        rollout, metrics = self.update
+        update = Update(rollout.to(device), metrics.to(device))
+        return TrainedReplica(self.solver.to(device), self.levels.to(device), update)
+
+
+def taken_out(env: SolverTrainingEnv, index: int) -> TrainedReplica:
+    """Returns one of an environment's Solvers as its last update has left it."""
+    own, (levels, (rollout, metrics)) = slice(index, index + 1), env.last_training
+    update = Update(rollout[own], metrics[own])
+    return TrainedReplica(env.solvers.snapshot()[own], levels[own], update)
+
+
+class Replicas:
+    """Trains K replicas of the Solver while the Proposer acts on them, all in this process.
+
+    Args:
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv`.
+    """
+
+    def __init__(self, proposer: PPO) -> None:
+        self._proposer = proposer
+        self._env: SolverTrainingEnv = proposer.env
+
+    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
+        """Trains K replicas of a Solver for one episode.
+
+        Args:
+            solver: a snapshot of it, batch [].
+            streams: of the cycle.
+
+        Returns:
+            The Proposer's rollout, [K, T], complete for
+            :meth:`~proposer_rl.learning.ppo.PPO.optimise`.
+        """
+        self._env.fork(solver, streams)
+        replicas = range(self._env.batch_size[0])
+        return self._proposer.collect(action_generators(streams, replicas))
+
+    def trained(self, replica: int) -> TrainedReplica:
+        """Returns the replica of this number as the last episode has left it."""
+        return taken_out(self._env, replica)
+
+    def close(self) -> None:
+        """Ends all processes that it has started; a further episode starts others."""
+
+
+ATTEMPTS = 3
+
+
+class ReplicasInWorkers(Replicas):
+    """Trains the replicas in workers, other processes that have a share of them each.
+
+    Where a worker is lost, all are started anew and the episode is repeated, with the same numbers.
+
+    Args:
+        proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` of all
+            replicas; it is used for all but the replicas' training.
+        make_env: makes a worker's environment, given its ``share`` of the replicas, ``device`` and
+            number of ``threads``, such as :func:`worker_env`; can be pickled.
+        settings: how many workers there are, and where.
+
+    Raises:
+        ValueError: for more workers than replicas.
+    """
+
+    def __init__(
+        self,
+        proposer: PPO,
+        make_env: Callable[..., SolverTrainingEnv],
+        settings: WorkerSettings,
+    ) -> None:
+        super().__init__(proposer)
+        self._make_env = make_env
+        self._settings = settings
+        self._shares = shares(self._env.batch_size[0], settings.workers)
+        # Of each replica its place, [K], among those of all workers: in the first that has it.
+        every = [replica for share in self._shares for replica in share]
+        self._first = [every.index(replica) for replica in range(self._env.batch_size[0])]
+        self._collector: BaseCollector | None = None
+        self._losses = 0
+
+    def roll_out(self, solver: TensorDictBase, streams: Streams) -> TensorDictBase:
+        """Trains K replicas of a Solver for one episode; see :meth:`Replicas.roll_out`.
+
+        Raises:
+            DivergedError: if a replica diverges, as in one process.
+            WorkersError: if workers are lost again and again.
+        """
+        self._env.view.draw_levels(streams)
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                rollout, diverged = self._roll_out(solver, streams)
+                break
+            except WorkersError:
+                raise
+            except lost(self._settings) as error:
+                self._losses += 1
+                self.close()
+                # A worker's error comes with its traceback before.
+                reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+                if attempt == ATTEMPTS:
+                    raise WorkersError(
+                        f"workers={len(self._shares)}: were lost {ATTEMPTS} times in one cycle, "
+                        f"last: {reason}; the same command goes on from the last checkpoint"
+                    ) from error
+                # It may have been the signal that ends this run, too.
+                self._env.on_update(0)
+                warnings.warn(
+                    f"a worker was lost ({reason}); it is replaced and the episode repeated",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+        for message in filter(None, diverged):
+            raise DivergedError(message)
+        rollout = rollout.flatten(0, 1)[self._first]  # [K, T], each from the first that has it
+        rollout = rollout.exclude("collector").to(self._env.device)
+        rollout.names = [None, "time"]
+        return self._proposer.complete(rollout)
+
+    def trained(self, replica: int) -> TrainedReplica:
+        """Returns the replica of this number as the last episode has left it."""
+        assert self._collector is not None, "there has been no episode"
+        orders = [(replica,)] * len(self._shares)
+        results: list[TrainedReplica | None] = self._collector.map_fn("env.trained", orders)
+        return next(filter(None, results)).to(self._env.device)
+
+    def close(self) -> None:
+        """Ends the workers; a further episode starts others."""
+        collector, self._collector = self._collector, None
+        if collector is not None:
+            stop(collector)
+
+    def _roll_out(
+        self, solver: TensorDictBase, streams: Streams
+    ) -> tuple[Any, Sequence[str | None]]:
+        """Returns the rollouts of all W workers, [W, k, T], and what diverged in each."""
+        collector = self._collector
+        if collector is None:
+            collector = self._collector = self._start()
+        # One block of memory each: across processes, every tensor costs a file descriptor.
+        origin = solver.cpu().consolidate()
+        named = self._proposer.agent.named_parameters()
+        weights = TensorDict({name: p.detach().cpu() for name, p in named}).consolidate()
+        collector.map_fn("env.fork", [(origin, streams)] * len(self._shares))
+        collector.map_fn("policy.start", [(weights, streams, share) for share in self._shares])
+        with quiet():
+            rollouts = collector.next()
+        return rollouts, collector.get_distant_attr("env.diverged")
+
+    def _start(self) -> BaseCollector:
+        """Starts workers with an environment and a policy each."""
+        horizon, threads = self._proposer.settings.horizon, torch.get_num_threads()
+        agent = deepcopy(self._proposer.agent).cpu()
+        shape = self._env.full_action_spec[agent.action_key].shape[1:]
+        placed = list(zip(self._shares, cycle(self._settings.devices), strict=False))
+        return start(
+            self._settings,
+            [
+                partial(self._make_env, share=share, device=device, threads=threads)
+                for share, device in placed
+            ],
+            [partial(WorkerPolicy, agent, horizon, shape, device) for _, device in placed],
+            frames=len(self._shares[0]) * horizon,
+            check=partial(self._env.on_update, 0),
+            patient=self._losses > 0,
+        )
+
+
+class WorkerEnv(SolverTrainingEnv):
+    """The meta-environment of a worker, which survives a Solver that diverges, and reports it.
+
+    An exception would end the collector's process, and the worker would be replaced in vain.
+
+    Attributes:
+        diverged: the line that says what has not been finite since the last fork, and where; None
+            where all is well.
+    """
+
+    diverged: str | None = None
+
+    def fork(self, solver: TensorDictBase, streams: Streams) -> None:
+        """Lets the next episodes start from one Solver; see :meth:`SolverTrainingEnv.fork`."""
+        self.diverged = None
+        super().fork(solver, streams)
+
+    def trained(self, replica: int) -> TrainedReplica | None:
+        """Returns the replica of this number on the CPU; None if another worker has it."""
+        if replica not in self._replicas:
+            return None
+        own = taken_out(self, replica - self._replicas.start).to("cpu")
+        return own._replace(solver=own.solver.consolidate())  # one thing to send, not hundreds
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.diverged is None:
+            try:
+                return super()._step(tensordict)
+            except DivergedError as error:
+                self.diverged = str(error)
+        # What is left of the rollout is of no use to anyone.
+        state = self._reset()
+        self._updates = self.meta_episode_length
+        ended = torch.ones_like(state["terminated"])
+        state.update({"terminated": ended, "done": ended.clone()})
+        return state.set("reward", torch.full_like(state["return"], torch.nan))
+
+
+def worker_env(
+    make_task: Callable[[str], Task],
+    config: ProposerSettings,
+    streams: Streams,
+    reward: Reward,
+    *,
+    share: range,
+    device: str,
+    threads: int,
+) -> SolverTrainingEnv:
+    """Makes the environment of a worker, in its process.
+
+    Args:
+        make_task: makes the task on a device.
+        config: the Proposer's settings.
+        streams: of the replicas' first weights.
+        reward: of an update.
+        share: the numbers of the replicas that train here.
+        device: where the worker computes.
+        threads: of one operation, as many as in the main process.
+    """
+    use_device(torch.device(device))
+    torch.set_num_threads(threads)
+    return meta_env(make_task(device), config, streams, reward, share, kind=WorkerEnv)
+
+
+class WorkerPolicy(RolloutPolicy):
+    """The Proposer in a worker; it gets its weights before every rollout.
+
+    Args:
+        agent: with any weights.
+        horizon: steps T of a rollout.
+        shape: of an action for one replica.
+        device: where it computes.
+    """
+
+    def __init__(self, agent: ActorCritic, horizon: int, shape: torch.Size, device: str) -> None:
+        super().__init__(agent.to(device))
+        self.horizon = horizon
+        self.shape = shape
+
+    def start(self, weights: TensorDictBase, streams: Streams, share: range) -> None:
+        """Prepares a rollout with these weights, on the replicas whose numbers are ``share``."""
+        (agent,) = self._agent
+        for name, parameter in agent.named_parameters():
+            parameter.data.copy_(weights[name])
+        device = next(agent.parameters()).device
+        shape = torch.Size([len(share), *self.shape])
+        generators = action_generators(streams, share)
+        self.begin(uniform_noise(shape, self.horizon, generators, device))
+
+
+def shares(replicas: int, workers: int) -> list[range]:
+    """Returns the numbers of K replicas in a range for each worker, all of the same length.
+
+    Where K is no multiple of the workers, the last ranges overlap: what one process has to do
+    takes no longer for it, and TorchRL's collectors want batches of one shape.
+
+    Raises:
+        ArgumentError: for more workers than replicas, or none.
+    """
+    if not 1 <= workers <= replicas:
+        raise ArgumentError(
+            f"workers={workers}: must be at least 1 and at most {replicas}, the replicas that they "
+            "share"
+        )
+    each = -(-replicas // workers)
+    starts = [min(worker * each, replicas - each) for worker in range(workers)]
+    return [range(start, start + each) for start in starts]
