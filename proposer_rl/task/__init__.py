@@ -6,6 +6,8 @@ from proposer_rl.task.base import distribution_of as distribution_of
 from proposer_rl.task.base import for_copies as for_copies
 from proposer_rl.task.base import named as named
 from proposer_rl.task.base import refuse_single_bin as refuse_single_bin
+from proposer_rl.task.contract import Board as Board
+from proposer_rl.task.contract import CellKind as CellKind
 from proposer_rl.task.contract import ComputeContext as ComputeContext
 from proposer_rl.task.contract import DifferentiableTask as DifferentiableTask
 from proposer_rl.task.contract import Distribution as Distribution
@@ -17,5 +19,6 @@ from proposer_rl.task.contract import Levels as Levels
 from proposer_rl.task.contract import LocatedTarget as LocatedTarget
 from proposer_rl.task.contract import NoSuccessError as NoSuccessError
 from proposer_rl.task.contract import OptimalTask as OptimalTask
+from proposer_rl.task.contract import PlayableTask as PlayableTask
 from proposer_rl.task.contract import Space as Space
 from proposer_rl.task.features import space_features as space_features

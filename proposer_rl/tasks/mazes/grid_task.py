@@ -16,8 +16,7 @@ from torch import Tensor
 from proposer_rl.learning import first_episode_success
 from proposer_rl.learning.settings import SolverSettings
 from proposer_rl.models import ActorCritic, MapEncoder
-from proposer_rl.play.board import Board
-from proposer_rl.task import ComputeContext, LevelResult, Task, check_names, named
+from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_names, named
 from proposer_rl.tasks.mazes.distance import shortest_path_length
 from proposer_rl.tasks.mazes.edits import edit_levels
 from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
