@@ -10,7 +10,10 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
+
+from tensordict import TensorDict
 
 from proposer_rl.curricula import (
     Curriculum,
@@ -35,9 +38,8 @@ from proposer_rl.curricula import (
     TaskStudent,
     TransportCurriculum,
 )
-from proposer_rl.curricula.proposer import load_proposer
 from proposer_rl.curricula.scores import Source
-from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss
+from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, load_agent
 from proposer_rl.learning.settings import PPOSettings
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
@@ -49,6 +51,7 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.settings import ProblemSettings, ProposerSettings
 from proposer_rl.meta.workers import CopiesInWorkers, WorkerSettings, worker_env
 from proposer_rl.models import ActorCritic
+from proposer_rl.runs.checkpoint import CheckpointError, State, learnt_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, LocatedTarget, Space, Task
@@ -428,3 +431,37 @@ def _one_solver(components: Components) -> None:
             f"seeds={list(components.seeds)}: a Proposer proposes to one Solver at a time; give "
             "each a run of its own"
         )
+
+
+def load_proposer(agent: ActorCritic, checkpoint: str, observes: Sequence[str]) -> None:
+    """Gives a Proposer the weights of one that has learnt with the same network.
+
+    Args:
+        agent: the Proposer.
+        checkpoint: of a run, its ``proposer.pt``, or its folder.
+        observes: what the Proposer observes beside the probes.
+
+    Raises:
+        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
+    """
+    try:
+        learnt = _with_proposer(learnt_curriculum(Path(checkpoint)))
+        observed = [name for name in learnt["observed"] if name != "probes"]
+        load_agent(agent, TensorDict(learnt["proposer"]))
+    except CheckpointError as error:
+        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
+        ) from error
+    if observed != list(observes):
+        raise ArgumentError(
+            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
+            f"{list(observes)}"
+        )
+
+
+def _with_proposer(state: State) -> State:
+    """Returns the state of the part that has a Proposer; filters, say, hold other curricula."""
+    inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
+    return state if "proposer" in state else next(filter(None, inner), {})

@@ -16,13 +16,13 @@ from proposer_rl.report import curves, page, pictures
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
-from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
 from proposer_rl.report.tidy import STUDY
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.records import words
 from research.claims import GAIN, TITLE, Evidence, own_claims, paper_claims, rules
 from research.generalisation import check_names, generalisation_table, read_scores
 from research.ranking import (

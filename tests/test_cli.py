@@ -204,7 +204,7 @@ def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> No
     ("function", "place"),
     [
         ("hydra.core.utils._save_config", "run"),
-        ("proposer_rl.cli.run.draw_run", "run"),
+        ("proposer_rl.cli.shown.draw_run", "run"),
         ("logging.FileHandler._open", "run/train.log"),
     ],
 )

@@ -14,19 +14,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from hydra.types import RunMode
-from rich.console import Console
-from tqdm import tqdm
 
 from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.groups import overrides
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
-from proposer_rl.report.progress import read_progress
-from proposer_rl.report.records import level_text
-from proposer_rl.report.terminal import screen
-from proposer_rl.runs.folder import RunFolder, is_rate
 from proposer_rl.runs.machine import processor
 
 
@@ -112,35 +105,3 @@ def _from_here(path: str) -> str:
     inside = Path(path).resolve()
     here = Path.cwd().resolve()
     return str(inside.relative_to(here)) if inside.is_relative_to(here) else path
-
-
-def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:
-    """Print the results; on one screen, unless the run is one of a sweep's."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        Console().print(screen(read_progress(folder.path)))
-    for seed, reached, final in zip(
-        config.seeds, result["updates_to_threshold"], result["final"], strict=True
-    ):
-        tqdm.write(f"{config.method}, seed {seed}: {_outcome_text(result, reached, final)}")
-    tqdm.write(_cost_text(result, len(config.seeds)))
-    tqdm.write(f"Files: {folder.path}  (picture: {picture.name})")
-
-
-def _outcome_text(result: dict[str, Any], reached: int | None, final: dict[str, float]) -> str:
-    headline = result["headline"]
-    level = f"{level_text(headline, result['threshold'])} {headline.replace('_', ' ')}"
-    end = f"{final[headline]:.1%}" if is_rate(headline) else f"{final[headline]:.3g}"
-    outcome = (
-        f"{level} after {reached} updates"
-        if reached is not None
-        else f"{level} not reached in {result['updates']} updates (censored)"
-    )
-    return f"{outcome}; {end} at the end."
-
-
-def _cost_text(result: dict[str, Any], seeds: int) -> str:
-    together = f" for each of {seeds} seeds" if seeds > 1 else ""
-    return (
-        f"Cost: {result['frames']:,} frames of the Solver{together}, "
-        f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
-    )

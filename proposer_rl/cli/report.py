@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
-    from proposer_rl.report.records import printable
+    from proposer_rl.runs.records import printable
 
     find_runs(options.folder)  # refuses what is none, before what takes seconds to import
     from proposer_rl.report.build import write_report

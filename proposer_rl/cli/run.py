@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
@@ -17,14 +20,13 @@ from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import log_of, logger
-from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
+from proposer_rl.cli.outcome import identity, run_name, to_go_on
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.report.pictures import draw_run
-from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
 from proposer_rl.runs.lock import locked
+from proposer_rl.runs.records import TaskFacts, checked
 from proposer_rl.runs.signals import Interrupted, StopSignals
 from proposer_rl.runs.status import Status
 
@@ -34,14 +36,34 @@ FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
 
-def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
+class Shown(Protocol):
+    """What people see of a run's folder; :mod:`proposer_rl.cli.shown` is it."""
+
+    def draw_run(self, folder: Path, title: str) -> Path:
+        """Draws the picture of a run that is over; returns its file."""
+
+    def last_map(self, folder: Path) -> NDArray[np.uint8] | None:
+        """Returns the heat map of the last proposals, uint8 [H, W, 3]; None without any."""
+
+    def announce(
+        self,
+        method: str,
+        seeds: Sequence[int],
+        result: Mapping[str, Any],
+        folder: Path,
+        picture: Path,
+    ) -> None:
+        """Prints the results."""
+
+
+def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Carry a run out for the command line: where it is stopped, say how it goes on, and end.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        return carry_out(config, path, signals)
+        return carry_out(config, path, signals, shown)
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
@@ -54,7 +76,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         raise
 
 
-def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
+def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
@@ -74,7 +96,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
         raise ConfigError(one_line(error)) from error
     with locked(path):
         try:
-            result = proceed(config, made, path, signals, status)
+            result = proceed(config, made, path, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
@@ -85,7 +107,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
 
 
 def proceed(
-    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status
+    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status, shown: Shown
 ) -> dict[str, Any]:
     """Begin a run, go on with it, or say that it is finished; returns its summary."""
     folder = RunFolder(path)
@@ -97,7 +119,7 @@ def proceed(
         tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as write:
-        log = None if write is None else log_of(write, path)
+        log = None if write is None else log_of(write, partial(shown.last_map, path))
         experiment = build(config, made, folder, signals, status, log)
         facts = identity(experiment, config)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
@@ -115,11 +137,11 @@ def proceed(
             content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
             write_atomically(path / PROPOSER, content)
         folder.write_json(SUMMARY, {**facts, **result})
-        picture = draw_run(path, title=run_name(config))
+        picture = shown.draw_run(path, run_name(config))
         if write is not None:
             with Image.open(picture) as image:
                 write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
-    announce(result, config, folder, picture)
+    shown.announce(config.method, config.seeds, result, path, picture)
     return result
 
 

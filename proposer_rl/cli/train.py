@@ -78,10 +78,11 @@ def _main(hydra_config: DictConfig) -> float:
         check_groups(overrides())
         check_chosen(hydra_config)
         with signals:  # already now: amid imports is no place to stop
-            from proposer_rl.cli.config import read_config  # only now: it takes seconds
+            from proposer_rl.cli import shown  # only now: it takes seconds
+            from proposer_rl.cli.config import read_config
             from proposer_rl.cli.run import train
 
-            return train(read_config(hydra_config), path, signals)
+            return train(read_config(hydra_config), path, signals, shown)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error)

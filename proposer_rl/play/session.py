@@ -12,9 +12,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from proposer_rl.learning import PPO
-from proposer_rl.report.records import SampleRecord, checked
 from proposer_rl.runs.checkpoint import checkpoint_files
 from proposer_rl.runs.folder import read_jsonl
+from proposer_rl.runs.records import SampleRecord, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Board, Levels, PlayableTask, Task
 

@@ -13,10 +13,10 @@ from proposer_rl.report.comparisons import (
     decisions,
     primary,
 )
-from proposer_rl.report.records import LONGEST_TEXT, printable
 from proposer_rl.report.statistics import FEWEST
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
+from proposer_rl.runs.records import LONGEST_TEXT, printable
 
 # What methods and ablations do, by ``method`` or ``ablation`` and name.
 Meanings = Mapping[str, Mapping[str, str]]

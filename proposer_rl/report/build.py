@@ -14,11 +14,11 @@ from proposer_rl.report import curves, outcomes, page, pictures, tidy
 from proposer_rl.report.answer import Meanings, answer
 from proposer_rl.report.charts import charts
 from proposer_rl.report.reading import OutputError, find_runs
-from proposer_rl.report.records import encoded, words
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
 from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
+from proposer_rl.runs.records import encoded, words
 
 PAGE = "report.html"
 FIGURES, TABLES = "figures", "tables"

@@ -12,10 +12,10 @@ from matplotlib.figure import FigureBase
 from proposer_rl.report import measures
 from proposer_rl.report.comparisons import waiting_outcome
 from proposer_rl.report.measures import TRAINED, UPDATES, Measure, Series
-from proposer_rl.report.records import words
 from proposer_rl.report.statistics import FEWEST, HELD, median_interval, median_of
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, Look, finish, style
+from proposer_rl.runs.records import words
 
 MOST_PANELS = 12
 

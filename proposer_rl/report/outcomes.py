@@ -16,7 +16,6 @@ from proposer_rl.report.comparisons import (
     outcomes,
     primary,
 )
-from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
@@ -29,6 +28,7 @@ from proposer_rl.report.statistics import (
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table
 from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import level_text, words
 
 MILLION = 1e6
 

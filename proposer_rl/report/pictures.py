@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from proposer_rl.report.measures import UPDATES
 from proposer_rl.report.reading import read_run
-from proposer_rl.report.records import Column, LevelRecord, SampleRecord, number, picture, words
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.style import (
@@ -27,6 +26,7 @@ from proposer_rl.report.style import (
     finish,
 )
 from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import Column, LevelRecord, SampleRecord, number, picture, words
 
 STAGES = 5
 BATCH = 2  # levels of a batch

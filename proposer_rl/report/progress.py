@@ -8,9 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from proposer_rl.report.reading import FAILURE, UnreadableRun, begun, read_run
-from proposer_rl.report.records import LONGEST_TEXT, printable, small_json
+from proposer_rl.report.reading import UnreadableRun, begun, read_run
 from proposer_rl.report.runs import Run
+from proposer_rl.runs.folder import FAILURE
+from proposer_rl.runs.records import LONGEST_TEXT, printable, small_json
 from proposer_rl.runs.status import FILE
 
 STOPPED = 128  # a greater exit code is that of a signal: the run can go on

@@ -16,7 +16,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from proposer_rl.report.records import (
+from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.tidy import LARGEST_FILE, NAMES, STUDY, read_table
+from proposer_rl.runs.folder import FAILURE, is_rate, read_csv, read_jsonl
+from proposer_rl.runs.records import (
     LARGEST,
     Column,
     LevelResults,
@@ -30,12 +33,8 @@ from proposer_rl.report.records import (
     number,
     printable,
 )
-from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.tidy import LARGEST_FILE, NAMES, STUDY, read_table
-from proposer_rl.runs.folder import is_rate, read_csv, read_jsonl
 
 MOST_FOLDERS = 20_000
-FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from proposer_rl.report.records import (
+from proposer_rl.runs.folder import SLACK
+from proposer_rl.runs.records import (
     Column,
     LevelRecord,
     Record,
@@ -21,7 +22,6 @@ from proposer_rl.report.records import (
     TaskFacts,
     number,
 )
-from proposer_rl.runs.folder import SLACK
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's own, besides its losses; the others are the task's.

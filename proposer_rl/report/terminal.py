@@ -15,7 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from proposer_rl.report.progress import Progress, duration
-from proposer_rl.report.records import (
+from proposer_rl.report.runs import Run, share_map
+from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import (
     GAINS,
     PLACE,
     Column,
@@ -24,8 +26,6 @@ from proposer_rl.report.records import (
     printable,
     words,
 )
-from proposer_rl.report.runs import Run, share_map
-from proposer_rl.runs.folder import is_rate
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"

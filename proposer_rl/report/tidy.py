@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from proposer_rl.report.records import encoded
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import read_bounded
+from proposer_rl.runs.records import encoded
 
 STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")

@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from proposer_rl.runs.folder import read_bounded, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, read_bounded, storage, write_atomically
 
 FORMAT = 2
 LARGEST = 2**36  # bytes
@@ -154,6 +154,24 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
             "data, and was not written by proposer_rl"
         )
     return step, state
+
+
+def learnt_curriculum(path: Path) -> State:
+    """Reads the curriculum's part of a checkpoint, of a run's newest one, or of what it left.
+
+    Raises:
+        CheckpointError: if there is none, or it cannot be used.
+        StorageError: if it cannot be read.
+    """
+    if not path.exists():
+        raise CheckpointError("there is no such file or folder")
+    latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
+    if latest is None and (path / PROPOSER).exists():
+        latest = load_checkpoint(path / PROPOSER)
+    if latest is None:
+        raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
+    state: State = latest[1]["curriculum"]
+    return state
 
 
 def _plain(value: object, where: str) -> object:
