@@ -25,7 +25,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from proposer_rl.runs.status import FILE as PROGRESS
+from proposer_rl.runs.process import PROGRESS
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPABILITIES_VERSION = 0x20080522  # capget(2)

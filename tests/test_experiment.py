@@ -35,7 +35,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.learning.settings import PPOSettings, SolverSettings
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Task
 from proposer_rl.teaching import Teacher

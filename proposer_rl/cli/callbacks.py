@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from proposer_rl.cli.errors import UNFORESEEN, exit_code, one_line
 from proposer_rl.runs.folder import FAILURE, write_atomically
-from proposer_rl.runs.lock import InUseError
+from proposer_rl.runs.process import InUseError
 
 HYDRAS_OWN = {".hydra", "train.log", "multirun.yaml"}
 

@@ -23,7 +23,7 @@ from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import check_groups, explained
 from proposer_rl.cli.run import carry_out
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 
 
 def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 from proposer_rl.cli.help import choices
 from proposer_rl.recipes import CONFIG_FOLDER
 

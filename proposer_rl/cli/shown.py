@@ -20,8 +20,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from tqdm import tqdm
 
-from proposer_rl.report.progress import find_progress, read_progress
-from proposer_rl.report.terminal import overview, screen
+from proposer_rl.report.terminal import find_progress, overview, read_progress, screen
 from proposer_rl.runs.folder import FAILURE, is_rate
 from proposer_rl.runs.records import level_text
 
@@ -51,16 +50,16 @@ class SweepSummary(Callback):
 
 def draw_run(folder: Path, title: str) -> Path:
     """Draws ``run.png`` of a run's folder; returns the file."""
-    from proposer_rl.report import pictures
+    from proposer_rl.report import figures
 
-    return pictures.draw_run(folder, title)
+    return figures.draw_run(folder, title)
 
 
 def last_map(folder: Path) -> NDArray[np.uint8] | None:
     """Returns the heat map of a run's last proposals, uint8 [H, W, 3]; None where it has none."""
-    from proposer_rl.report import pictures
+    from proposer_rl.report import figures
 
-    return pictures.last_map(folder)
+    return figures.last_map(folder)
 
 
 def announce(

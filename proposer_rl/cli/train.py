@@ -28,7 +28,7 @@ from proposer_rl.cli.callbacks import (
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
 from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 
 LONGEST = 300  # characters of what is said of a lost job
 BEGUN: list[Path] = []  # folders of this process's runs: what comes after is no matter of overrides

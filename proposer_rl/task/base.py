@@ -30,7 +30,7 @@ from proposer_rl.models import (
     joint_categorical,
     normal,
 )
-from proposer_rl.runs.pictures import pixels, png, written
+from proposer_rl.runs.records import pixels, png, written
 from proposer_rl.streams import Streams
 from proposer_rl.task.contract import ComputeContext, Distribution, LevelResult, Levels, Space
 from proposer_rl.task.features import space_features
