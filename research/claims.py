@@ -25,12 +25,12 @@ from proposer_rl.report.comparisons import (
     outcomes,
     primary,
 )
-from proposer_rl.report.records import Record, numbers, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import ERROR, FEWEST, Estimate, holm, mean_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import write
 from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import Record, numbers, words
 from research.ranking import TARGET, Needs, needs_of
 
 Verdict = Literal["supported", "contradicted", "undecided", "too few seeds"]

@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from proposer_rl.cli.arguments import check_file
-from proposer_rl.cli.errors import ConfigError, command
+from proposer_rl.cli.errors import ConfigError, check_file, command
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
 
 Rows = list[dict[str, Any]]

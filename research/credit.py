@@ -19,8 +19,7 @@ from scipy.stats import spearmanr
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.errors import ConfigError, number
 from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.transport import interim_target, mastered, squared_distances

@@ -17,8 +17,7 @@ from rich.table import Table
 from scipy.stats import bootstrap, linregress, rankdata
 from torch import Tensor
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.errors import ConfigError, number
 from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture

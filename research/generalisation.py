@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 from proposer_rl.report.comparisons import Outcome, at_the_end
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.records import encoded, number, printable, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
 from proposer_rl.runs.folder import is_rate, read_bounded
+from proposer_rl.runs.records import encoded, number, printable, words
 
 LARGEST_FILE = 2**24
 LONGEST_NAME = 1024  # characters; a file of levels is named by its path

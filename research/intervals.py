@@ -17,8 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 from proposer_rl.report.statistics import CONFIDENCE, HELD, median_of
 from proposer_rl.runs.folder import write_atomically
 

@@ -8,21 +8,20 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report import curves, page, pictures
+from proposer_rl.report import figures, page
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.reading import OutputError
-from proposer_rl.report.records import words
+from proposer_rl.report.runs import STUDY
 from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.report.tables import Table, escape_markdown
-from proposer_rl.report.tidy import STUDY
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.records import words
 from research.claims import GAIN, TITLE, Evidence, own_claims, paper_claims, rules
 from research.generalisation import check_names, generalisation_table, read_scores
 from research.ranking import (
@@ -43,10 +42,10 @@ SCARCE = ("updates of the Solver", "environment frames", "seconds")
 
 # Of the page of claims.
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
-    curves.learning_curves,
-    curves.cost_curves,
-    pictures.heat_maps,
-    curves.difficulty,
+    figures.learning_curves,
+    figures.cost_curves,
+    figures.heat_maps,
+    figures.difficulty,
 )
 
 
@@ -103,7 +102,7 @@ def _choice(
         f"From {_runs(study)}. By what is available, and by what is scarce: the method with the "
         f"highest mean over seeds of {words(study.headline)} along training, over a "
         "budget of it; its median is shown.",
-        _picture(curves.cost_curves(shown)._replace(name="recommended"), files),
+        _picture(figures.cost_curves(shown)._replace(name="recommended"), files),
         _decision_table(found),
         _budgets(study),
     ]

@@ -20,16 +20,14 @@ import numpy as np
 import pandas as pd
 
 from proposer_rl.cli.errors import command
-from proposer_rl.report.curves import learning_curves
+from proposer_rl.report.figures import heat_maps, learning_curves
 from proposer_rl.report.page import document, report_command, section
-from proposer_rl.report.pictures import heat_maps
 from proposer_rl.report.reading import OutputError, find_runs, read_run
-from proposer_rl.report.records import anywhere, encoded, printable
-from proposer_rl.report.runs import Run
+from proposer_rl.report.runs import NAMES, STUDY, Run, tables, to_csv
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import in_few_colours, render
-from proposer_rl.report.tidy import NAMES, STUDY, tables, to_csv
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.records import anywhere, encoded, printable
 
 MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (

@@ -16,11 +16,11 @@ from proposer_rl.report.comparisons import (
     primary,
 )
 from proposer_rl.report.measures import COSTS
-from proposer_rl.report.records import words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import FEWEST, INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
+from proposer_rl.runs.records import words
 
 # What methods need, as their files say.
 TARGET, EXACT, GRADIENTS = "a target", "exact evaluation", "its gradients"

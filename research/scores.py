@@ -20,8 +20,7 @@ from rich.table import Table
 from rich.text import Text
 from tqdm import tqdm
 
-from proposer_rl.cli.arguments import check_file
-from proposer_rl.cli.errors import ConfigError, command
+from proposer_rl.cli.errors import ConfigError, check_file, command
 from proposer_rl.cli.evaluate import Evaluation, evaluate, load
 from proposer_rl.report.reading import find_runs
 from proposer_rl.report.runs import Run

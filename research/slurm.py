@@ -21,8 +21,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import read_csv
 

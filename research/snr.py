@@ -16,7 +16,7 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from proposer_rl.cli.arguments import number
+from proposer_rl.cli.errors import number
 from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.assembly import MixtureSettings

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.records import number, printable
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import read_bounded
+from proposer_rl.runs.records import number, printable
 
 LARGEST_FILE = 2**20
 BENCHMARK = "curricula"

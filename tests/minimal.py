@@ -205,7 +205,7 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
 
 
 def _run(extra: str) -> None:
-    from proposer_rl.cli import run
+    from proposer_rl.cli import shown
     from proposer_rl.recipes import available
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
@@ -220,7 +220,7 @@ def _run(extra: str) -> None:
         else:
             _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
-        run.draw_run = lambda folder, title: folder / "run.png"  # one picture is enough
+        shown.draw_run = lambda folder, title: folder / "run.png"  # one picture is enough
     if extra == "":
         import gymnasium
 

@@ -192,7 +192,7 @@ def train(folder: Path, overrides: list[str]) -> None:
     from proposer_rl.cli.build import build, parts
     from proposer_rl.learning import graphs
     from proposer_rl.runs.folder import RunFolder
-    from proposer_rl.runs.signals import StopSignals
+    from proposer_rl.runs.process import StopSignals
     from tests.tiny import composed
 
     graphs.has_graphs = lambda device: device.type == NAME

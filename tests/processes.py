@@ -25,7 +25,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from proposer_rl.runs.status import FILE as PROGRESS
+from proposer_rl.runs.process import PROGRESS
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPABILITIES_VERSION = 0x20080522  # capget(2)
@@ -122,14 +122,14 @@ def python(
 
 
 def serve() -> None:
-    from proposer_rl.cli import run, train
+    from proposer_rl.cli import run, shown, train  # noqa: F401  run takes seconds
     from tests import composing
 
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
     for module in ("proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
     composing.remember()
-    run.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
+    shown.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
     gc.freeze()  # a child that looks for garbage would copy all that memory
 
     for line in sys.stdin:

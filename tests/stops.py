@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from signal import SIGTERM
 
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 
 
 class StopAt(StopSignals):

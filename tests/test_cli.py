@@ -17,12 +17,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from proposer_rl.cli.outcome import quoted
+from proposer_rl.cli.run import quoted
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
-from proposer_rl.runs.signals import Interrupted
+from proposer_rl.runs.process import Interrupted
 from tests.same_run import tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -140,7 +140,7 @@ def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, 
     assert train(*arguments) == 0
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "run", lambda _: os.kill(os.getpid(), signal.SIGINT))
-        patched.setattr("proposer_rl.runs.signals.StopSignals._keep", signal.default_int_handler)
+        patched.setattr("proposer_rl.runs.process.StopSignals._keep", signal.default_int_handler)
         assert train(*arguments, "schedule.updates=4") == 128 + signal.SIGINT
     assert not Path("run/summary.json").exists()  # it is not at the end of what was asked for
     assert train(*arguments) == 0
@@ -204,7 +204,7 @@ def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> No
     ("function", "place"),
     [
         ("hydra.core.utils._save_config", "run"),
-        ("proposer_rl.cli.run.draw_run", "run"),
+        ("proposer_rl.cli.shown.draw_run", "run"),
         ("logging.FileHandler._open", "run/train.log"),
     ],
 )

@@ -38,7 +38,7 @@ from proposer_rl.learning import DivergedError
 from proposer_rl.recipes import CONFIG_FOLDER, available
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 from tests.same_run import assert_same_run
 from tests.tiny import composed
 

@@ -9,7 +9,7 @@ import pytest
 from proposer_rl.cli.build import build, parts
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.tasks.mazes import MazeEnv
 from tests.stops import StopAt
 from tests.tiny import composed

@@ -34,7 +34,7 @@ from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Task
 from proposer_rl.teaching import Teacher

@@ -23,7 +23,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.learning import PPO
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.runs.signals import Interrupted, StopSignals
+from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from tests.commands import trained_run
 from tests.same_run import assert_same_run

@@ -15,10 +15,14 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # Only the command line composes configurations; everything else takes plain arguments. The
 # one validator is pydantic's; so are the checks of a run's files and of what a browser asks.
-CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"settings", "play", "report"}}
+CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"settings", "play", "runs"}}
 # What reads runs must start at once.
 HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")
+# What is above everything: only these commands know of it, and nothing that a run is made of.
+SHOWING = ("report", "play")
+SHOW = {"cli.report", "cli.watch", "cli.play", "cli.evaluate", "cli.shown"}
+TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
 # The names of the package itself, and the room that knows mazes.
 KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "api")
 MOST_ROOMS = 17
@@ -154,6 +158,26 @@ def test_what_reads_runs_needs_no_torch() -> None:
     assert len(readers) > len(READERS)
     for name in readers:
         assert not reached(graph, name) & HEAVY, name
+
+
+def test_report_and_play_stand_above_everything() -> None:
+    graph = imports(ROOT)
+    knowing = {
+        name
+        for name, used in graph.items()
+        if any(other[1:].partition(".")[0] in SHOWING for other in used if other[0] == ".")
+        and name.partition(".")[0] not in SHOWING
+    }
+    assert knowing == SHOW
+    for name in TRAINING:
+        used = {other[1:].partition(".")[0] for other in reached(graph, name) if other[0] == "."}
+        assert not used & {*SHOWING}, name
+
+
+def test_only_what_assembles_runs_reads_checkpoints() -> None:
+    graph = imports(ROOT)
+    readers = {name.partition(".")[0] for name, used in graph.items() if ".runs.checkpoint" in used}
+    assert readers == {"methods", "experiment", "play", "cli"}
 
 
 def test_nothing_but_mazes_knows_mazes() -> None:

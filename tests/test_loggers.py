@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.loggers import log_of, logger, require_logger
+from proposer_rl.cli.shown import last_map
 from tests.report.folders import LEVEL, PIXELS, cycle, write_run
 
 SMOKE = ["+method=target", "+scale=smoke", "compute.progress=false", "hydra.run.dir=run"]
@@ -29,7 +31,7 @@ def test_the_runs_folder_is_enough_for_csv(tmp_path: Path) -> None:
 def test_rows_and_settings_go_to_tensorboard(tmp_path: Path) -> None:
     config = {"method": "plr", "solver": {"ppo": {"gamma": 0.9}}}
     with logger(LoggerSettings(type="tensorboard"), tmp_path, "run", config) as write:
-        log = log_of(write, tmp_path)
+        log = log_of(write, lambda: None)
         log("metrics", {"id_success": 0.25, "frames": 100}, 10)
         log("metrics", {"id_success": 0.5, "frames": 200}, 20)
     (folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
@@ -52,7 +54,7 @@ def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> Non
     cycles = [cycle(0, [0.25, -0.5], [[6, 0, 0], [0, 0, 0]])]
     folder = write_run(tmp_path / "run", "perf_gain", cycles=cycles)
     with logger(LoggerSettings(type="tensorboard"), folder, "run", {}) as write:
-        log = log_of(write, folder)
+        log = log_of(write, partial(last_map, folder))
         log("cycles", cycles[0], 20)
         log("cycles", {"levels": {"best": [LEVEL], "none": []}}, 20)
         log("curriculum", {"levels": [LEVEL, {"picture": "none"}, *[LEVEL] * 4]}, 20)

@@ -14,7 +14,7 @@ import pytest
 
 from proposer_rl.cli.build import build, parts
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from tests.tiny import composed
 
 UPDATES = int(os.environ.get("LONG_RUN_UPDATES", "60"))

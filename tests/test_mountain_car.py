@@ -16,7 +16,7 @@ from proposer_rl.cli.play import open_session
 from proposer_rl.cli.report import main as report
 from proposer_rl.cli.watch import main as watch
 from proposer_rl.play.session import Drawn, OfCurriculum
-from proposer_rl.report.pictures import along_training, side_by_side
+from proposer_rl.report.figures import along_training, side_by_side
 from proposer_rl.runs.folder import read_csv
 from tests.commands import trained_run
 from tests.processes import Processes

@@ -16,7 +16,7 @@ from proposer_rl.meta.rewards import performance_gain
 from proposer_rl.methods import Components, proposer
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.tasks.mazes.task import MazeTask
 from research.ranking import EXACT, GRADIENTS, TARGET
 from tests.tiny import TASK, composed

@@ -12,7 +12,7 @@ from signal import SIGINT, SIGKILL, SIGTERM, SIGUSR1
 import pytest
 
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
-from proposer_rl.runs.lock import locked
+from proposer_rl.runs.process import locked
 from tests.processes import Ended, Processes
 from tests.same_run import assert_same_run
 

@@ -16,7 +16,7 @@ from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import MixtureSettings, ProblemSettings, ProposerSettings
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.maze_settings import MazeSettings
 from tests.tiny import composed

@@ -17,8 +17,7 @@ from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import read_csv, read_jsonl
-from proposer_rl.runs.lock import locked
-from proposer_rl.runs.signals import Interrupted
+from proposer_rl.runs.process import Interrupted, locked
 from tests.commands import call
 
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=2"]

@@ -21,9 +21,7 @@ from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
 from proposer_rl.models import available_cores, use_device
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.machine import memory
-from proposer_rl.runs.signals import StopSignals
-from proposer_rl.runs.status import Status
+from proposer_rl.runs.process import Status, StopSignals, memory
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 

@@ -17,14 +17,10 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from rich.console import Console
 
 from proposer_rl.cli.errors import UNFORESEEN, exit_code, one_line
-from proposer_rl.report.progress import find_progress
-from proposer_rl.report.reading import FAILURE
-from proposer_rl.report.terminal import overview
-from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.lock import InUseError
+from proposer_rl.runs.folder import FAILURE, write_atomically
+from proposer_rl.runs.process import InUseError
 
 HYDRAS_OWN = {".hydra", "train.log", "multirun.yaml"}
 
@@ -76,29 +72,6 @@ class LostJobError(RuntimeError):
     exit_code = 6
 
 
-class SweepSummary(Callback):
-    """Lists the runs of a sweep when it is over.
-
-    The exit code is that of a run that failed in it; other sweeps may have the same folder.
-    """
-
-    def __init__(self) -> None:
-        self._failed_before: dict[Path, int] = {}
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra before the first run."""
-        self._failed_before = _failures(config)
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra after the last run, whatever became of the runs."""
-        found = find_progress(Path(config.hydra.sweep.dir))
-        Console().print(overview(found))
-        failed = _failures(config).items() - self._failed_before.items()
-        if failed:
-            # Hydra turns an exception of a callback into a warning, but lets an exit through.
-            sys.exit(max(int(json.loads(file.read_text())["exit_code"]) for file, _ in failed))
-
-
 def forget_failure(folder: Path) -> None:
     """A run that failed is tried again: what is recorded of the failure no longer holds."""
     (folder / FAILURE).unlink(missing_ok=True)
@@ -120,9 +93,3 @@ def record_failure(folder: Path, error: Exception) -> float:
         traceback.print_exception(error)
     print(f"error: {message}", file=sys.stderr)
     return math.nan
-
-
-def _failures(config: DictConfig) -> dict[Path, int]:
-    """What is recorded of failed runs in a sweep's folder, and when it was written."""
-    folder = Path(config.hydra.sweep.dir)
-    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

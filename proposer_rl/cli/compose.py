@@ -17,12 +17,13 @@ from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from proposer_rl.cli import shown
 from proposer_rl.cli.config import read_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import check_groups, explained
 from proposer_rl.cli.run import carry_out
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 
 
 def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:
@@ -48,7 +49,7 @@ def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Pa
         path = folder or Path("outputs") / str(config.method) / _moment(config.seed)
         check_groups(list(overrides))
         with StopSignals() as signals:
-            carry_out(read_config(config), path, signals)
+            carry_out(read_config(config), path, signals, shown)
     return path
 
 

@@ -17,8 +17,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from proposer_rl.cli.arguments import settings_file
-from proposer_rl.cli.errors import ConfigError, one_line
+from proposer_rl.cli.errors import ConfigError, one_line, settings_file
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings

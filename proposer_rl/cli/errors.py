@@ -1,4 +1,4 @@
-"""What a command that does not come to its end says, and the exit code that it ends with.
+"""What stands on a command line, and what a command says that does not come to its end.
 
 An error that is foreseen is a class with an ``exit_code``; its message is one line. Whatever is
 wrong with what a user gave is a :class:`ConfigError`, in every function of this room.
@@ -8,16 +8,20 @@ use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an u
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from signal import SIGINT
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 BAD_INPUT = 2
 STORAGE = 4
 UNFORESEEN = 1
 SIGNALLED = 128
+Number = TypeVar("Number", int, float)
 
 
 class ConfigError(ValueError):
@@ -72,3 +76,39 @@ def one_line(error: BaseException, folder: Path | None = None) -> str:
     if lacks_memory(error):
         text = f"the run does not fit in memory: {text}"
     return "".join(c for c in " ".join(text.split()) if c.isprintable())
+
+
+def number(
+    kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf
+) -> Callable[[str], Number]:
+    """The type of an argument that is a finite number in a range, for argparse."""
+    allowed = "a whole number" if kind is int else "a number"
+    if math.isfinite(most):
+        allowed += f" from {least:,} to {most:,}"
+    elif math.isfinite(least):
+        allowed += f" of at least {least:,}"
+
+    def parse(text: str) -> Number:
+        with suppress(ValueError, OverflowError):
+            value = kind(text)
+            if math.isfinite(value) and least <= value <= most:
+                return value
+        raise argparse.ArgumentTypeError(f"must be {allowed}, got {text!r}")
+
+    return parse
+
+
+def check_file(option: str, file: Path | None, *suffixes: str) -> None:
+    """Refuse a file that an option asks to be written, before anything is computed."""
+    if file is not None and file.suffix not in suffixes:
+        raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
+    if file is not None and not file.parent.is_dir():
+        raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
+
+
+def settings_file(folder: Path) -> Path:
+    """The file of settings in a run's folder; a folder without one is no run's."""
+    file = folder / "config.json"
+    if not file.is_file():
+        raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
+    return file

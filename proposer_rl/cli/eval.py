@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import check_file, number
-from proposer_rl.cli.errors import ConfigError, command
+from proposer_rl.cli.errors import ConfigError, check_file, command, number
 
 MOST_STEPS = 10**5
 

@@ -17,8 +17,8 @@ from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
-from proposer_rl.report.records import numbers, picture
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.records import numbers, picture
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 ID = "wandb_id.txt"
@@ -62,12 +62,17 @@ def logger(
         yield None
 
 
-def log_of(write: Write, path: Path) -> Log:
-    """What takes rows of a run's tables, and writes what of them is a number or can be shown."""
+def log_of(write: Write, last_map: Callable[[], Picture | None]) -> Log:
+    """Returns what takes rows of a run's tables, and writes what of them is a number or a picture.
+
+    Args:
+        write: to a logger.
+        last_map: draws the run's last proposals as a heat map; None where there is none.
+    """
 
     def log(table: str, row: Mapping[str, Any], step: int) -> None:
         found = {f"{table}/{key}": value for key, value in _numbers(row)}
-        write(found, {f"{table}/{key}": image for key, image in _images(row, path)}, step)
+        write(found, {f"{table}/{key}": image for key, image in _images(row, last_map)}, step)
 
     return log
 
@@ -147,7 +152,9 @@ def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield f"{key}_mean", float(found.mean())
 
 
-def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, Picture]]:
+def _images(
+    row: Mapping[str, Any], last_map: Callable[[], Picture | None]
+) -> Iterator[tuple[str, Picture]]:
     """What of a row is seen better than read."""
     levels = row.get("levels", ())
     for name, records in levels.items() if isinstance(levels, Mapping) else [("levels", levels)]:
@@ -156,9 +163,7 @@ def _images(row: Mapping[str, Any], path: Path) -> Iterator[tuple[str, Picture]]
         if tiles:
             yield name, _sheet(tiles)
     if "histogram" in row:
-        from proposer_rl.report.pictures import last_map  # figures, which other loggers need not
-
-        image = last_map(path)
+        image = last_map()
         if image is not None:
             yield "histogram", image
 

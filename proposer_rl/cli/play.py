@@ -12,8 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from proposer_rl.cli.arguments import number, settings_file
-from proposer_rl.cli.errors import ConfigError, command
+from proposer_rl.cli.errors import ConfigError, command, number, settings_file
 from proposer_rl.extras import install_command
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ def open_session(folder: Path) -> Session:
     """What there is to see of the run in a folder."""
     settings_file(folder)  # before what takes seconds to import
     from proposer_rl.cli.config import saved_config
-    from proposer_rl.cli.outcome import run_name
+    from proposer_rl.cli.run import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
 

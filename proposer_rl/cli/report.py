@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 from proposer_rl.cli.help import choices
 from proposer_rl.recipes import CONFIG_FOLDER
 
@@ -34,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
-    from proposer_rl.report.records import printable
+    from proposer_rl.runs.records import printable
 
     if all(path.suffix == ".jsonl" for path in options.folder):
         from proposer_rl.report.teachers import write_teachers

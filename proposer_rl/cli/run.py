@@ -4,29 +4,40 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import shlex
 import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line
+from proposer_rl.cli.groups import overrides
+from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import log_of, logger
-from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
+from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.report.pictures import draw_run
-from proposer_rl.report.records import TaskFacts, checked
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
-from proposer_rl.runs.lock import locked
-from proposer_rl.runs.signals import Interrupted, StopSignals
-from proposer_rl.runs.status import Status
+from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
+from proposer_rl.runs.records import TaskFacts, checked
 
 SUMMARY = "summary.json"
 # What may differ: where it is computed and shown, and a longer schedule.
@@ -34,14 +45,34 @@ FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
 
-def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
+class Shown(Protocol):
+    """What people see of a run's folder; :mod:`proposer_rl.cli.shown` is it."""
+
+    def draw_run(self, folder: Path, title: str) -> Path:
+        """Draws the picture of a run that is over; returns its file."""
+
+    def last_map(self, folder: Path) -> NDArray[np.uint8] | None:
+        """Returns the heat map of the last proposals, uint8 [H, W, 3]; None without any."""
+
+    def announce(
+        self,
+        method: str,
+        seeds: Sequence[int],
+        result: Mapping[str, Any],
+        folder: Path,
+        picture: Path,
+    ) -> None:
+        """Prints the results."""
+
+
+def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Carry a run out for the command line: where it is stopped, say how it goes on, and end.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        return carry_out(config, path, signals)
+        return carry_out(config, path, signals, shown)
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
         tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
@@ -54,7 +85,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         raise
 
 
-def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
+def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
@@ -74,7 +105,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
         raise ConfigError(one_line(error)) from error
     with locked(path):
         try:
-            result = proceed(config, made, path, signals, status)
+            result = proceed(config, made, path, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
@@ -85,7 +116,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
 
 
 def proceed(
-    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status
+    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status, shown: Shown
 ) -> dict[str, Any]:
     """Begin a run, go on with it, or say that it is finished; returns its summary."""
     folder = RunFolder(path)
@@ -97,7 +128,7 @@ def proceed(
         tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as write:
-        log = None if write is None else log_of(write, path)
+        log = None if write is None else log_of(write, partial(shown.last_map, path))
         experiment = build(config, made, folder, signals, status, log)
         facts = identity(experiment, config)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
@@ -115,11 +146,11 @@ def proceed(
             content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
             write_atomically(path / PROPOSER, content)
         folder.write_json(SUMMARY, {**facts, **result})
-        picture = draw_run(path, title=run_name(config))
+        picture = shown.draw_run(path, run_name(config))
         if write is not None:
             with Image.open(picture) as image:
                 write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
-    announce(result, config, folder, picture)
+    shown.announce(config.method, config.seeds, result, path, picture)
     return result
 
 
@@ -208,3 +239,87 @@ def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, 
         for key in sorted(before.keys() | now.keys())
         for name, values in _different(before.get(key), now.get(key), f"{prefix}{key}.").items()
     }
+
+
+def run_name(config: RunConfig) -> str:
+    """The run's name, in pictures and loggers."""
+    ablation = "" if config.ablation == "none" else f"_{config.ablation}"
+    return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
+
+
+def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
+    """What the run is, and what it is made with: method, seeds, machine, versions."""
+    device = experiment.task.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
+    packages = ("proposer_rl", "torchrl", "tensordict", "hydra-core")
+    parameters = sum(p.numel() for p in experiment.learner.agent.parameters())
+    return {
+        "method": config.method,
+        "scale": config.scale,
+        "ablation": config.ablation,
+        "seed": config.seed,
+        "seeds": config.seeds,
+        "about": _about(config),
+        "overrides": overrides(),
+        "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
+        "solver_parameters": parameters // len(config.seeds),
+        "device": f"{device.type} {name}".strip(),
+        "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "threads": torch.get_num_threads(),
+        "collector": config.compute.collector,
+        "workers": config.compute.workers,
+        "versions": {
+            "python": platform.python_version(),
+            "torch": str(torch.__version__),  # with its build, which not all of its wheels tell
+            **{package: version(package) for package in packages},
+        },
+    }
+
+
+def to_go_on(path: Path) -> str:
+    """The command that goes on with the run in a folder."""
+    paths, config = _python_path(), _config_folder()
+    before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
+    options = ["--config-dir", config] if config else []
+    own = [word for word in overrides() if not word.startswith("+sweep=")]
+    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(path))}"])
+    return " ".join([*before, "bin/train", words])
+
+
+def quoted(path: str) -> str:
+    """A path as Hydra's grammar of overrides takes it: in its quotes, where it has to be."""
+    with suppress(HydraException):
+        if OverridesParser.create().parse_override(f"hydra.run.dir={path}").value() == path:
+            return path
+    return override_value(path)
+
+
+def _about(config: RunConfig) -> dict[str, str]:
+    """What method and ablation do, in the words of their files; those of one's own, too."""
+    own = _config_folder()
+    folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
+    chosen = {"method": config.method, "ablation": config.ablation}
+    said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
+    needed = needs(folders).get(config.method)
+    return said if needed is None else {**said, "needs": ", ".join(needed)}
+
+
+def _config_folder() -> str | None:
+    """The folder given with ``--config-dir``."""
+    sources = HydraConfig.get().runtime.config_sources
+    given = (source.path for source in sources if source.provider == "command-line")
+    return next(map(_from_here, given), None)
+
+
+def _python_path() -> str | None:
+    """The caller's PYTHONPATH: that of this process without the checkout, which bin/ adds."""
+    own = str(PACKAGE.parent)
+    given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+    return os.pathsep.join(_from_here(part) for part in given if part != own) or None
+
+
+def _from_here(path: str) -> str:
+    """A path as it can be given again on another machine: from the working folder, if inside it."""
+    inside = Path(path).resolve()
+    here = Path.cwd().resolve()
+    return str(inside.relative_to(here)) if inside.is_relative_to(here) else path

@@ -28,7 +28,7 @@ from proposer_rl.cli.callbacks import (
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
 from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 
 LONGEST = 300  # characters of what is said of a lost job
 BEGUN: list[Path] = []  # folders of this process's runs: what comes after is no matter of overrides
@@ -78,10 +78,11 @@ def _main(hydra_config: DictConfig) -> float:
         check_groups(overrides())
         check_chosen(hydra_config)
         with signals:  # already now: amid imports is no place to stop
-            from proposer_rl.cli.config import read_config  # only now: it takes seconds
+            from proposer_rl.cli import shown  # only now: it takes seconds
+            from proposer_rl.cli.config import read_config
             from proposer_rl.cli.run import train
 
-            return train(read_config(hydra_config), path, signals)
+            return train(read_config(hydra_config), path, signals, shown)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return record_failure(path, error)

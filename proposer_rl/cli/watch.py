@@ -12,10 +12,8 @@ from pathlib import Path
 from rich.console import Console, RenderableType
 from rich.live import Live
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
-from proposer_rl.report.progress import find_progress
-from proposer_rl.report.terminal import overview, screen
+from proposer_rl.cli.errors import command, number
+from proposer_rl.report.terminal import find_progress, overview, screen
 
 EPILOG = """\
 examples:

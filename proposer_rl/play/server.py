@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from proposer_rl.play.session import LARGEST_BODY, Examine, Session, Source, Write
-from proposer_rl.report.records import checked, printable
+from proposer_rl.runs.records import checked, printable
 
 HOSTS = ["127.0.0.1", "localhost"]
 CONNECTIONS = 256  # at once; of more, the one that has asked nothing for longest is closed

@@ -12,12 +12,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from proposer_rl.learning import PPO
-from proposer_rl.play.board import Board, PlayableTask
-from proposer_rl.report.records import SampleRecord, checked
 from proposer_rl.runs.checkpoint import checkpoint_files
 from proposer_rl.runs.folder import read_jsonl
+from proposer_rl.runs.records import SampleRecord, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Task
+from proposer_rl.task import Board, Levels, PlayableTask, Task
 
 SHOWN = 12  # levels of a draw
 MOST_LEVELS = 200  # of a file
@@ -140,7 +139,7 @@ class Session:
         }
 
     def examine(self, question: Examine) -> dict[str, Any]:
-        """What a Solver does on a drawing; see :meth:`~proposer_rl.play.board.Board.examine`.
+        """What a Solver does on a drawing; see :meth:`~proposer_rl.task.Board.examine`.
 
         Raises:
             ValueError: if there is no such Solver, or the drawing is no level.

@@ -10,32 +10,32 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import curves, outcomes, page, pictures, tidy
-from proposer_rl.report.answer import Meanings, answer
+from proposer_rl.report import figures, outcomes, page, runs
 from proposer_rl.report.charts import charts
+from proposer_rl.report.outcomes import Meanings, answer
 from proposer_rl.report.reading import OutputError, find_runs
-from proposer_rl.report.records import encoded, words
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
 from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
+from proposer_rl.runs.records import encoded, words
 
 PAGE = "report.html"
 FIGURES, TABLES = "figures", "tables"
 
 # In the order of the page.
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
-    curves.learning_curves,
-    curves.cost_curves,
-    curves.difficulty,
-    pictures.heat_maps,
-    pictures.along_training,
-    pictures.side_by_side,
-    pictures.recorded_by_curricula,
+    figures.learning_curves,
+    figures.cost_curves,
+    figures.difficulty,
+    figures.heat_maps,
+    figures.along_training,
+    figures.side_by_side,
+    figures.recorded_by_curricula,
 )
 
 # These are no charts, so that the page has them as pictures.
-STILL = {pictures.side_by_side, pictures.recorded_by_curricula}
+STILL = {figures.side_by_side, figures.recorded_by_curricula}
 
 # What is to be said of means over the worst share of the levels, by whether they are exact.
 SELECTION = {
@@ -131,16 +131,16 @@ def _section(
         files[f"{TABLES}/{prefix}{table.name}.csv"] = encoded(table.to_csv())
         files[f"{TABLES}/{prefix}{table.name}.md"] = encoded(table.to_markdown())
     named = [(group.label, run) for group in study.groups for run in group.runs]
-    rows = tidy.tables(named, "method")
-    files |= {f"{TABLES}/{prefix}{name}.csv": tidy.to_csv(own) for name, own in rows.items()}
-    figures = []
+    rows = runs.tables(named, "method")
+    files |= {f"{TABLES}/{prefix}{name}.csv": runs.to_csv(own) for name, own in rows.items()}
+    still = []
     for draw in DRAWINGS:
         drawing = draw(study)
         if drawing is not None:
             path = f"{FIGURES}/{prefix}{drawing.name}"
             svg, png = render(drawing, "svg", "png")
             if draw in STILL:
-                figures.append(page.figure(drawing, png))
+                still.append(page.figure(drawing, png))
             files |= {f"{path}.svg": svg, f"{path}.png": png}
         bar.update()
     data = charts(study)
@@ -160,7 +160,7 @@ def _section(
         "single": bool(data["levels"]),
         "selection": SELECTION[study.example.task.exact],
         "methods": methods,
-        "figures": figures,
+        "figures": still,
         "tables": tables,
         "commands": page.commands(study),
         "configs": page.configs(study),

@@ -15,11 +15,11 @@ from PIL import Image
 from proposer_rl.report import measures
 from proposer_rl.report.comparisons import Outcome, outcomes
 from proposer_rl.report.measures import Measure, Series, axis_text
-from proposer_rl.report.records import LevelRecord, Record, number, picture
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import LevelRecord, Record, number, picture
 
 Json = Any
 DIGITS = 5

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from proposer_rl.report import statistics
-from proposer_rl.report.records import level_text, words
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import Estimate, Interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import level_text, words
 
 ALIKE = 0.1  # of a rate: differences below it are small, and who gained less learnt nothing
 

@@ -10,7 +10,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pandas as pd
 
-from proposer_rl.report.records import (
+from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.studies import Group, Study
+from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import (
     GAINS,
     LONGEST_TEXT,
     PLACE,
@@ -20,9 +23,6 @@ from proposer_rl.report.records import (
     numbers,
     words,
 )
-from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.studies import Group, Study
-from proposer_rl.runs.folder import is_rate
 
 UPDATES = "Solver updates"
 # What training cost beside updates: in words, and of a run at each of its evaluations.

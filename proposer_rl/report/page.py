@@ -16,13 +16,12 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
-from proposer_rl.report.answer import Meanings, answer, meaning
-from proposer_rl.report.outcomes import against_baseline, group_table
-from proposer_rl.report.records import anywhere, level_text, words
+from proposer_rl.report.outcomes import Meanings, against_baseline, answer, group_table, meaning
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import DPI, Drawing, in_few_colours
 from proposer_rl.report.tables import escape_markdown
+from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
 LONGEST_WORD = 2000  # of a command

@@ -5,6 +5,7 @@ Whatever is not as it should be raises :class:`UnreadableRun`, which names the f
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -16,7 +17,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from proposer_rl.report.records import (
+from proposer_rl.report.runs import COST, LARGEST_FILE, NAMES, STUDY, Run
+from proposer_rl.runs.folder import FAILURE, is_rate, read_bounded, read_csv, read_jsonl
+from proposer_rl.runs.records import (
     LARGEST,
     Column,
     LevelResults,
@@ -30,12 +33,8 @@ from proposer_rl.report.records import (
     number,
     printable,
 )
-from proposer_rl.report.runs import COST, Run
-from proposer_rl.report.tidy import LARGEST_FILE, NAMES, STUDY, read_table
-from proposer_rl.runs.folder import is_rate, read_csv, read_jsonl
 
 MOST_FOLDERS = 20_000
-FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
 
@@ -123,7 +122,7 @@ def _read_study(folder: Path) -> list[Run]:
     """The runs of a study, as ``bin/research publish`` writes it; they lie in the folder."""
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
-    for row in read_table(folder / STUDY).to_dict("records"):
+    for row in _table(folder / STUDY).to_dict("records"):
         name, config = row["run"], json.loads(row["config"])
         facts = checked(dict[str, Any], json.loads(row["facts"]), f"{STUDY}: facts")
         if ".." in Path(checked(Text, name, f"{STUDY}: run")).parts or Path(name).is_absolute():
@@ -148,11 +147,30 @@ def _read_study(folder: Path) -> list[Run]:
     return runs
 
 
+def _table(file: Path) -> pd.DataFrame:
+    """A table of a study, its cells as text; NaN where one is empty."""
+    import lzma  # which not every Python is built with
+
+    if file.is_symlink():
+        raise ValueError(f"{file.name} is not a plain file")
+    content = read_bounded(file, LARGEST_FILE)
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=2 * LARGEST_FILE)
+    try:
+        text = unpacker.decompress(content, LARGEST_FILE + 1)
+    except (lzma.LZMAError, EOFError) as error:
+        raise ValueError(f"{file.name} is not packed by xz: {error}") from None
+    if len(text) > LARGEST_FILE or not unpacker.eof:
+        raise ValueError(f"{file.name} is cut off, or larger than {LARGEST_FILE // 2**20} MiB")
+    return pd.read_csv(
+        io.BytesIO(text), dtype=str, keep_default_na=False, na_values=[""], index_col=False
+    )
+
+
 def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
     """A table of a study in those of its runs; columns that a run has nothing in are left out."""
     if not (folder / f"{name}.csv.xz").exists():
         return {}
-    table = read_table(folder / f"{name}.csv.xz")
+    table = _table(folder / f"{name}.csv.xz")
     values = table.drop(columns="run")
     known = values.notna().groupby(table["run"]).any()
     places = values.groupby(table["run"]).indices

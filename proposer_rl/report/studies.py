@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from proposer_rl.report.reading import UnreadableRun, read_run
-from proposer_rl.report.records import Column
 from proposer_rl.report.runs import Run
 from proposer_rl.report.style import Look, looks
+from proposer_rl.runs.records import Column
 
 USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from proposer_rl.report.records import Column
+from proposer_rl.runs.records import Column
 
 # Okabe and Ito's colours, which stay distinct under the common forms of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"

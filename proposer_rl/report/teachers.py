@@ -15,10 +15,10 @@ from matplotlib.figure import FigureBase
 
 from proposer_rl.report.build import check_output
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.records import LARGEST, Column, printable
+from proposer_rl.report.runs import LARGEST_FILE
 from proposer_rl.report.style import Drawing, Look, finish, looks, render, style
-from proposer_rl.report.tidy import LARGEST_FILE
 from proposer_rl.runs.folder import read_jsonl, write_atomically
+from proposer_rl.runs.records import LARGEST, Column, printable
 
 PAGE = "teachers.html"
 COMMON = ("mean_return", "mean_success", "proposed", "told", "dropped", "out")

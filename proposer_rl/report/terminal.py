@@ -1,10 +1,14 @@
-"""Runs drawn in characters: one run as a screen, several as a table."""
+"""How far runs and sweeps are, drawn in characters: one run as a screen, several as a table."""
 
 from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from rich.columns import Columns
@@ -14,18 +18,21 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from proposer_rl.report.progress import Progress, duration
-from proposer_rl.report.records import (
+from proposer_rl.report.reading import UnreadableRun, begun, read_run
+from proposer_rl.report.runs import Run, share_map
+from proposer_rl.runs.folder import FAILURE, is_rate
+from proposer_rl.runs.process import PROGRESS
+from proposer_rl.runs.records import (
     GAINS,
+    LONGEST_TEXT,
     PLACE,
     Column,
     number,
     numbers,
     printable,
+    small_json,
     words,
 )
-from proposer_rl.report.runs import Run, share_map
-from proposer_rl.runs.folder import is_rate
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 SHADES = " ░▒▓█"
@@ -34,6 +41,105 @@ WIDTH = 30  # characters of a curve
 LEVELS = 3
 NUMBERS = 8  # of a curriculum that is shown by its own
 WIDEST_MAP = 20
+STOPPED = 128  # a greater exit code is that of a signal: the run can go on
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that reads best."""
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of one run's folder.
+
+    Attributes:
+        folder: of the run.
+        runs: its seeds; empty if it has not measured anything yet, or failed before.
+        failure: why it failed, in one line; empty if it did not.
+        age: seconds since something was written.
+        activity: what it was doing then, and how long the rest takes; empty if it does not say or
+            has failed.
+    """
+
+    folder: Path
+    runs: tuple[Run, ...]
+    failure: str
+    age: float
+    activity: str = ""
+
+    @property
+    def state(self) -> str:
+        """In a word: failed, finished, unfinished (running or interrupted) or starting."""
+        if self.failure:
+            return "failed"
+        if not self.runs:
+            return "starting"
+        return "finished" if all(run.finished for run in self.runs) else "unfinished"
+
+
+def read_progress(folder: Path) -> Progress:
+    """The state of a run's folder, whatever of it is there yet."""
+    failure = _failure(folder)
+    try:
+        runs = tuple(read_run(folder))
+    except UnreadableRun as error:
+        runs = ()
+        if not failure and (folder / "metrics.csv").is_file():
+            failure = printable(str(error).removeprefix(f"{folder}: "))
+    activity = "" if failure else _doing(folder)
+    if activity and runs:
+        activity = ", ".join(filter(None, [activity, _left(runs[0])]))
+    return Progress(folder, runs, failure, _seconds_since(folder), activity)
+
+
+def find_progress(folder: Path) -> list[Progress]:
+    """The states of all runs in a folder, or of the folder itself."""
+    found = [read_progress(path) for path in begun(folder)]
+    if not found:
+        raise UnreadableRun(f"{folder}: no run in it, finished or begun")
+    return found
+
+
+def _failure(folder: Path) -> str:
+    if not (folder / FAILURE).is_file():
+        return ""
+    match small_json(folder / FAILURE):
+        case {"exit_code": int(code)} if code > STOPPED:
+            return ""
+        case {"message": message}:
+            return printable(str(message))[:LONGEST_TEXT]
+    return f"{FAILURE} cannot be read"
+
+
+def _doing(folder: Path) -> str:
+    """What a run says that it is doing; empty where it is over or the file cannot be read."""
+    match small_json(folder / PROGRESS, 2**12):
+        case {"doing": str(text)}:
+            return printable(text)[:LONGEST_TEXT]
+    return ""
+
+
+def _left(run: Run) -> str:
+    """How long the rest takes if each update takes as long as those so far; empty before one."""
+    if not run.updates or run.planned is None:
+        return ""
+    rest = run.last("seconds") / run.updates * (run.planned - run.updates)
+    since = time.time() - (run.folder / "metrics.csv").stat().st_mtime
+    return f"about {duration(max(rest - since, 0.0))} left"
+
+
+def _seconds_since(folder: Path) -> float:
+    """Returns how long ago something in a folder was written; 0 where it is empty."""
+    times = []
+    for entry in os.scandir(folder):
+        with suppress(FileNotFoundError):  # its temporary name is gone once a file is written
+            if entry.is_file():
+                times.append(entry.stat().st_mtime)
+    return max(time.time() - max(times), 0.0) if times else 0.0
 
 
 def screen(progress: Progress) -> RenderableType:

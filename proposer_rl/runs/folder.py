@@ -22,6 +22,7 @@ Number = int | float
 
 # What a run writes row by row; all else in its folder, tables of its user's too, is left alone.
 TABLES = ("curriculum.jsonl", "cycles.jsonl", "levels.jsonl", "metrics.csv", "training.csv")
+FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 PROPOSER = "proposer.pt"  # what a run's curriculum has learnt, alone: a checkpoint without Solvers
 # By how much a mean may miss a threshold that it reached: 18 of 20 in float32 is 0.89999998.
 SLACK = 1e-6

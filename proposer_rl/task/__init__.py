@@ -1,6 +1,8 @@
 """Tasks: what they are made of, and the base of all."""
 
 from proposer_rl.task.base import Task as Task
+from proposer_rl.task.protocols import Board as Board
+from proposer_rl.task.protocols import CellKind as CellKind
 from proposer_rl.task.protocols import ComputeContext as ComputeContext
 from proposer_rl.task.protocols import DifferentiableTask as DifferentiableTask
 from proposer_rl.task.protocols import Distribution as Distribution
@@ -12,6 +14,7 @@ from proposer_rl.task.protocols import Levels as Levels
 from proposer_rl.task.protocols import LocatedTarget as LocatedTarget
 from proposer_rl.task.protocols import NoSuccessError as NoSuccessError
 from proposer_rl.task.protocols import OptimalTask as OptimalTask
+from proposer_rl.task.protocols import PlayableTask as PlayableTask
 from proposer_rl.task.protocols import Space as Space
 from proposer_rl.task.protocols import check_distributions as check_distributions
 from proposer_rl.task.protocols import distribution_of as distribution_of

@@ -29,7 +29,7 @@ from proposer_rl.learning import (
     mean_performance,
 )
 from proposer_rl.models import ActorCritic, Population, normal
-from proposer_rl.runs.pictures import pixels, png, written
+from proposer_rl.runs.records import pixels, png, written
 from proposer_rl.streams import Streams
 from proposer_rl.task.protocols import (
     ComputeContext,

@@ -6,8 +6,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.arguments import number
-from proposer_rl.cli.errors import command
+from proposer_rl.cli.errors import command, number
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from proposer_rl.cli.config import RunConfig, checked_config
 from proposer_rl.curricula import LearnedCurriculum, TaskStudent, outcome_of
 from proposer_rl.report.reading import UnreadableRun, find_runs
 from proposer_rl.report.studies import Group, Study, read_studies
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from research.benchmarks.results import Options, Result, Row, Spread, Table
 from research.benchmarks.scales import PAPER, QUICK, TINY, Scale

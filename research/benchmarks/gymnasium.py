@@ -21,7 +21,7 @@ from proposer_rl.curricula import TaskStudent
 from proposer_rl.curricula.continued import ContinuedLevels
 from proposer_rl.recipes import CONFIG_FOLDER, override_value
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from research.benchmarks.results import Options, Result, Row, Spread, Table
 from research.benchmarks.sb3_peer import train_sb3

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from proposer_rl.runs.machine import processor
+from proposer_rl.runs.process import processor
 from research.benchmarks.results import Result, Row, Spread, Unit
 
 HEADER = ["what", "against", "measured", "from – to", "target", "reached"]

@@ -19,7 +19,7 @@ from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.learning import PPO
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level
 from proposer_rl.tasks.mazes.task import MazeTask

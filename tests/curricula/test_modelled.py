@@ -16,7 +16,7 @@ from proposer_rl.cli.build import build, parts
 from proposer_rl.curricula import Filtered, Modelled, SamplingCurriculum, Scorer, Student
 from proposer_rl.curricula.outcome_model import OutcomeModel
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import space_features

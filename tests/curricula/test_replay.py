@@ -23,7 +23,7 @@ from proposer_rl.curricula.buffer import (
 from proposer_rl.curricula.children import easiness, lineage
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import planes
 from tests.curricula.living import live, solvers, student

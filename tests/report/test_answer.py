@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from proposer_rl.report.answer import answer, meaning
 from proposer_rl.report.comparisons import UNDECIDED
-from proposer_rl.report.outcomes import comparison_table
+from proposer_rl.report.outcomes import answer, comparison_table, meaning
 from proposer_rl.report.studies import Study, read_studies
 from tests.report.folders import write_run
 

@@ -20,8 +20,7 @@ from proposer_rl.cli.report import main
 from proposer_rl.cli.watch import main as watch
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
-from proposer_rl.report.curves import cost_curves
-from proposer_rl.report.pictures import along_training, draw_run, side_by_side
+from proposer_rl.report.figures import along_training, cost_curves, draw_run, side_by_side
 from tests.report.folders import LEVEL, TASK, cycle, page_data, write_rockets, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
@@ -292,7 +291,7 @@ def test_pictures_that_cannot_be_shown_leave_their_place_empty(
 def test_only_what_writes_a_page_loads_its_library() -> None:
     """Help, and looking at runs, must come at once."""
     asked = (
-        "import sys, proposer_rl.cli.report, proposer_rl.cli.watch, proposer_rl.report.pictures; "
+        "import sys, proposer_rl.cli.report, proposer_rl.cli.watch, proposer_rl.report.figures; "
         "print({'plotly', 'torch'} & set(sys.modules))"
     )
     said = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)

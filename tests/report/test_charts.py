@@ -17,7 +17,7 @@ from PIL import Image
 from proposer_rl.report import build, page
 from proposer_rl.report.build import write_report
 from proposer_rl.report.charts import charts
-from proposer_rl.report.curves import learning_curves
+from proposer_rl.report.figures import learning_curves
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import render
 from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run

@@ -15,7 +15,6 @@ import pytest
 from scipy import stats
 
 from proposer_rl.report.comparisons import decisions, waiting_outcome
-from proposer_rl.report.records import TaskFacts
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     ERROR,
@@ -29,6 +28,7 @@ from proposer_rl.report.statistics import (
     probability_of_improvement,
 )
 from proposer_rl.report.studies import Group, Study
+from proposer_rl.runs.records import TaskFacts
 from tests.report.folders import TASK, config
 
 REPLICATIONS, ENOUGH = 2000, 0.93

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from proposer_rl.report.answer import answer
-from proposer_rl.report.outcomes import comparison_table, group_table, run_table
+from proposer_rl.report.outcomes import answer, comparison_table, group_table, run_table
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.tables import Table, write

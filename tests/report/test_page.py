@@ -11,7 +11,7 @@ import pytest
 
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
-from proposer_rl.report.curves import cost_curves
+from proposer_rl.report.figures import cost_curves
 from tests.report.folders import LEVEL, PIXELS, cycle, png, write_jsonl, write_run
 
 CHROMIUM = shutil.which("chromium")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from proposer_rl.report import reading
-from proposer_rl.report.pictures import draw_run
+from proposer_rl.report.figures import draw_run
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from proposer_rl.report import build
 from proposer_rl.report.charts import charts
-from proposer_rl.report.curves import difficulty
+from proposer_rl.report.figures import difficulty
 from proposer_rl.report.measures import worst, worst_means
 from proposer_rl.report.outcomes import group_table
 from proposer_rl.report.statistics import median_interval, median_of

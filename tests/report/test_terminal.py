@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.cli.watch import main
-from proposer_rl.report import progress
-from proposer_rl.report.progress import duration, find_progress, read_progress
-from proposer_rl.report.terminal import BLOCKS, sparkline
+from proposer_rl.report import terminal
+from proposer_rl.report.terminal import BLOCKS, duration, find_progress, read_progress, sparkline
 from tests.report.folders import TASK, cycle, write_run
 
 
@@ -119,7 +118,7 @@ def test_a_file_that_gets_its_name_meanwhile_is_no_error(
         os.replace(temporary, folder / "progress.json")
         return iter(found)
 
-    monkeypatch.setattr(progress.os, "scandir", renamed_after)
+    monkeypatch.setattr(terminal.os, "scandir", renamed_after)
     assert 0 <= read_progress(folder).age < 60
 
 

@@ -15,7 +15,7 @@ from scipy import integrate, stats
 
 from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report.curves import cost_curves, learning_curves
+from proposer_rl.report.figures import cost_curves, learning_curves
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing

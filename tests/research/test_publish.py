@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.cli.report import main as report
-from proposer_rl.report.curves import learning_curves
+from proposer_rl.report.figures import learning_curves
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
+from proposer_rl.report.runs import tables
 from proposer_rl.report.studies import read_studies
-from proposer_rl.report.tidy import tables
 from research import publish
 from research.publish import main
 from tests.report.folders import LEVEL, TASK, cycle, write_run

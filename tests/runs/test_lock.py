@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.runs.folder import StorageError
-from proposer_rl.runs.lock import InUseError, locked
+from proposer_rl.runs.process import InUseError, locked
 
 
 def test_a_folder_is_locked_until_the_end_and_can_be_locked_again(tmp_path: Path) -> None:

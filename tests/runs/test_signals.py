@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from proposer_rl.runs.signals import STOP_SIGNALS, Interrupted, StopSignals
+from proposer_rl.runs.process import STOP_SIGNALS, Interrupted, StopSignals
 from tests.processes import ROOT, python
 
 
@@ -104,7 +104,7 @@ def test_other_threads_change_nothing() -> None:
 SHIELDED = """
 import os, time
 from multiprocessing import Lock, resource_tracker
-from proposer_rl.runs.signals import STOP_SIGNALS, StopSignals
+from proposer_rl.runs.process import STOP_SIGNALS, StopSignals
 with StopSignals():
     Lock()
     for signum in STOP_SIGNALS:

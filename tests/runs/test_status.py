@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from proposer_rl.runs.status import FILE, Status
+from proposer_rl.runs.process import PROGRESS, Status
 
 
 class Clock:
@@ -27,7 +27,7 @@ def test_the_file_says_what_is_going_on_and_is_gone_at_the_end(tmp_path: Path) -
             clock.now += 10
             status.tell("training the copies", part)
         status.tell("at once")  # nothing is written more often than once a second
-        assert json.loads((tmp_path / FILE).read_text()) == {"doing": "training the copies 4/4"}
+        assert json.loads((tmp_path / PROGRESS).read_text()) == {"doing": "training the copies 4/4"}
     assert shown == [
         "improving",
         "training the copies",
@@ -43,7 +43,7 @@ def test_a_run_that_stops_or_breaks_does_nothing_any_more(
     status = Status(clock=(clock := Clock()))
     with pytest.raises(stop), status.of_run(tmp_path, lambda: None):
         status.tell("update")
-        assert json.loads((tmp_path / FILE).read_text())["doing"] == "update"
+        assert json.loads((tmp_path / PROGRESS).read_text())["doing"] == "update"
         raise stop
     assert not list(tmp_path.iterdir())
     clock.now += 10

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from proposer_rl.runs.pictures import written
+from proposer_rl.runs.records import written
 from proposer_rl.tasks.gymnasium.env import as_actions
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.settings import ParameterSettings

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.models import ActorCritic, cell_maps
-from proposer_rl.play.board import CellKind
+from proposer_rl.task import CellKind
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     expected_visits,
@@ -40,7 +40,7 @@ DIGITS = 4  # of the numbers of a map: what can be seen
 
 
 class Drawings:
-    """Mazes as drawings: of a :class:`~proposer_rl.play.board.Board` all but what a Solver does.
+    """Mazes as drawings: of a :class:`~proposer_rl.task.Board` all but what a Solver does.
 
     Args:
         task: whose levels are drawn.
@@ -54,7 +54,7 @@ class Drawings:
         self.sets = shipped_sets()
 
     def read(self, rows: Sequence[str]) -> Any:
-        """The level that is drawn; see :class:`~proposer_rl.play.board.Board`."""
+        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
         # The message of a drawing shows it; here it was seen already.
         try:
             level = self._task.level.from_text("\n".join(rows))
@@ -81,7 +81,7 @@ class Drawings:
 
 
 class MazeBoard(Drawings):
-    """Mazes that are seen whole; a :class:`~proposer_rl.play.board.Board`."""
+    """Mazes that are seen whole; a :class:`~proposer_rl.task.Board`."""
 
     kinds = (
         CellKind(FREE, "free"),
@@ -95,7 +95,7 @@ class MazeBoard(Drawings):
     def examine(
         self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, exactly; see :class:`~proposer_rl.play.board.Board`.
+        """What a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
 
         ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
         ``maps``: the critic's values; the probability of success from every cell with the whole

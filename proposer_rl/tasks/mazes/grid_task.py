@@ -15,8 +15,7 @@ from torch import Tensor
 
 from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
-from proposer_rl.play.board import Board
-from proposer_rl.task import ComputeContext, LevelResult, Task, check_distributions, named
+from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
 from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.learning import in_first_episode
-from proposer_rl.runs.pictures import png
+from proposer_rl.runs.records import png
 from proposer_rl.tasks.mazes.levels import FREE, Level
 
 EPISODE = "•"  # a free cell that the Solver's episode went through

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 
 from proposer_rl.models import ActorCritic
-from proposer_rl.play.board import CellKind
 from proposer_rl.streams import Streams
+from proposer_rl.task import CellKind
 from proposer_rl.tasks.mazes.board import Drawings
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import FREE, GOAL, WALL, cell_index
@@ -21,7 +21,7 @@ Node = list[int]  # row, column and direction
 
 
 class ViewBoard(Drawings):
-    """Mazes seen through a window; a board (:mod:`proposer_rl.play.board`) without policy and maps.
+    """Mazes seen through a window; a :class:`~proposer_rl.task.Board` without policy and maps.
 
     What a Solver does in a cell depends on what it remembers, so that only episodes can be shown.
 
@@ -46,7 +46,7 @@ class ViewBoard(Drawings):
     def examine(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, by playing; see :class:`~proposer_rl.play.board.Board`.
+        """What a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
 
         ``results``: means over sampled episodes, those of ``bin/eval`` on a level named ``drawn``.
         """

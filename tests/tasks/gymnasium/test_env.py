@@ -11,7 +11,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.runs.signals import StopSignals
+from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment

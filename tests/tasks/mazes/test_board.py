@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from proposer_rl.models import ActorCritic, cell_maps
-from proposer_rl.play.board import PlayableTask
 from proposer_rl.streams import Streams
+from proposer_rl.task import PlayableTask
 from proposer_rl.tasks.mazes import Level, MazeEnv, planes
 from proposer_rl.tasks.mazes.board import shortest_path
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from proposer_rl.report import records
-from proposer_rl.report.records import level_text, number, numbers, picture, words
+from proposer_rl.runs import records
+from proposer_rl.runs.records import level_text, number, numbers, picture, words
 from tests.report.folders import LEVEL, PIXELS, png
 
 

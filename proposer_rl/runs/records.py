@@ -8,14 +8,14 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw
 from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from proposer_rl.runs.folder import is_rate, read_bounded
@@ -32,6 +32,11 @@ PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histog
 Column = NDArray[np.float64]
 Record = Mapping[str, Any]
 T = TypeVar("T")
+Result = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
+Results = Annotated[list[Result], Field(min_length=1)]
+_adapter = cache(TypeAdapter)  # making one takes longer than checking a value
+COLOURS = 64  # of a picture: enough for drawings, and a third of the bytes
+WIDTH = 150  # pixels, of lines of text
 
 
 def _one_line(text: str) -> str:
@@ -51,8 +56,6 @@ class LevelRecord(BaseModel):
     text: Annotated[list[Text], Field(max_length=64)] = []
 
 
-Result = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
-Results = Annotated[list[Result], Field(min_length=1)]
 # What a cycle tells in pictures, by their captions.
 Sheets = Annotated[dict[Name, list[LevelRecord]], Field(max_length=16)]
 
@@ -104,9 +107,6 @@ class TaskFacts(BaseModel):
     key: Text = ""
     text_key: Text = ""
     exact: bool | None = None
-
-
-_adapter = cache(TypeAdapter)  # making one takes longer than checking a value
 
 
 def checked(kind: type[T], value: Any, where: str) -> T:
@@ -193,3 +193,24 @@ def words(name: str) -> str:
 def level_text(name: str, value: float) -> str:
     """A value of a column as a reader wants it: 80% of a success, 0.8 of anything else."""
     return f"{100 * value:g}%" if is_rate(name) else f"{value:g}"
+
+
+def png(picture: NDArray[np.uint8]) -> str:
+    """A picture uint8 [H, W, 3] as PNG in base64; of many colours the most frequent are kept."""
+    image = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def pixels(text: str) -> NDArray[np.uint8]:
+    """The picture uint8 [H, W, 3] that :func:`png` made a text of; only for texts of our own."""
+    with Image.open(io.BytesIO(base64.b64decode(text)), formats=["PNG"]) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def written(lines: Sequence[str]) -> NDArray[np.uint8]:
+    """Lines of text as a picture, uint8 [H, W, 3]."""
+    image = Image.new("RGB", (WIDTH, 8 + 14 * len(lines)), (250, 250, 250))
+    ImageDraw.Draw(image).multiline_text((4, 4), "\n".join(lines), (45, 45, 45))
+    return np.asarray(image)

@@ -1,0 +1,104 @@
+"""What a run shows, and a sweep when it is over: it is read from their folders.
+
+Training is given this module and knows nothing of what draws; figures take a while to import.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+from rich.console import Console
+from tqdm import tqdm
+
+from proposer_rl.report.terminal import find_progress, overview, read_progress, screen
+from proposer_rl.runs.folder import FAILURE, is_rate
+from proposer_rl.runs.records import level_text
+
+
+class SweepSummary(Callback):
+    """Lists the runs of a sweep when it is over.
+
+    The exit code is that of a run that failed in it; other sweeps may have the same folder.
+    """
+
+    def __init__(self) -> None:
+        self._failed_before: dict[Path, int] = {}
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra before the first run."""
+        self._failed_before = _failures(config)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra after the last run, whatever became of the runs."""
+        found = find_progress(Path(config.hydra.sweep.dir))
+        Console().print(overview(found))
+        failed = _failures(config).items() - self._failed_before.items()
+        if failed:
+            # Hydra turns an exception of a callback into a warning, but lets an exit through.
+            sys.exit(max(int(json.loads(file.read_text())["exit_code"]) for file, _ in failed))
+
+
+def draw_run(folder: Path, title: str) -> Path:
+    """Draws ``run.png`` of a run's folder; returns the file."""
+    from proposer_rl.report import figures
+
+    return figures.draw_run(folder, title)
+
+
+def last_map(folder: Path) -> NDArray[np.uint8] | None:
+    """Returns the heat map of a run's last proposals, uint8 [H, W, 3]; None where it has none."""
+    from proposer_rl.report import figures
+
+    return figures.last_map(folder)
+
+
+def announce(
+    method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
+) -> None:
+    """Print the results; on one screen, unless the run is one of a sweep's."""
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        Console().print(screen(read_progress(folder)))
+    for seed, reached, final in zip(
+        seeds, result["updates_to_threshold"], result["final"], strict=True
+    ):
+        tqdm.write(f"{method}, seed {seed}: {_outcome_text(result, reached, final)}")
+    tqdm.write(_cost_text(result, len(seeds)))
+    tqdm.write(f"Files: {folder}  (picture: {picture.name})")
+
+
+def _outcome_text(
+    result: Mapping[str, Any], reached: int | None, final: Mapping[str, float]
+) -> str:
+    headline = result["headline"]
+    level = f"{level_text(headline, result['threshold'])} {headline.replace('_', ' ')}"
+    end = f"{final[headline]:.1%}" if is_rate(headline) else f"{final[headline]:.3g}"
+    outcome = (
+        f"{level} after {reached} updates"
+        if reached is not None
+        else f"{level} not reached in {result['updates']} updates (censored)"
+    )
+    return f"{outcome}; {end} at the end."
+
+
+def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
+    together = f" for each of {seeds} seeds" if seeds > 1 else ""
+    return (
+        f"Cost: {result['frames']:,} frames of the Solver{together}, "
+        f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
+    )
+
+
+def _failures(config: DictConfig) -> dict[Path, int]:
+    """What is recorded of failed runs in a sweep's folder, and when it was written."""
+    folder = Path(config.hydra.sweep.dir)
+    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

@@ -1,0 +1,231 @@
+"""The process of a run: signals that ask it to stop, its folder's lock, what it is doing, where."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from proposer_rl.runs.folder import storage, write_atomically
+
+# Ctrl-C; the polite kill; a closed terminal; what Slurm and submitit send before a job is
+# pre-empted or runs out of time.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+PROGRESS = "progress.json"
+EVERY = 1.0  # seconds between two writes
+
+
+class Interrupted(Exception):
+    """The run was asked to stop, and has saved what is needed to go on.
+
+    Attributes:
+        signum: the signal.
+    """
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signum).name}")
+        self.signum = signum
+
+    @property
+    def exit_code(self) -> int:
+        """That of a process which the signal ends, as shells have it."""
+        return 128 + self.signum
+
+
+class StopRequested(Exception):
+    """A signal has come during long work, which ends here and can be repeated."""
+
+
+class StopSignals:
+    """Inside this context a stop signal is kept until the run comes to a safe point.
+
+    A second SIGINT is not kept: it raises KeyboardInterrupt at once. A signal that is ignored (as
+    ``nohup`` has it) stays so. Outside of the main thread nothing is changed, since Python delivers
+    signals there only.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[int, Any] = {}
+        self._pending: int | None = None
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            _shield_tracker()
+            for signum in STOP_SIGNALS:
+                if signal.getsignal(signum) is not signal.SIG_IGN:
+                    self._before[signum] = signal.signal(signum, self._keep)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for signum, handler in self._before.items():
+            signal.signal(signum, handler)
+
+    @property
+    def pending(self) -> bool:
+        """Whether a signal has come."""
+        return self._pending is not None
+
+    def check(self) -> None:
+        """Interrupt long work that can be repeated.
+
+        Raises:
+            StopRequested: if a signal has come.
+        """
+        if self.pending:
+            raise StopRequested
+
+    def deliver(self) -> None:
+        """Act on the signal that has come: to be called once all is saved.
+
+        A handler that was there before this context is called, such as submitit's, which puts the
+        job into the queue again and exits; if it returns, the run goes on.
+
+        Raises:
+            Interrupted: if there was no such handler, or it raises, as submitit's does where a job
+                has run out of time too often to be queued again.
+        """
+        signum, self._pending = self._pending, None
+        if signum is None:
+            return
+        before = self._before[signum]
+        if not callable(before) or before is signal.default_int_handler:
+            raise Interrupted(signum)
+        try:
+            before(signum, None)
+        except Exception as error:
+            raise Interrupted(signum) from error
+
+    def _keep(self, signum: int, frame: FrameType | None) -> None:
+        if signum == signal.SIGINT and self._pending == signal.SIGINT:
+            raise KeyboardInterrupt
+        self._pending = signum
+        hint = "; once more: stop at once" if signum == signal.SIGINT else ""
+        line = f"\n{signal.Signals(signum).name}: saving at the next safe point{hint}\n"
+        os.write(2, line.encode())  # print is not safe to enter twice
+
+
+def _shield_tracker() -> None:
+    """Start Python's resource tracker with stop signals blocked for good, unless it runs already.
+
+    Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
+    and its successor complain in tracebacks of what it does not know.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class InUseError(RuntimeError):
+    """Another process works in the folder; the message is one line that names it."""
+
+    exit_code = 5
+
+
+@contextmanager
+def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep other processes out of a folder.
+
+    The operating system gives the lock up when the process ends, in whatever way: a lock of a dead
+    process blocks nobody.
+
+    Args:
+        folder: where ``.lock`` is made, and ``.holder.json``, which tells others who holds it.
+
+    Raises:
+        InUseError: at once, if another process holds it, naming host, process and start.
+        StorageError: if the folder cannot be written to.
+    """
+    path = Path(folder)
+    lock = FileLock(path / ".lock")
+    with storage(path / ".lock"):
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            raise InUseError(f"{path} is in use by {_holder(path)}") from None
+    try:
+        started = time.strftime("%Y-%m-%d %H:%M:%S")
+        holder = {"process": os.getpid(), "host": platform.node(), "started": started}
+        write_atomically(path / ".holder.json", json.dumps(holder).encode())
+        yield
+    finally:
+        lock.release()
+
+
+def _holder(folder: Path) -> str:
+    try:
+        holder = json.loads((folder / ".holder.json").read_text())
+        return f"process {holder['process']} on {holder['host']}, started {holder['started']}"
+    except (OSError, ValueError, TypeError, KeyError):
+        return "another process"  # which has just begun
+
+
+class Status:
+    """Says what a run is doing.
+
+    Args:
+        parts: number of parts of the work that is told in parts.
+        clock: seconds.
+    """
+
+    def __init__(self, parts: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
+        self.doing = ""
+        self._parts = parts
+        self._clock = clock
+        self._folder: Path | None = None
+        self._told = -EVERY
+        self._show: Callable[[], None] = lambda: None
+
+    @contextmanager
+    def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
+        """While a run goes on, report it in its folder, and call ``show`` as often."""
+        self._folder, self._show = folder, show
+        try:
+            yield
+        finally:
+            self._folder = None
+            # A run that is over does nothing, however it ended; and why it did is to be told, not
+            # that a file of no worth stays.
+            with suppress(OSError):
+                (folder / PROGRESS).unlink()
+
+    def tell(self, doing: str, part: int = 0) -> None:
+        """Say what the run does, and how many parts of it are done; 0 where it has none."""
+        self.doing = f"{doing} {min(part, self._parts)}/{self._parts}" if part else doing
+        now = self._clock()
+        if self._folder is None or now - self._told < EVERY:
+            return
+        self._told = now
+        content = json.dumps({"doing": self.doing}).encode()
+        write_atomically(self._folder / PROGRESS, content, durably=False)
+        self._show()
+
+
+def processor() -> str:
+    """The processor's name, or else its kind."""
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def memory() -> int:
+    """Bytes that this process can have: the machine's, or what a container or Slurm allows."""
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):  # "max", or no such file
+        return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return whole
