@@ -62,16 +62,29 @@ def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
     )
 
 
-def step_by_hand(
-    expected: ActorCritic, policy: torch.distributions.Categorical, choices: Tensor
-) -> None:
-    """Adam's first, on the objective of draws [..., P] that are paid as their bins are wanted."""
+def filtered(curriculum: Curriculum, times: int) -> Curriculum:
+    """Trains on one in so many levels: those with the highest scores, which are the last."""
+    scores = GivenScores(torch.arange(float(times * P)).unsqueeze(0))
+    return curriculum if times == 1 else Filtered(curriculum, scores, times=times, temperature=1e-3)
+
+
+def step_by_hand(expected: ActorCritic, streams: Streams, times: int, kept: slice) -> Tensor:
+    """Makes Adam's first step, on the objective of draws that are paid as their bins are wanted.
+
+    Returns:
+        The last P draws.
+    """
+    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
+    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
+    noise = torch.rand(times, 1, P, generator=streams.generator("choices"))
+    choices = draw_at(policy, noise)[kept]  # [times, 1, P]
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
     adam = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
     loss.backward()
     adam.step()
+    return choices[-1, 0]
 
 
 def assert_same_weights(found: ActorCritic, expected: ActorCritic) -> None:
@@ -110,22 +123,10 @@ def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     task = Seen(1, WANTED)
     curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
     expected, student = copy.deepcopy(curriculum.agent), taught(task)
-    scores = torch.arange(float(times * P)).unsqueeze(0)
-    whole = (
-        curriculum
-        if times == 1
-        else Filtered(curriculum, GivenScores(scores), times=times, temperature=1e-3)
-    )
-    batch = whole.propose(student, P, [Streams(0)])
+    batch = filtered(curriculum, times).propose(student, P, [Streams(0)])
     assert student.evaluations == 3 + 2 * P * times
-
-    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
-    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(times, 1, P, generator=Streams(0).generator("choices"))
-    choices = draw_at(policy, noise)  # [times, 1, P]
-    # Of the scores above those of the last are the highest.
-    assert sorted(batch.levels[0].tolist()) == sorted(choices[-1, 0].tolist())
-    step_by_hand(expected, policy, choices)
+    last = step_by_hand(expected, Streams(0), times, slice(None))
+    assert sorted(batch.levels[0].tolist()) == sorted(last.tolist())
     assert_same_weights(curriculum.agent, expected)
 
 
@@ -200,23 +201,13 @@ def observed(curriculum: Curriculum, batch: Batch) -> None:
 def test_every_problem_that_was_trained_on_is_credited_with_its_episodes(times: int) -> None:
     curriculum = sampled(epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
     expected = copy.deepcopy(curriculum.agent)
-    scores = torch.arange(float(times * P)).unsqueeze(0)
-    whole = (
-        curriculum
-        if times == 1
-        else Filtered(curriculum, GivenScores(scores), times=times, temperature=1e-3)
-    )
+    whole = filtered(curriculum, times)
     trained(whole, 0)  # there is no direction yet
     levels = trained(whole, 1)
     assert_same_weights(curriculum.agent, expected)
     trained(whole, 2)
-
-    seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
-    policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(times, 1, P, generator=Streams(0, 1).generator("choices"))
-    choices = draw_at(policy, noise)[-1, 0]  # of the scores above those of the last are the highest
-    assert sorted(levels[0].tolist()) == sorted(choices.tolist())
-    step_by_hand(expected, policy, choices)
+    last = step_by_hand(expected, Streams(0, 1), times, slice(-1, None))
+    assert sorted(levels[0].tolist()) == sorted(last.tolist())
     assert_same_weights(curriculum.agent, expected)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import product
 
 import pytest
 import torch
@@ -123,7 +124,7 @@ def test_a_reward_of_another_shape_is_refused(shape: list[int]) -> None:
         played(meta_env(lambda _: torch.zeros(shape)))
 
 
-def test_all_copies_start_as_the_forked_solver() -> None:
+def test_all_replicas_start_as_the_forked_solver() -> None:
     env = meta_env()
     solver = learners(1)
     solver.update([torch.Generator().manual_seed(5)])
@@ -139,14 +140,6 @@ def test_the_same_fork_and_actions_reproduce_an_episode_bit_for_bit() -> None:
     one, same, other = (played(env, seed) for seed in (4, 4, 5))
     assert (one == same).all()
     assert not torch.equal(one["next", "reward"], other["next", "reward"])
-
-
-def test_a_seed_makes_later_episodes_the_same() -> None:
-    env, rewards = meta_env(), []
-    for seed in (4, 4, 5):
-        env.set_seed(seed)
-        rewards.append(play(env, some_actions())["next", "reward"])
-    assert rewards[0].equal(rewards[1]) and not rewards[0].equal(rewards[2])
 
 
 def test_an_episode_that_was_broken_off_can_be_played_again() -> None:
@@ -166,19 +159,39 @@ def test_an_episode_that_was_broken_off_can_be_played_again() -> None:
         assert (played(env) == whole).all()
 
 
+@pytest.mark.parametrize("forked", [False, True])
+def test_the_seed_decides_what_an_episode_draws(forked: bool) -> None:
+    env, rewards, walls = meta_env(), [], []
+    for seed in (4, 4, 5):
+        env.set_seed(seed)
+        if forked:
+            env.fork(learners(1).snapshot()[0], env.streams)
+        rewards.append(play(env, some_actions())["next", "reward"])
+        walls.append(env.last_training[0].walls)
+    for drawn in (rewards, walls):
+        assert drawn[0].equal(drawn[1]) and not drawn[0].equal(drawn[2])
+
+
+def test_an_episode_ends_after_its_last_update_and_counts_what_was_proposed() -> None:
+    env, actions = meta_env(), some_actions()
+    steps = played(env)
+    assert steps["next", "done"][:, -1].all() and not steps["next", "done"][:, :-1].any()
+    # The Solvers stay as they were trained, also after the automatic reset.
+    after = evaluate(env.solvers.agent, env.view.validation)["return"].mean(1)
+    torch.testing.assert_close(after, steps["next", "return"][:, -1, 0])
+    progress = torch.arange(L + 1) / L
+    torch.testing.assert_close(steps["progress"][0, :, 0], progress[:-1])
+    torch.testing.assert_close(steps["next", "progress"][0, :, 0], progress[1:])
+    for k, step in product(range(K), range(L)):
+        counts = actions[step, k].bincount(minlength=SPACE.size)
+        assert torch.equal(steps["next", "proposed"][k, step], counts)
+
+
 def test_episodes_of_one_fork_start_alike_but_draw_anew() -> None:
     env = meta_env()
     first, second = played(env), play(env, some_actions())
     assert torch.equal(first["probes"][:, 0], second["probes"][:, 0])
     assert not torch.equal(first["next", "reward"], second["next", "reward"])
-
-
-def test_trained_solvers_stay_readable_after_the_automatic_reset() -> None:
-    env = meta_env()
-    steps = played(env)
-    assert steps["next", "done"][:, -1].all() and not steps["next", "done"][:, :-1].any()
-    after = evaluate(env.solvers.agent, env.view.validation)["return"].mean(1)
-    torch.testing.assert_close(after, steps["next", "return"][:, -1, 0])
 
 
 def test_any_reward_can_be_paid() -> None:
@@ -245,23 +258,8 @@ def test_a_held_actions_reward_adds_up_over_its_updates() -> None:
     assert ((reward > 0) & (reward <= 4)).all() and (reward > 1).any()
 
 
-def test_what_was_proposed_is_counted() -> None:
-    actions, counted = some_actions(), played(meta_env())["next", "proposed"]
-    for k in range(K):
-        for step in range(L):
-            expected = actions[step, k].bincount(minlength=SPACE.size)
-            assert torch.equal(counted[k, step], expected)
-
-
-def test_progress_runs_from_zero_to_one() -> None:
-    steps = played(meta_env())
-    expected = torch.arange(L + 1) / L
-    torch.testing.assert_close(steps["progress"][0, :, 0], expected[:-1])
-    torch.testing.assert_close(steps["next", "progress"][0, :, 0], expected[1:])
-
-
-def test_a_share_of_the_copies_is_those_copies() -> None:
-    """As in a worker, whose environment has copies 1 and 2 only."""
+def test_a_share_of_the_replicas_is_those_replicas() -> None:
+    """A worker's environment, for example, has replicas 1 and 2 only."""
     whole, share = meta_env(), meta_env(first_replica=1)
     every, last = played(whole), played(share)
     shifted = torch.cat([some_actions()[:, 1:], some_actions()[:, :1]], 1)
@@ -271,7 +269,7 @@ def test_a_share_of_the_copies_is_those_copies() -> None:
     assert not torch.equal(last["next", "reward"], every["next", "reward"])
 
 
-def test_a_copy_that_diverges_has_its_number_among_all() -> None:
+def test_a_replica_that_diverges_has_its_number_among_all() -> None:
     share = meta_env(first_replica=4)
     first, second = some_actions()[:2]
     _, state = share.step_and_maybe_reset(share.reset().set("action", first))
@@ -280,30 +278,25 @@ def test_a_copy_that_diverges_has_its_number_among_all() -> None:
         share.step(state.set("action", second))
 
 
-def test_the_seed_decides_what_an_episode_draws() -> None:
-    env, actions, trained = meta_env(), some_actions(), []
-    for seed in (1, 2, 1):
-        env.set_seed(seed)
-        env.fork(learners(1).snapshot()[0], env.streams)
-        play(env, actions)
-        levels, _ = env.last_training
-        trained.append(levels.walls)
-    assert torch.equal(trained[0], trained[2]) and not torch.equal(trained[0], trained[1])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"meta_episode_length": 0}, "action_repeat=1 must divide meta_episode_length=0"),
+        ({"action_repeat": 2}, f"action_repeat=2 must divide meta_episode_length={L}"),
+        ({"action_repeat": 0}, f"action_repeat=0 must divide meta_episode_length={L}"),
+        ({"probe_levels": -1}, f"probe_levels=-1 must be at least 0 and .* validation_levels={E}"),
+        ({"probe_levels": 7}, f"probe_levels=7 .* and at most validation_levels={E}: the Proposer"),
+    ],
+)
+def test_refuses_lengths_that_make_no_sense(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        meta_env(**options)
 
 
-def test_refuses_lengths_and_solvers_that_make_no_sense() -> None:
-    for length, held in ((0, 1), (5, 2), (4, 0)):
-        message = f"action_repeat={held} must divide meta_episode_length={length}"
-        with pytest.raises(ValueError, match=message):
-            meta_env(meta_episode_length=length, action_repeat=held)
-    for probes in (-1, E + 1):
-        message = f"probe_levels={probes} must be at least 0 and at most validation_levels={E}"
-        with pytest.raises(ValueError, match=message):
-            meta_env(probe_levels=probes)
-    ppo = learners(1)
-    ppo.agent.copies = None
-    view = SolverView(TASK, validation_levels=E, probe_levels=C)
+def test_refuses_a_single_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = meta_env()
+    monkeypatch.setattr(env.solvers.agent, "copies", None)
     with pytest.raises(ValueError, match="must be a population"):
         SolverTrainingEnv(
-            ppo, view=view, actions=mixture(), reward=performance_gain, meta_episode_length=L
+            env.solvers, view=env.view, actions=mixture(), reward=max, meta_episode_length=L
         )

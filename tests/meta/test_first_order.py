@@ -83,6 +83,11 @@ def exact_direction(ppo: PPO, levels: Level, measure: str = "log_success") -> di
     return target_direction(ppo, target_performance(performance(ppo.agent, levels), measure))
 
 
+def aligned(ppo: PPO, direction: dict[str, Tensor], levels: Level, step: float = RATE) -> Tensor:
+    """The slope of the exact return of levels [K, E] along a direction, by differences."""
+    return alignment(ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"])
+
+
 def inner(one: dict[str, Tensor], other: dict[str, Tensor]) -> Tensor:
     return torch.stack([(one[name] * other[name]).flatten(1).sum(1) for name in one]).sum(0)
 
@@ -142,11 +147,10 @@ def test_the_direction_leaves_frozen_parameters_out() -> None:
     assert [*found] == [weight[0]]
     turned = nn.functional.cosine_similarity(*(x[weight[0]].flatten(1) for x in (found, whole)))
     torch.testing.assert_close(turned, torch.ones_like(turned))
-    slope = alignment(ppo.agent, found, RATE, lambda: performance(ppo.agent, levels)["return"])
+    slope = aligned(ppo, found, levels)
     still = {**found, bias[0]: torch.zeros_like(bias[1])}
     bias[1].requires_grad_(True)
-    same = alignment(ppo.agent, still, RATE, lambda: performance(ppo.agent, levels)["return"])
-    assert slope.equal(same)
+    assert slope.equal(aligned(ppo, still, levels))
 
 
 def test_before_the_first_step_it_is_the_gradients_direction() -> None:
@@ -191,7 +195,7 @@ def test_an_alignment_is_the_inner_product_with_the_levels_gradient(double: bool
     network = None if double else Population(lambda: UNet(channels=(8, 8)), copies=2, cores=1)
     ppo = learner(target, network=network)
     direction, step = exact_direction(ppo, target), RATE if double else 1e-5
-    found = alignment(ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"])
+    found = aligned(ppo, direction, levels, step)
     for p in range(4):
         returns = performance(ppo.agent, levels)["return"][:, p]
         expected = inner(direction, gradient(ppo.agent, returns.sum()))
@@ -217,9 +221,7 @@ def test_short_differences_tell_the_derivative_also_in_wide_networks(
     ]
 
     def agreement(step: float) -> float:
-        found = alignment(
-            ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"]
-        )
+        found = aligned(ppo, direction, levels, step)
         both = torch.stack([found.flatten(), torch.stack(slopes, 1).flatten()])
         return float(torch.corrcoef(both)[0, 1])
 
@@ -233,10 +235,7 @@ def test_a_solvers_numbers_do_not_depend_on_those_beside_it() -> None:
     alone.restore(both.snapshot()[1:])
 
     def scores(ppo: PPO, which: slice) -> Tensor:
-        direction = exact_direction(ppo, target[which])
-        return alignment(
-            ppo.agent, direction, RATE, lambda: performance(ppo.agent, levels[which])["return"]
-        )
+        return aligned(ppo, exact_direction(ppo, target[which]), levels[which])
 
     torch.testing.assert_close(scores(both, slice(0, 2))[1:], scores(alone, slice(1, 2)))
 
@@ -261,7 +260,7 @@ def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -
     steps = ppo.settings.horizon
     rollout, advantage = first_episodes(ppo, [torch.Generator().manual_seed(k) for k in range(2)])
     exact = exact_direction(ppo, levels, "return")
-    expected = alignment(ppo.agent, exact, RATE, lambda: performance(ppo.agent, levels)["return"])
+    expected = aligned(ppo, exact, levels)
     each = steps * alignment(
         ppo.agent, exact, RATE, lambda: surrogate(ppo.agent, rollout, advantage)
     ).unflatten(1, (episodes, 6))
