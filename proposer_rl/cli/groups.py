@@ -38,7 +38,7 @@ OmegaConf.register_new_resolver(
 
 
 def overrides() -> list[str]:
-    """As given on the command line: what they refer to is the run's, not Hydra's own."""
+    """Returns them as given on the command line: what they refer to is the run's, not Hydra's."""
     given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
     return list(given)
 
@@ -111,7 +111,7 @@ def explained(error: Exception) -> str:
 
 
 def _no_mapping(error: Exception) -> str:
-    """Of an override the error names all; of a file its name, so that its lists are named here."""
+    """Says where the list is: an error in an override names all, one in a file only the file."""
     said, *_ = str(error).splitlines()
     name, *_ = said.removeprefix("Error merging override ").split(": Config")
     name = name.removeprefix("In '").removesuffix("'")
@@ -131,7 +131,7 @@ def _lists(node: Any, place: str = "") -> Iterator[str]:
 
 
 def _not_utf8(error: UnicodeDecodeError) -> str:
-    """Of all files in the folders that the command names, the one that was read."""
+    """Names the file that was read, which is in one of the folders that the command names."""
     files = (file for folder in own_folders(sys.argv) for file in sorted(folder.rglob("*.yaml")))
     named = [f"{file}: " for file in files if file.read_bytes().startswith(error.object)]
     return f"{''.join(named[:1])}is not encoded in UTF-8; save it so ({one_line(error)})"

@@ -18,12 +18,12 @@ from proposer_rl.report.measures import Measure, Series, axis_text
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
+from proposer_rl.report.style import DASHES
 from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import LevelRecord, Record, number, picture
 
 Json = Any
 DIGITS = 5
-DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
 LEVELS = 4  # of a batch
 SIDE = 160  # pixels of a picture, at most
 # How many stages of a method are shown: as many as fit.

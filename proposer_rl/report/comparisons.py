@@ -127,7 +127,7 @@ def learnt(group: Group, name: str, updates: float) -> bool:
 
 
 def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, str], Decision]:
-    """Of every pair of groups which is better by an outcome, by their labels in either order.
+    """Decides for every pair of groups which is better, by their labels in either order.
 
     The tests of all pairs are corrected together, by Holm's method.
 

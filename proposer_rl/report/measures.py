@@ -192,7 +192,7 @@ def over_cycles(group: Group, value: Value) -> Series | None:
 
 
 def _aligned(runs: Mapping[int, tuple[Iterable[float], Iterable[float]]]) -> Series | None:
-    """Of each run places and values; None without a run."""
+    """Returns the series of runs whose places and values are given; None without a run."""
     rows = {seed: dict(zip(*own, strict=True)) for seed, own in runs.items()}
     return pd.DataFrame(rows, dtype=float).sort_index().T if rows else None
 

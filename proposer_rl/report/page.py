@@ -19,13 +19,12 @@ from PIL import Image
 from proposer_rl.report.outcomes import Meanings, against_baseline, answer, group_table, meaning
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Study
-from proposer_rl.report.style import DPI, Drawing, in_few_colours
+from proposer_rl.report.style import DASHES, DPI, Drawing, in_few_colours
 from proposer_rl.report.tables import escape_markdown
 from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
 LONGEST_WORD = 2000  # of a command
-DASHES = {"-": "none", "--": "7 4", "-.": "7 3 2 3", ":": "2 3"}
 MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
 
 

@@ -230,7 +230,7 @@ def _title(run: Run) -> str:
 
 
 def _without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Of runs with the same settings and seed the longest: a seed must not count twice."""
+    """Keeps the longest of the runs with equal settings and seed, since a seed counts once."""
     best: dict[str, Run] = {}
     notes = []
     for run in runs:
@@ -301,7 +301,7 @@ def _overrides(run: Run) -> list[str] | None:
 
 
 def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
-    """Of each configuration the values that are not the same in all."""
+    """Returns the values of each configuration that are not equal in all."""
     keys = sorted({key for leaf in leaves for key in leaf})
     differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
     # Dotted keys by their last part, where no other ends in the same.

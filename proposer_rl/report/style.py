@@ -30,7 +30,8 @@ METHODS = {
 # For every other method or variant: Paul Tol's muted scheme without near doubles, with marks.
 FURTHER = ("#332288", "#882255", "#44AA99", "#AA4499", "#999933", "#88CCEE", "#CC6677")
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-DASHES = ("-", "--", "-.", ":")
+# Lines of matplotlib, and the same for SVG and Plotly: lengths of dashes and gaps.
+DASHES = {"-": "none", "--": "7,4", "-.": "7,3,2,3", ":": "2,3"}
 TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
 PANEL = (4.6, 3.3)  # inches
@@ -99,7 +100,7 @@ def looks(labels: Iterable[str]) -> dict[str, Look]:
         place = min(order, key=used.__getitem__)
         again = used[place]
         mark = MARKS[(place + TURN * again) % len(MARKS)]
-        found[label] = Look(FURTHER[place], DASHES[again % len(DASHES)], mark)
+        found[label] = Look(FURTHER[place], [*DASHES][again % len(DASHES)], mark)
         used[place] += 1
     return found
 

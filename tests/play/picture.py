@@ -5,16 +5,15 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
+from tests.browser import chromium
 from tests.play.pages import served
-from tests.play.test_browser import CHROMIUM, OPTIONS
 
 
 def main(run: Path, file: Path) -> None:
     """Take a level of the run, go through its checkpoints, and show all that there is to see."""
-    with served(run) as page, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+    with served(run) as page, chromium() as browser:
         tab = browser.new_page(viewport={"width": 1180, "height": 800}, color_scheme="light")
         tab.goto(page.address)
         tab.locator("#gallery button").nth(1).click()
@@ -25,7 +24,6 @@ def main(run: Path, file: Path) -> None:
         expect(tab.locator("#along .unknown")).to_have_count(0, timeout=0)
         tab.wait_for_timeout(1000)  # the gallery's own answer
         tab.screenshot(path=file)
-        browser.close()
 
 
 if __name__ == "__main__":

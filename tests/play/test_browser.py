@@ -16,7 +16,6 @@ from playwright.sync_api import (
     Download,
     Locator,
     expect,
-    sync_playwright,
 )
 from playwright.sync_api import Page as Tab
 
@@ -25,24 +24,17 @@ from proposer_rl.models import cell_logits
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
 from proposer_rl.tasks.mazes.levels import Level, planes
+from tests.browser import chromium, needs_chromium
 from tests.play.pages import Page, served
 from tests.tasks.mazes.oracles import path_length
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-OPTIONS = [
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-]
-
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH")
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -161,10 +161,8 @@ def test_a_foreign_folder_is_not_written_to(runs: Path, tmp_path: Path, capsys) 
     assert contents(tmp_path) == before
 
 
-def test_the_tables_of_a_report_are_known_as_one(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [])
+@pytest.mark.usefixtures("undrawn")
+def test_the_tables_of_a_report_are_known_as_one(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "kept" / "tables").mkdir(parents=True)
     (tmp_path / "kept" / "tables" / "runs.csv").write_text("old")
     main([str(runs), "-q", "-o", str(tmp_path / "kept")])

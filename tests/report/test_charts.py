@@ -121,9 +121,9 @@ def test_outcomes_are_those_that_decide(runs: Path, data: dict[str, Any]) -> Non
     assert outcome["methods"][0]["estimate"] == pytest.approx(median_and_interval(values), abs=2e-5)
 
 
-def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     """A short run leaves a median that is not of all, and few seeds have no interval."""
-    monkeypatch.setattr(build, "DRAWINGS", [])
     write_run(tmp_path / "a", seeds=[0])
     write_run(tmp_path / "b", seeds=[1], curve=[0.0, 0.1], finished=False)
     (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
@@ -140,10 +140,8 @@ def test_what_is_not_known_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert data["outcomes"][0]["methods"][0]["values"][1] is None
 
 
-def test_stages_move_proposals_levels_and_success_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [])
+@pytest.mark.usefixtures("undrawn")
+def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> None:
     maps = [[[6, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 3, 3]]]
     cycles = [cycle(i, [0.1], maps[i], every=20) for i in range(2)]
     curve = [0.0, 0.2, 0.4, 0.6]
@@ -198,11 +196,9 @@ FIGURES = 2**20  # more than the pictures of 9 methods take
 
 
 @pytest.mark.slow
-def test_a_page_of_many_long_runs_stays_small(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_a_page_of_many_long_runs_stays_small(tmp_path: Path) -> None:
     """9 methods x 5 seeds with 76 evaluations each; noise, which cannot be packed."""
-    monkeypatch.setattr(build, "DRAWINGS", [])
     random = np.random.default_rng(0)
     cost = ["frames", "curriculum_frames", "evaluations", "seconds"]
     names = [f"{d}_{kind}" for d in ("id", "ood") for kind in ("success", "return", "worst10")]
@@ -229,10 +225,8 @@ def save(path: Path, header: list[str], values: Any) -> None:
     np.savetxt(path, values, "%.17g", ",", header=",".join(header), comments="")
 
 
-def test_pictures_that_are_too_large_are_fewer_or_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [])
+@pytest.mark.usefixtures("undrawn")
+def test_pictures_that_are_too_large_are_fewer_or_none(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
 
     def noise() -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,19 +11,9 @@ import pytest
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.figures import cost_curves
+from tests.browser import chromium, needs_chromium
 from tests.report.folders import LEVEL, PIXELS, cycle, png, write_jsonl, write_run
 
-CHROMIUM = shutil.which("chromium")
-OPTIONS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--disable-sync",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-]
 # Where a point of a chart lies on the screen.
 PIXEL = """([place, x, y]) => {
     const chart = document.querySelector(place), { left, top } = chart.getBoundingClientRect();
@@ -34,8 +23,8 @@ PIXEL = """([place, x, y]) => {
 HOSTILE = "</script><img src=x onerror=alert(1)><a href='http://example.org'>%{x}$\\bad{"
 SEEDS = 6
 
-sync_api = pytest.importorskip("playwright.sync_api")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH")
+pytest.importorskip("playwright.sync_api")
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +80,11 @@ class Seen:
 
 @pytest.fixture(scope="module")
 def seen(written: Path) -> Iterator[Seen]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+    with chromium() as browser:
         seen = Seen(browser.new_page())
         seen.page.goto(written.as_uri())
         seen.page.wait_for_selector("html[data-ready]")
         yield seen
-        browser.close()
 
 
 def test_methods_are_switched_on_and_off(seen: Seen) -> None:

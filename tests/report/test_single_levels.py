@@ -79,10 +79,10 @@ def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
     ("exact", "text"),
     [(True, "no second evaluation"), (False, "selection bias makes"), (None, "do not say")],
 )
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_says_whether_selection_bias_is_in_it(
-    exact: bool | None, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exact: bool | None, text: str, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [])
     study_of(tmp_path / "runs", exact)
     page = build.write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
     assert text in page.read_text(encoding="utf-8")
