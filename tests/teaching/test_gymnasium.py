@@ -112,7 +112,7 @@ def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
     [
         ({"g": "model.opt.gravity"}, r"set.g='model.opt.gravity': .* shape \[3\]; name one of its"),
         ({"g": "ground"}, "set.g='ground': ground is no number but a str"),
-        ({"ground": "masses.torso"}, "set.ground='masses.torso': 'dict' object has no attribute"),
+        ({"ground": "masses.torso"}, "set.ground='masses.torso': masses.torso is a number, 1.0, and no place"),
         ({"ground": "floor"}, "set.ground='floor': Parts has no attribute 'floor'"),
     ],
 )
