@@ -151,8 +151,8 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         left_out = [name for name in names if name not in (*how, SEED)]
         if left_out and not self._began:
             warnings.warn(
-                f"set: leaves out {', '.join(left_out)}, of which the environment sees nothing: "
-                "the curriculum would choose among levels that are the same",
+                f"set: leaves out {', '.join(left_out)}, which the environment then never gets: "
+                "the curriculum chooses among values that change nothing",
                 stacklevel=3,
             )
         self._began = True

@@ -295,7 +295,8 @@ class Teacher:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
         Raises:
-            ArgumentError: if it is of another number of students, or of another curriculum.
+            ArgumentError: if it is of another number of students, or of another curriculum, or
+                tickets are out, as of environments that have begun.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
@@ -303,6 +304,12 @@ class Teacher:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
             if strange := state["curriculum"].keys() ^ self.curriculum.state_dict().keys():
                 raise ArgumentError(f"state: of another curriculum, by its {min(strange)!r}")
+            if self._tickets.out:
+                raise ArgumentError(
+                    "state: levels of this teacher are out, whose tickets the state has for others; "
+                    "load it before collectors and environments begin, or drop() them, and reset "
+                    "what plays them"
+                )
             source: Any = self.space.space
             like = source.sample(1, torch.Generator())[0]
             self.curriculum.load_state_dict(state["curriculum"])

@@ -55,6 +55,11 @@ class Tickets:
         self.told = False  # whether anything has been since the last collection
         self.scored: bool | None = None  # whether with a score; None where nothing was told yet
 
+    @property
+    def out(self) -> bool:
+        """Whether there are any that are out."""
+        return any((block.state == OUT).any() for block in self.blocks)
+
     def add(self, batch: Batch) -> Block:
         """Number the levels of a batch."""
         block = Block(self.next, batch)
