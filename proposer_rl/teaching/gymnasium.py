@@ -76,7 +76,8 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begin an episode on the next level."""
         self._drop()
         self._ticket, self._level = self._teacher.ask()
-        self._return, self._steps, self._succeeded = 0.0, 0, None
+        self._return, self._steps = 0.0, 0
+        self._succeeded: float | None = None
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
         elif isinstance(self._how, str):
@@ -118,7 +119,8 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _end(self) -> None:
         """Tell what came of the episode."""
         self._note(self._success())
-        if self._succeeded is None and ("success" in self._teacher.reads or self._rule):
+        needed = isinstance(self._rule, str) or "success" in self._teacher.reads
+        if self._succeeded is None and needed:
             own = {name: self._last[name] for name in self._last.keys() - {"level", "level_id"}}
             raise ArgumentError(
                 f"success={self._rule!r}: the last info has no such entry; give one that it has, "
@@ -148,14 +150,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _set(self, how: Mapping[str, str]) -> None:
         """Set attributes that the environment has to all values of the level."""
         names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
-        left_out = [name for name in names if name not in (*how, SEED)]
-        if left_out and not self._began:
-            warnings.warn(
-                f"set: leaves out {', '.join(left_out)}, which the environment then never gets: "
-                "the curriculum chooses among values that change nothing",
-                stacklevel=3,
-            )
-        self._began = True
         for name, path in how.items():
             if name not in names:
                 raise ArgumentError(
@@ -165,6 +159,14 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 write(self.env.unwrapped, path, _plain(self._level[name]))
             except AttributeRefusedError as error:
                 raise ArgumentError(f"set.{name}={path!r}: {error}") from error
+        left_out = [name for name in names if name not in (*how, SEED)]
+        if left_out and not self._began:
+            warnings.warn(
+                f"set: leaves out {', '.join(left_out)}, which the environment then never gets: "
+                "the curriculum chooses among values that change nothing",
+                stacklevel=3,
+            )
+        self._began = True
 
     def _marked(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return {**info, "level": self._level, "level_id": self._ticket}

@@ -306,7 +306,7 @@ class Teacher:
                 raise ArgumentError(f"state: of another curriculum, by its {min(strange)!r}")
             if self._tickets.out:
                 raise ArgumentError(
-                    "state: levels of this teacher are out, whose tickets the state has for others; "
+                    "state: levels of this teacher are out, whose tickets it has for others; "
                     "load it before collectors and environments begin, or drop() them, and reset "
                     "what plays them"
                 )

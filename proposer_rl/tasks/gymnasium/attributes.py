@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from numbers import Number
@@ -78,8 +79,9 @@ def stray(environment: Any, path: str, value: Any) -> str | None:
     """
     for layer, now in _readings(environment, path):
         try:
-            if isinstance(value, Number):
-                same = bool(np.isclose(float(now), value, rtol=1e-5))  # it may be kept in 32 bits
+            if isinstance(value, int | float):
+                # It may be kept in 32 bits.
+                same = math.isclose(float(now), float(value), rel_tol=1e-5, abs_tol=1e-8)
             else:
                 same = now is value or np.array_equal(now, value)
         except (TypeError, ValueError, RuntimeError):
@@ -91,20 +93,22 @@ def stray(environment: Any, path: str, value: Any) -> str | None:
 
 def _readings(environment: Any, path: str) -> Iterator[tuple[Any, Any]]:
     """What stands at a path in an environment, and in those of its wrappers that have it."""
+    first = path.partition(".")[0]
     while isinstance(environment, gymnasium.Wrapper):
-        with suppress(AttributeRefusedError):
-            yield environment, read(environment, path)
+        if hasattr(environment, first):
+            with suppress(AttributeRefusedError):
+                yield environment, read(environment, path)
         environment = environment.env
     yield environment, read(environment, path)
 
 
 def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, Number) else repr(value)
+    return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
 def _alike(before: Any, value: Any, path: str) -> Any:
     """A value as what it replaces: a truth value, a tensor without dimensions."""
-    if not isinstance(value, Number):
+    if not isinstance(value, int | float):
         if isinstance(before, Number):
             raise AttributeRefusedError(f"{path} is a number, {before}, and no place for {value!r}")
         return value
