@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium
+import numpy as np
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, entries, number, stepped
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -20,9 +23,10 @@ SUCCESS = ("success", "is_success")  # entries of an info that mean it
 class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment that asks for a level at every reset, and tells at the end of the episode.
 
-    ``info`` has the ``level`` and its ticket ``level_id`` after a reset and after the last step. An
-    episode that a reset cuts off counts for nothing. In vector environments every environment has
-    its wrapper, and all of them the same teacher, in other processes its client.
+    ``info`` has the ``level`` and its ticket ``level_id`` after a reset and after the last step.
+    Wrappers that end episodes, as ``TimeLimit``, belong inside: an episode that a reset cuts off
+    counts for nothing, of which the second warns. In vector environments every environment has its
+    wrapper, and all of them the same teacher, in other processes its client.
 
     Args:
         env: the environment.
@@ -32,12 +36,17 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             function of the unwrapped environment and the level; or ``"options"`` for those of the
             reset. A level's ``seed`` is that of the reset.
         success: whether an episode was one: ``"terminated"``, ``"truncated"``, another entry of the
-            last info, or a function of that; None for its entry ``success`` or ``is_success``.
+            last info (``"metrics.won"`` is an entry of an entry), or a function of that; None for
+            its entry ``success`` or ``is_success``.
+        once: whether it may be one in any step, so that what is reached and lost again counts.
+        reset_truncates: whether a reset truncates an episode that has begun, which then counts, as
+            where wrappers outside end episodes.
 
     Raises:
-        ArgumentError: if the teacher is of several students; at the first reset, if the environment
-            has no such attribute, or more than a number there; at the first end, if the curriculum
-            reads success and nothing says it.
+        ArgumentError: if the teacher is of several students; at a reset, if the environment has no
+            such attribute, more than a number there, or another value afterwards; in a step, if it
+            returns something else than Gymnasium's interface says; at the first end, if the
+            curriculum reads success and nothing says it.
     """
 
     def __init__(
@@ -47,6 +56,8 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         set: Mapping[str, str] | Callable[[Any, Any], object] | str,
         *,
         success: str | Callable[[Mapping[str, Any]], Any] | None = None,
+        once: bool = False,
+        reset_truncates: bool = False,
     ) -> None:
         super().__init__(env)
         if teacher.students != 1 or "rollout" in teacher.reads:
@@ -54,76 +65,131 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if isinstance(set, str) and set != "options":
             raise ArgumentError(f"set={set!r}: must be attributes, a function or 'options'")
         self._teacher, self._how, self._rule = teacher, set, success
+        self._once, self._reset_truncates = once, reset_truncates
         self._ticket: int | None = None
+        self._began = False  # any episode
+        self._cut_off = 0  # episodes
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on the next level."""
-        if self._ticket is not None:
-            self._teacher.drop(self._ticket)
+        self._drop()
         self._ticket, self._level = self._teacher.ask()
         self._return, self._steps = 0.0, 0
+        self._succeeded: float | None = None
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
         elif isinstance(self._how, str):
             options = {**(options or {}), **self._level}
         else:
-            for name, path in self._how.items():
-                self._set(name, path)
+            self._set(self._how)
         if isinstance(self._level, Mapping):
             seed = _plain(self._level.get(SEED, seed))
         observation, info = self.env.reset(seed=seed, options=options)
+        if isinstance(self._how, Mapping):
+            for name, path in self._how.items():
+                if line := stray(self.env, path, _plain(self._level[name])):
+                    raise ArgumentError(
+                        f"set.{name}={path!r}: {line}, after a reset; give a function that sets "
+                        "it where it stays"
+                    )
         return observation, self._marked(info)
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """A step; the last one of an episode is told."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._return += float(reward)
-        self._steps += 1
-        if (terminated or truncated) and self._ticket is not None:
-            info = self._marked(info)
-            success = self._success({**info, "terminated": terminated, "truncated": truncated})
-            self._teacher.tell(self._ticket, self._return, success, steps=self._steps)
-            self._ticket = None
+        try:
+            answer = stepped(self.env.step(action))
+        except UnfitEnvironmentError as error:
+            raise ArgumentError(f"env: {error}") from error
+        observation, reward, terminated, truncated, info = answer
+        if self._ticket is not None:
+            self._return += reward
+            self._steps += 1
+            over = terminated or truncated
+            if over:
+                info = self._marked(info)
+            self._last = {**info, "terminated": terminated, "truncated": truncated}
+            if over:
+                self._end()
+            elif self._once:
+                self._note(self._success())
         return observation, reward, terminated, truncated, info
 
-    def _set(self, name: str, path: str) -> None:
-        """Set an attribute that the environment has."""
-        names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
-        if name not in names:
+    def _end(self) -> None:
+        """Tell what came of the episode."""
+        self._note(self._success())
+        needed = isinstance(self._rule, str) or "success" in self._teacher.reads
+        if self._succeeded is None and needed:
+            own = {name: self._last[name] for name in self._last.keys() - {"level", "level_id"}}
             raise ArgumentError(
-                f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
+                f"success={self._rule!r}: the last info has no such entry; give one that it has, "
+                f"{', '.join(sorted(name for name, _ in entries(own)))}, or a function"
             )
-        env, value = self.env.unwrapped, _plain(self._level[name])
-        within, _, last = path.rpartition(".")
-        try:
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                write(env, path, value)
-            else:
-                read(env, path)
-                setattr(read(env, within) if within else env, last, value)
-        except (AttributeError, AttributeRefusedError) as error:
-            raise ArgumentError(f"set.{name}={path!r}: {error}") from error
+        self._teacher.tell(self._ticket, self._return, self._succeeded, steps=self._steps)
+        self._ticket = None
+
+    def _drop(self) -> None:
+        """Leave the episode, if there is one."""
+        if self._ticket is None:
+            return
+        if self._steps and self._reset_truncates:
+            self._last = {**self._marked(self._last), "truncated": True}
+            self._end()
+            return
+        self._cut_off += bool(self._steps)
+        if self._steps and self._cut_off == 2:  # one alone may well be meant
+            warnings.warn(
+                "TaughtEnv: a second episode was cut off by a reset; such episodes count for "
+                "nothing. Put wrappers that end episodes inside, as in TaughtEnv(TimeLimit(env, "
+                "200), ...), or give reset_truncates=True",
+                stacklevel=3,
+            )
+        self._teacher.drop(self._ticket)
+
+    def _set(self, how: Mapping[str, str]) -> None:
+        """Set attributes that the environment has to all values of the level."""
+        names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
+        for name, path in how.items():
+            if name not in names:
+                raise ArgumentError(
+                    f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
+                )
+            try:
+                write(self.env.unwrapped, path, _plain(self._level[name]))
+            except AttributeRefusedError as error:
+                raise ArgumentError(f"set.{name}={path!r}: {error}") from error
+        left_out = [name for name in names if name not in (*how, SEED)]
+        if left_out and not self._began:
+            warnings.warn(
+                f"set: leaves out {', '.join(left_out)}, which the environment then never gets: "
+                "the curriculum chooses among values that change nothing",
+                stacklevel=3,
+            )
+        self._began = True
 
     def _marked(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return {**info, "level": self._level, "level_id": self._ticket}
 
-    def _success(self, last: Mapping[str, Any]) -> Any:
+    def _success(self) -> Any:
+        """What the last step says of success; None where it says nothing."""
         rule = self._rule
         if callable(rule):
-            return rule(last)
-        known = [name for name in ((rule,) if rule else SUCCESS) if name in last]
-        if known:
-            return last[known[0]]
-        if "success" in self._teacher.reads or rule:
-            raise ArgumentError(
-                f"success={rule!r}: the last info has no such entry; give 'terminated', "
-                "'truncated', another entry of it, or a function"
-            )
-        return None
+            return rule(self._last)
+        known = dict(entries(self._last))
+        return next((known[n] for n in ((rule,) if rule else SUCCESS) if n in known), None)
+
+    def _note(self, success: Any) -> None:
+        if success is None:
+            return
+        try:
+            now = number(success, f"success={self._rule!r}: what came of an episode")
+        except UnfitEnvironmentError as error:
+            raise ArgumentError(str(error)) from error
+        self._succeeded = max(now, self._succeeded or 0.0) if self._once else now
 
 
 def _plain(value: Any) -> Any:
     """A number as Python has it; environments take no tensors."""
-    return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
+    one = isinstance(value, np.generic) or (isinstance(value, Tensor) and value.numel() == 1)
+    return value.item() if one else value

@@ -329,7 +329,8 @@ class Teacher:
 
         Raises:
             ArgumentError: if it is of another space, curriculum, setting of it or number of
-                students, naming what differs; then nothing has changed.
+                students, naming what differs, or tickets are out, as of environments that have
+                begun; then nothing has changed.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
@@ -337,6 +338,12 @@ class Teacher:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
             for what, now in self._of.items():
                 require_same(what, state["of"][what], now)
+            if self._ledger.out:
+                raise ArgumentError(
+                    "state: levels of this teacher are out, whose tickets it has for others; "
+                    "load it before collectors and environments begin, or drop() them, and reset "
+                    "what plays them"
+                )
             self.curriculum.load_state_dict(state["curriculum"])
             self._ledger.load_state_dict(state["ledger"], self._like)
             self._scored = state["scored"]

@@ -6,10 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import AutoResetTransform, EnvBase, Transform, VecGymEnvTransform
+from torchrl.envs import (
+    AutoResetTransform,
+    EnvBase,
+    ParallelEnv,
+    SerialEnv,
+    Transform,
+    VecGymEnvTransform,
+)
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
@@ -47,12 +54,19 @@ class LevelTransform(Transform):
         teacher: of one student; in another process than its own, its client.
         set_level: ``set_level(env, levels)`` makes the environment, without transforms, play levels
             [*B] from its next reset on. Of those that go on the levels are as before.
-        success: as of :class:`Teacher`; None for its entry ``success``.
+        success: as of :class:`Teacher`, or another entry of ``next``; None for its entry
+            ``success``, or what the environment's class has as ``success_rule``.
+        once: whether it may be one in any step, so that what is reached and lost again counts.
+        reward: the entry of ``next`` that returns are of, one number for each environment; or a
+            function of ``next`` that makes it of several agents' or objectives'.
         tell: whether it tells returns and success; False where the loop gives whole rollouts to
-            :meth:`Teacher.observe`.
+            :meth:`Teacher.observe`. A collector with ``set_truncated``, which ends episodes in a
+            rollout alone, then needs ``reset_at_each_iter``.
 
     Raises:
-        ArgumentError: if the teacher is of several students, or reads rollouts and is to be told.
+        ArgumentError: if the teacher is of several students, or reads rollouts and is to be told;
+            at the first reset, if the environment has no such reward or success, resets itself, or
+            is one of several that levels do not get into from outside.
     """
 
     def __init__(
@@ -60,7 +74,9 @@ class LevelTransform(Transform):
         teacher: Teacher | TeacherClient,
         set_level: Callable[[EnvBase, Any], object],
         *,
-        success: Success | None = None,
+        success: Success | NestedKey | None = None,
+        once: bool = False,
+        reward: NestedKey | Callable[[TensorDictBase], Tensor] = "reward",
         tell: bool = True,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[LEVEL_ID])
@@ -72,7 +88,7 @@ class LevelTransform(Transform):
                 "teacher.observe"
             )
         self._teacher, self._set_level = teacher, set_level
-        self._rule, self._tells = success, tell
+        self._rule, self._once, self._reward, self._tells = success, once, reward, tell
 
     @property
     def _now(self) -> _Played:
@@ -102,13 +118,15 @@ class LevelTransform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         after, now = next_tensordict, self._now
-        now.returns += after["reward"].reshape(-1)
+        now.returns += self._of_each("reward", self._reward, after)
         now.steps += 1
-        success = self._success(after)
-        now.knows = success is not None
-        if success is not None:
-            now.succeeded = success.reshape(-1).clone()  # it is written to
-        self._end(after["done"].reshape(-1) & now.out)
+        rule = self._success(after)
+        now.knows = rule is not None
+        if rule is not None:
+            success = self._of_each("success", rule, after)
+            # It is written to.
+            now.succeeded = now.succeeded.maximum(success) if self._once else success.clone()
+        self._end(self._of_each("done", "done", after) & now.out)
         return self._marked(after)
 
     def _begin(self, tensordict: TensorDictBase | None) -> None:
@@ -137,20 +155,37 @@ class LevelTransform(Transform):
         self._set_level(env, played.clone())
 
     def _start(self, count: int, device: torch.device) -> None:
-        now = self._now
+        now, env = self._now, self.parent.base_env
+        if isinstance(env, ParallelEnv | SerialEnv):
+            name = type(env).__name__
+            raise ArgumentError(
+                f"env: levels do not get into the environments of {name} from outside; give each "
+                f"a transform, as in {name}(n, make), where make returns TransformedEnv(env, "
+                "LevelTransform(client, set_level)) with client = teacher.client()"
+            )
         resets_itself = VecGymEnvTransform, AutoResetTransform
         if any(isinstance(part, resets_itself) for part in self.parent.modules()):
             raise ArgumentError(
                 "env: resets itself at an episode's end, before there is another level; give a "
                 "vector of Gymnasium autoreset_mode=AutoresetMode.DISABLED"
             )
-        if now.levels is not None and bool(now.out.any()):
+        if now.levels is None:
+            self._check()
+        elif bool(now.out.any()):
             self._teacher.drop(now.ids[now.out])
         now.ids = torch.full((count,), NONE, device=device)
         now.returns = torch.zeros(count, dtype=torch.float64, device=device)
         now.steps = torch.zeros(count, dtype=torch.int64, device=device)
         now.out = torch.zeros(count, dtype=torch.bool, device=device)
         now.succeeded = torch.zeros_like(now.out)
+
+    def _check(self) -> None:
+        """Refuse what a step will lack, before there is one."""
+        after = self.parent.fake_tensordict()["next"]
+        self._of_each("done", "done", after)
+        for name, rule in (("reward", self._reward), ("success", self._success(after))):
+            if rule is not None and not callable(rule):
+                self._of_each(name, rule, after)
 
     def _end(self, ended: Tensor) -> None:
         """Tell what came of episodes, bool [n]."""
@@ -165,18 +200,33 @@ class LevelTransform(Transform):
             )
         now.out = now.out & ~ended
 
-    def _success(self, after: TensorDictBase) -> Tensor | None:
-        rule = self._rule
-        if rule is not None:
-            return rule(after) if callable(rule) else after[rule]
+    def _of_each(self, name: str, rule: Any, after: TensorDictBase) -> Tensor:
+        """One number of each environment, [n], by an entry or a function."""
+        how = "it must be one number for each environment, an entry or a function of next"
+        entry = rule(after) if callable(rule) else after.get(rule, None)
+        if entry is None:
+            there = ", ".join(
+                key if isinstance(key, str) else ".".join(key) for key in after.keys(True, True)
+            )
+            raise ArgumentError(f"{name}={rule!r}: no entry of next, which has {there}; {how}")
+        batch = self.parent.batch_size
+        if entry.numel() != batch.numel() or entry.shape[: len(batch)] != batch:
+            raise ArgumentError(f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; {how}")
+        return entry.reshape(-1)
+
+    def _success(self, after: TensorDictBase) -> Any:
+        """The entry or function that says what is a success; None where nothing does."""
+        if self._rule is not None:
+            return self._rule
         if "success" in after.keys():
-            return after["success"]
-        if "success" in self._teacher.reads:
+            return "success"
+        rule = getattr(type(self.parent.base_env), "success_rule", None)
+        if rule is None and self._tells and "success" in self._teacher.reads:
             raise ArgumentError(
                 "success: missing: this curriculum reads it, and the environment has no such "
                 'entry; give success="terminated", "truncated" or a function'
             )
-        return None
+        return rule
 
     def _marked(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(LEVEL_ID, self._now.ids.reshape(*tensordict.batch_size, 1).clone())

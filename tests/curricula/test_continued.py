@@ -29,6 +29,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.env import plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer
+from proposer_rl.tasks.gymnasium.settings import SuccessSettings
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task
 from tests.tiny import tiny_task, tiny_view_task
@@ -37,10 +38,11 @@ K, P, T = 2, 3, 4
 SEEDS = list(range(K))
 
 
-def continued_task(**changed: Any) -> Any:
+def continued_task(success: Any = None, **changed: Any) -> Any:
     numbers: dict[str, Any] = {"horizon": T, "epochs": 2, "minibatches": 2, "learning_rate": 3e-3}
     ppo = PPOSettings(continue_episodes=True, anneal_updates=30, **{**numbers, **changed})
-    return walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))
+    rule = {} if success is None else {"success": success}
+    return walk_task(solver=SolverSettings(batch_size=P, ppo=ppo), **rule)
 
 
 TASK = continued_task()
@@ -221,7 +223,9 @@ def test_others_watch_whole_episodes_elsewhere() -> None:
 
 
 def walking() -> Any:
-    return continued_task(normalize_observations=True, normalize_rewards=True)
+    """A success may be of a step before the checkpoint."""
+    far = SuccessSettings(kind="info", key="far", once=True)
+    return continued_task(far, normalize_observations=True, normalize_rewards=True)
 
 
 def remembering() -> Any:

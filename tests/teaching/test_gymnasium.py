@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import warnings
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,13 +15,14 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from tests.teaching.counting import ITEMS, Counting, LevelEnv, check, set_level
 
-SPACE = prl.Parameters({"gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, seeded=True)
+SPACE = prl.Parameters({"gravity": (5.0, 25.0)}, seeded=True)
 
 
 def taught(teacher: Any) -> gymnasium.Env:
@@ -107,12 +109,16 @@ def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
     assert (env.ground, env.windy, env.masses) == (level["ground"], True, {"torso": level["mass"]})
 
 
+@pytest.mark.filterwarnings("ignore:set. leaves out")
 @pytest.mark.parametrize(
     ("sets", "message"),
     [
         ({"g": "model.opt.gravity"}, r"set.g='model.opt.gravity': .* shape \[3\]; name one of its"),
         ({"g": "ground"}, "set.g='ground': ground is no number but a str"),
-        ({"ground": "masses.torso"}, "set.ground='masses.torso': 'dict' object has no attribute"),
+        (
+            {"ground": "masses.torso"},
+            "set.ground='masses.torso': .* is a number, 1.0, and no",
+        ),
         ({"ground": "floor"}, "set.ground='floor': Parts has no attribute 'floor'"),
     ],
 )
@@ -197,6 +203,153 @@ def test_success_is_what_the_rule_says(rule: str) -> None:
     assert {n: s for n, (_, s) in curriculum.seen.items()} == {
         n: expected.get(n, RULES[rule]) for n in range(4)
     }
+
+
+def answering(**members: Any) -> gymnasium.Env[Any, Any]:
+    return type("Odd", (LevelEnv,), members)()
+
+
+def paying(reward: Any) -> gymnasium.Env[Any, Any]:
+    return answering(step=lambda self, a: (LevelEnv.step(self, a)[0], reward, True, False, {}))
+
+
+@pytest.mark.parametrize("reward", [0.5, np.array([0.5]), np.array(0.5), torch.tensor([[0.5]])])
+def test_one_number_in_an_array_is_a_reward(reward: Any) -> None:
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS)
+    env = prl.TaughtEnv(paying(reward), teacher, set_level)
+    env.reset()
+    assert type(env.step(0)[1]) is float
+    teacher.propose(1)  # takes in what was told
+    assert curriculum.seen[0][0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("env", "more", "message"),
+    [
+        (paying(np.ones(2)), {}, r"env: the reward must be a number, not array\(\[1., 1.\]\)"),
+        (paying({"a": 1.0}), {}, "env: the reward must be a number, not {'a': 1.0}"),
+        (paying(np.nan), {}, "env: step pays a reward of nan: it must be finite"),
+        (paying(-np.inf), {}, "env: step pays a reward of -inf: it must be finite"),
+        (answering(step=lambda self, a: (0, 1.0, True, {})), {}, "env: step must return five"),
+        (paying(1.0), {"success": "won"}, "success='won': .* it has, terminated, truncated, or"),
+        (paying(1.0), {"success": lambda last: "yes"}, "success=.*must be a number, not 'yes'"),
+    ],
+)
+def test_what_a_step_must_not_answer(env: Any, more: Any, message: str) -> None:
+    curriculum = Counting()
+    teacher = prl.Teacher(curriculum, ITEMS)
+    env = prl.TaughtEnv(env, teacher, set_level, **more)
+    env.reset()
+    with pytest.raises(ArgumentError, match=message) as refused:
+        env.step(0)
+    teacher.propose(1)
+    assert not curriculum.seen and "\n" not in str(refused.value)
+
+
+def told(outside: bool, **more: Any) -> dict[int, tuple[float, float]]:
+    """What is told of nine episodes of three steps at most, the time limit around or inside."""
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS)
+    inner = LevelEnv() if outside else TimeLimit(LevelEnv(), 3)
+    how: Any = dict(success="terminated", **more)
+    env: Any = prl.TaughtEnv(inner, teacher, set_level, **how)
+    env = TimeLimit(env, 3) if outside else env
+    for _ in range(9):
+        env.reset()
+        while not any(env.step(0)[2:4]):
+            pass
+    env.reset()
+    env.reset()  # nothing has begun
+    teacher.propose(1)  # takes in what was told
+    return curriculum.seen
+
+
+def test_a_time_limit_outside_is_warned_of_or_counts() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        right = told(outside=False)
+        assert told(outside=True, reset_truncates=True) == right
+    with pytest.warns(UserWarning, match="a second episode was cut off by a reset") as heard:
+        some = told(outside=True)
+    assert len(heard) == 1
+    assert some == {number: one for number, one in right.items() if one[1]} != right
+    assert len(right) == 9
+
+
+def test_one_episode_may_be_cut_off() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = prl.TaughtEnv(LevelEnv(), prl.Teacher(Counting(), ITEMS), set_level)
+        env.reset()
+        env.step(0)
+        env.reset()
+
+
+def test_a_parameter_that_the_environment_never_gets_is_told_once() -> None:
+    space = prl.Parameters({"gravity": (5.0, 25.0), "force_mag": (5.0, 15.0)}, seeded=True)
+    teacher = prl.Teacher("domain_randomization", space)
+    env = prl.TaughtEnv(gymnasium.make("CartPole-v1"), teacher, {"gravity": "gravity"})
+    with pytest.warns(UserWarning, match="set: leaves out force_mag, which") as heard:
+        env.reset()
+        env.reset()
+    assert len(heard) == 1
+
+
+class Copies(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Has a gravity of its own."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.gravity = env.unwrapped.gravity
+
+
+class PutsBack(Copies):
+    def reset(self, **given: Any) -> Any:
+        self.unwrapped.gravity = self.gravity  # type: ignore[attr-defined]
+        return super().reset(**given)
+
+
+def fixed(value: Any) -> property:
+    return property(lambda self: value, lambda self, new: None)
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (answering(gravity=fixed(9.8)), "gravity of Odd is 9.8, not "),
+        (answering(ground=fixed("flat")), "ground of Odd is flat, not 'stairs'"),
+        (Copies(answering(gravity=9.8)), "gravity of Copies is 9.8, not .*, after a reset"),
+        (PutsBack(answering(gravity=9.8)), "gravity of PutsBack is 9.8, not .*, after a reset"),
+        (answering(gravity=property(lambda self: 9.8)), "gravity of Odd cannot be set to"),
+    ],
+)
+def test_an_attribute_that_does_not_get_there_is_found(env: Any, message: str) -> None:
+    name, values = ("ground", ["stairs"]) if "ground" in message else ("gravity", (5.0, 9.0))
+    teacher = prl.Teacher("domain_randomization", prl.Parameters({name: values}))
+    with pytest.raises(ArgumentError, match=f"set.{name}='{name}': {message}"):
+        prl.TaughtEnv(env, teacher, {name: name}).reset()
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_success_may_be_of_any_step(once: bool) -> None:
+    """On every second level it is there in the first step alone, else never but every fourth."""
+
+    def step(self: Any, action: int) -> Any:
+        seen, reward, *ends, _ = LevelEnv.step(self, action)
+        won = self.played % 2 == 0 and (self.steps == 1 or self.played % 4 == 0)
+        return seen, reward, *ends, {"deep": {"won": np.array([won])}}
+
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS)
+    env = prl.TaughtEnv(answering(step=step), teacher, set_level, success="deep.won", once=once)
+    for _ in range(8):
+        env.reset()
+        while not env.step(0)[2]:
+            pass
+    teacher.propose(1)  # takes in what was told
+    for number in range(8):
+        assert curriculum.seen[number][1] == (number % (2 if once else 4) == 0)
 
 
 def test_success_is_asked_for_where_nothing_says_it() -> None:

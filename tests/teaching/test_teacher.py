@@ -492,6 +492,10 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         lambda t: t.load_state_dict(prl.Teacher("plr", SPACE).state_dict()),
         "state: of another curriculum: kind was plr, is ",
     ),
+    "a state, while tickets are out": (
+        lambda t: t.load_state_dict(t.state_dict()),
+        "state: levels of this teacher are out",
+    ),
     "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7: must be from 0 to 1"),
     "too few": (
         lambda t: t.tell([0, 1, 2], [0.0, 1.0], [1, 0, 0]),

@@ -10,8 +10,10 @@ import gymnasium
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.utils import split_trajectories
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import (
     Compose,
     FrameSkipTransform,
@@ -230,6 +232,102 @@ def test_environments_that_reset_themselves_are_refused() -> None:
             continue
         with pytest.raises(ArgumentError, match="env: resets itself at an episode's end"):
             env.rollout(3)
+
+
+class Several(LevelsEnv):
+    """Two rewards, of which one is that of the level: of agents, or of objectives."""
+
+    def __init__(self, key: Any, shape: tuple[int, ...]) -> None:
+        super().__init__(3)
+        self.key, self.shaped = key, (3, *shape)
+        spec = Unbounded(self.shaped)
+        agents = Composite(reward=spec, shape=(3, 2))
+        self.reward_spec = spec if key == "reward" else Composite(agents=agents, shape=(3,))
+
+    def _step(self, tensordict: Any) -> Any:
+        after = super()._step(tensordict)
+        rewards = torch.zeros(self.shaped)
+        rewards[:, 0] = after.pop("reward").reshape(3, *[1] * (len(self.shaped) - 2))
+        agents = TensorDict({"reward": rewards}, [3, 2]) if self.key != "reward" else None
+        return after.set("reward", rewards) if agents is None else after.set("agents", agents)
+
+
+AGENTS, OBJECTIVES = (("agents", "reward"), (2, 1)), ("reward", (2,))
+
+
+@pytest.mark.parametrize(
+    ("make", "how", "message"),
+    [
+        (
+            partial(Several, *AGENTS),
+            {},
+            "reward='reward': no entry of next, .*agents.reward",
+        ),
+        (
+            partial(Several, *AGENTS),
+            {"reward": ("agents", "reward")},
+            r"reward: has the shape \[3, 2, 1\], not \[3, 1\]; it must be one number for each",
+        ),
+        (partial(Several, *OBJECTIVES), {}, r"reward: has the shape \[3, 2\], not \[3, 1\]"),
+        (LevelsEnv, {"success": "won"}, "success='won': no entry of next, which has .*success"),
+        (LevelsEnv, {"success": "observatio"}, "success='observatio': no entry"),
+        (partial(SerialEnv, 2, LevelsEnv), {}, "env: levels .* of SerialEnv from outside"),
+        (
+            partial(ParallelEnv, 2, LevelsEnv),
+            {},
+            "env: levels .* of ParallelEnv from outside",
+        ),
+    ],
+)
+def test_what_an_environment_lacks_is_said_before_a_step(make: Any, how: Any, message: str) -> None:
+    teacher = prl.Teacher(Counting(), ITEMS)
+    env = TransformedEnv(make(), prl.LevelTransform(teacher, set_level, **how))
+    with pytest.raises(ArgumentError, match=message) as refused:
+        env.reset()
+    assert "\n" not in str(refused.value)
+    assert teacher.ask()[0] == 0  # no level is lost
+
+
+@pytest.mark.parametrize("rewards", [AGENTS, OBJECTIVES])
+def test_a_function_makes_one_reward_of_several(rewards: Any) -> None:
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS)
+    how = {"reward": lambda after: after[rewards[0]].flatten(1).sum(-1, keepdim=True)}
+    env = TransformedEnv(Several(*rewards), prl.LevelTransform(teacher, set_level, **how))
+    env.rollout(12, break_when_any_done=False)
+    teacher.propose(1)  # takes in what was told
+    check(curriculum.seen)
+    assert len(curriculum.seen) > 3
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_success_may_be_of_any_step(once: bool) -> None:
+    """It is there in the first step of odd levels, and in the last one of every fourth."""
+
+    def won(after: Any) -> Any:
+        level = after["reward"]  # see LevelsEnv
+        return ((after["observation"] == 1) & (level % 2 == 1)) | (after["done"] & (level % 4 == 0))
+
+    curriculum = Counting("success")
+    teacher = prl.Teacher(curriculum, ITEMS)
+    taught(teacher, success=won, once=once).rollout(16, break_when_any_done=False)
+    teacher.propose(1)  # takes in what was told
+    assert len(curriculum.seen) > 8
+    for number, (_, success) in curriculum.seen.items():
+        assert success == (number % 4 == 0 or (once and number % 2 == 1)), number
+
+
+def test_mazes_say_what_is_a_success() -> None:
+    """The goal is to the right: the first episode gets there, the second one does not."""
+    teacher: Any = prl.Teacher(Counting("success"), ITEMS)
+    env = prl.MazeEnv(prl.Level.from_text("S.G"), max_steps=3)
+    env = TransformedEnv(env, prl.LevelTransform(teacher, lambda env, level: None))
+    for action in (3, 2):
+        state = env.reset()
+        while not state["done"]:
+            state = env.step(state.set("action", torch.tensor(action)))["next"]
+    teacher.propose(1)  # takes in what was told
+    assert [success for _, success in teacher.curriculum.seen.values()] == [1.0, 0.0]
 
 
 def test_success_is_asked_for() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium
@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 # Spaces whose values are one number or an array of them.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class UnfitEnvironmentError(ValueError):
@@ -44,15 +45,28 @@ class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step; what comes back must be five values."""
-        result = self.env.step(action)
-        if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], Mapping)):
-            raise UnfitEnvironmentError(
-                "step must return five values, observation, reward, terminated, truncated and an "
-                f"info, which is a dictionary; it returns {_what(result)} (as in old Gym?)"
-            )
-        seen, reward, terminated, truncated, info = result
-        over = flag(terminated, "terminated"), flag(truncated, "truncated")
-        return seen, number(reward, "the reward"), *over, info
+        return stepped(self.env.step(action))
+
+
+def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """What a step has returned: the reward as a finite float, the ends as truth values.
+
+    Raises:
+        UnfitEnvironmentError: if it is not that.
+    """
+    if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], Mapping)):
+        raise UnfitEnvironmentError(
+            "step must return five values, observation, reward, terminated, truncated and an "
+            f"info, which is a dictionary; it returns {_what(result)} (as in old Gym?)"
+        )
+    seen, reward, terminated, truncated, info = result
+    over = flag(terminated, "terminated"), flag(truncated, "truncated")
+    reward = number(reward, "the reward")
+    if not abs(reward) <= LARGEST:
+        raise UnfitEnvironmentError(
+            f"step pays a reward of {reward}: it must be finite, also as float32"
+        )
+    return seen, reward, *over, info
 
 
 def number(value: Any, what: str) -> float:
@@ -66,7 +80,9 @@ def number(value: Any, what: str) -> float:
     element = _element(value)
     if isinstance(element, int | float):
         return float(element)
-    raise UnfitEnvironmentError(f"{what} must be a number, not {_what(value)}")
+    raise UnfitEnvironmentError(
+        f"{what} must be a number, not {_what(value)}; an array of one number is one, too"
+    )
 
 
 def flag(value: Any, what: str) -> bool:
@@ -81,6 +97,14 @@ def flag(value: Any, what: str) -> bool:
     if isinstance(element, int | float) and element in (0, 1):
         return bool(element)
     raise UnfitEnvironmentError(f"{what} must be true or false, not {_what(value)}")
+
+
+def entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """An info's entries by their names, also those within others: ``metrics.won``."""
+    for name, value in info.items():
+        yield f"{within}{name}", value
+        if isinstance(value, Mapping):
+            yield from entries(value, f"{within}{name}.")
 
 
 def check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:

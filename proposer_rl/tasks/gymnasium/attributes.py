@@ -1,18 +1,21 @@
-"""Numbers inside an environment, by dotted names: ``gravity``, ``model.opt.gravity.2``."""
+"""What is inside an environment, by dotted names: ``gravity``, ``model.opt.gravity.2``."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from numbers import Number
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 
 
 class AttributeRefusedError(ValueError):
-    """An environment has no such number, or does not take it; the message is one line."""
+    """An environment has no such thing, or does not take it; the message is one line."""
 
 
 def read(environment: Any, path: str) -> Any:
@@ -36,11 +39,11 @@ def read(environment: Any, path: str) -> Any:
     return place
 
 
-def write(environment: Any, path: str, value: float) -> None:
-    """Put a number in the place of another, and see that it is there.
+def write(environment: Any, path: str, value: Any) -> None:
+    """Put a number in the place of another, or a text in that of what is none, and see it there.
 
     Raises:
-        AttributeRefusedError: if there is no number at the path, or it cannot be changed.
+        AttributeRefusedError: if there is no such thing at the path, or it cannot be changed.
     """
     before = read(environment, path)
     within, _, last = path.rpartition(".")
@@ -56,7 +59,7 @@ def write(environment: Any, path: str, value: float) -> None:
     except Exception as error:  # a setter may raise anything
         reason = " ".join(str(error).split())
         raise AttributeRefusedError(
-            f"{path} of {type(environment).__name__} cannot be set to {value:g}: "
+            f"{path} of {type(environment).__name__} cannot be set to {_shown(value)}: "
             f"{type(error).__name__}: {reason}"
         ) from error
     if shadows and last in vars(holder):
@@ -69,18 +72,46 @@ def write(environment: Any, path: str, value: float) -> None:
         raise AttributeRefusedError(line)
 
 
-def stray(environment: Any, path: str, value: float) -> str | None:
-    """A line that says what stands at a path, where it is not this number; else None."""
-    now = read(environment, path)
-    try:
-        same = bool(np.isclose(float(now), value, rtol=1e-5))  # it may be kept in 32 bits
-    except (TypeError, ValueError):
-        same = False
-    return None if same else f"{path} of {type(environment).__name__} is {now}, not {value:g}"
+def stray(environment: Any, path: str, value: Any) -> str | None:
+    """A line that says what stands at a path, where it is not this value; else None.
+
+    A wrapper that has something there by itself, beside the environment, must have the same.
+    """
+    for layer, now in _readings(environment, path):
+        try:
+            if isinstance(value, int | float):
+                # It may be kept in 32 bits.
+                same = math.isclose(float(now), float(value), rel_tol=1e-5, abs_tol=1e-8)
+            else:
+                same = now is value or np.array_equal(now, value)
+        except (TypeError, ValueError, RuntimeError):
+            same = False
+        if not same:
+            return f"{path} of {type(layer).__name__} is {now}, not {_shown(value)}"
+    return None
 
 
-def _alike(before: Any, value: float, path: str) -> Any:
-    """A number as what it replaces: a truth value, a tensor without dimensions."""
+def _readings(environment: Any, path: str) -> Iterator[tuple[Any, Any]]:
+    """What stands at a path in an environment, and in those of its wrappers that have it."""
+    first = path.partition(".")[0]
+    while isinstance(environment, gymnasium.Wrapper):
+        if hasattr(environment, first):
+            with suppress(AttributeRefusedError):
+                yield environment, read(environment, path)
+        environment = environment.env
+    yield environment, read(environment, path)
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, int | float) else repr(value)
+
+
+def _alike(before: Any, value: Any, path: str) -> Any:
+    """A value as what it replaces: a truth value, a tensor without dimensions."""
+    if not isinstance(value, int | float):
+        if isinstance(before, Number):
+            raise AttributeRefusedError(f"{path} is a number, {before}, and no place for {value!r}")
+        return value
     shape = tuple(getattr(before, "shape", ()))
     if isinstance(before, list | tuple):
         shape = (len(before),)

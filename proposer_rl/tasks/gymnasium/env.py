@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from proposer_rl.models import available_cores
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.processes import ProcessVectorEnv
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step
+from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
 from proposer_rl.tasks.gymnasium.spaces import NUMBERS
 from proposer_rl.tasks.parameters import SEED
 
@@ -41,7 +41,7 @@ class GymnasiumEnv(EnvBase):
             device is that of the states.
         make: makes one environment.
         parameters: what differs between levels, by name.
-        success: whether the last step of an episode says that it was one.
+        success: when an episode is one.
         reward_scale: rewards are multiplied with it.
         vectorization: one after another, or in as many processes as there are cores.
         once: play one episode of each level, and then stand still, without reward.
@@ -53,7 +53,7 @@ class GymnasiumEnv(EnvBase):
         make: MakeEnvironment,
         parameters: Mapping[str, ParameterSettings],
         *,
-        success: Callable[[Step], bool],
+        success: SuccessSettings,
         reward_scale: float = 1.0,
         vectorization: Vectorization = "sync",
         once: bool = False,

@@ -13,9 +13,14 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
-from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError, stepped
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings, Step, WrapperSettings
+from proposer_rl.tasks.gymnasium.settings import (
+    ParameterSettings,
+    Step,
+    SuccessSettings,
+    WrapperSettings,
+)
 from proposer_rl.tasks.gymnasium.spaces import plain
 from proposer_rl.tasks.parameters import SEED
 
@@ -111,7 +116,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     Args:
         make, parameters: the environment, and what differs between levels, by name.
         play: the first level.
-        success: whether a step ended an episode that is one; None where nobody asks.
+        success: when an episode is one; None where nobody asks.
         once: stand still after the first episode of a level, for evaluations.
 
     Attributes:
@@ -125,11 +130,11 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         make: MakeEnvironment,
         parameters: Mapping[str, ParameterSettings],
         play: Play,
-        success: Callable[[Step], bool] | None = None,
+        success: SuccessSettings | None = None,
         once: bool = False,
     ) -> None:
         self.make, self.parameters = make, parameters
-        self._succeeded, self._once = success, once
+        self._success, self._once = success, once
         self._ways = [
             (name, settings.set, path)
             for name, settings in parameters.items()
@@ -163,7 +168,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._once and self._played:
             self._still = True
             return self._seen, {}
-        self._played, self._return = True, 0.0
+        self._played, self._return, self._succeeded = True, 0.0, False
         self._set_up()
         given = self._named("option")
         try:
@@ -181,26 +186,24 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._still:
             return self._seen, 0.0, False, False, {}
         try:
-            self._seen, reward, terminated, truncated, self.told = self.env.step(action)
-        except UnfitEnvironmentError:
-            raise
+            answer = stepped(self.env.step(action))
         except Exception as error:  # whatever an environment of somebody's may raise
-            raise UnfitEnvironmentError(
-                f"step raises {told(error)}, on the level {self._play}"
-            ) from error
-        self._return += float(reward)
-        succeeded = False
-        if self._succeeded is not None and (terminated or truncated):
-            succeeded = self._succeeded(
-                Step(terminated, truncated, self.in_time, self._return, self.told)
-            )
-        info = {"success": True} if succeeded else {}
-        return self._seen, float(reward), terminated, truncated, info
+            unfit = isinstance(error, UnfitEnvironmentError)
+            said = str(error) if unfit else f"step raises {told(error)}"
+            raise UnfitEnvironmentError(f"{said}, on the level {self._play}") from error
+        self._seen, reward, terminated, truncated, self.told = answer
+        self._return += reward
+        over, rule = terminated or truncated, self._success
+        if rule is not None and (over or rule.once):
+            step = Step(terminated, truncated, self.in_time, self._return, self.told)
+            self._succeeded = rule(step) or self._succeeded
+        info = {"success": True} if over and self._succeeded else {}
+        return self._seen, reward, terminated, truncated, info
 
     def strays(self) -> str | None:
         """What of the level is not in the environment any more, as a line; None where all is."""
         for name, how, path in self._ways:
-            line = how == "attribute" and stray(self.unwrapped, path, self._play.values[name])
+            line = how == "attribute" and stray(self.env, path, self._play.values[name])
             if line:
                 return f"parameters.{name}: {line}"
         return None

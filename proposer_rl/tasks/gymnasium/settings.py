@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 from annotated_types import Ge, Gt, Len
 
 from proposer_rl.settings import settings
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, flag
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, entries, flag
 from proposer_rl.tasks.ranges import RangeSettings
 
 # The dotted name of a function or class, or that with its further arguments by name.
@@ -39,13 +39,13 @@ class ParameterSettings(RangeSettings):
 
 
 class Step(NamedTuple):
-    """The last step of an episode.
+    """A step, mostly the last one of an episode.
 
     Attributes:
         terminated: whether the environment ended it.
         truncated: whether it was cut off.
         in_time: whether the time limit had not been reached.
-        returns: the sum of its rewards.
+        returns: the sum of the episode's rewards.
         info: what the environment told.
     """
 
@@ -67,12 +67,15 @@ class SuccessSettings:
         least: the return.
         key: the entry's name; dots lead to entries of entries.
         optional: whether the entry is told only where the episode is a success.
+        once: whether the entry may be true in any step, so that what is reached and lost again is a
+            success, too.
     """
 
     kind: Literal["return", "survived", "terminated", "info"]
     least: float | None = None
     key: str | None = None
     optional: bool = False
+    once: bool = False
 
     def check(self) -> None:
         """Refuse a kind that lacks what it needs, or has more.
@@ -86,11 +89,12 @@ class SuccessSettings:
             if given != (name == needed):
                 verb = "has no effect" if given else "missing"
                 raise ValueError(f"success.{name}: {verb} with success.kind={self.kind}")
-        if self.optional and self.kind != "info":
-            raise ValueError(f"success.optional: has no effect with success.kind={self.kind}")
+        for name in ("optional", "once"):
+            if getattr(self, name) and self.kind != "info":
+                raise ValueError(f"success.{name}: has no effect with success.kind={self.kind}")
 
     def __call__(self, step: Step) -> bool:
-        """Whether an episode with this last step is a success.
+        """Whether an episode with this last step, or with ``once`` any such step, is a success.
 
         Raises:
             UnfitEnvironmentError: if its info says it in something else than a truth value.
@@ -111,7 +115,7 @@ class SuccessSettings:
             UnfitEnvironmentError: naming the key and the entries that there are.
         """
         if self.kind == "info" and not self.optional and self._entry(info) is None:
-            there = ", ".join(name for name, _ in _entries(info))
+            there = ", ".join(name for name, _ in entries(info))
             raise UnfitEnvironmentError(
                 f"success.key={self.key}: the last info of an episode has no such entry; it has: "
                 f"{there or 'none'}; where only episodes that succeed have it, set "
@@ -120,15 +124,7 @@ class SuccessSettings:
 
     def _entry(self, info: Mapping[str, Any]) -> Any:
         """The info's entry; None where it is absent."""
-        return dict(_entries(info)).get(self.key or "")
-
-
-def _entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """An info's entries by their names, also those within others."""
-    for name, value in info.items():
-        yield f"{within}{name}", value
-        if isinstance(value, Mapping):
-            yield from _entries(value, f"{within}{name}.")
+        return dict(entries(info)).get(self.key or "")
 
 
 @settings

@@ -35,10 +35,15 @@ class LevelEnv(EnvBase):
             :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-designed ones.
         max_steps: Step limit of an episode.
 
+    Attributes:
+        success_rule: What of a step is a success, as ``success`` of
+            :class:`~proposer_rl.teaching.LevelTransform`.
+
     Raises:
         ValueError: If ``max_steps`` is less than 1.
     """
 
+    success_rule = "terminated"
     _constant: Sequence[str] = ()  # observations that stay the same throughout an episode
 
     def __init__(self, levels: Level, max_steps: int) -> None:

@@ -140,11 +140,30 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
         ({"kind": "survived", "least": 1.0}, "success.least: has no effect"),
         ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: has no effect"),
         ({"kind": "survived", "optional": True}, "success.optional: has no effect"),
+        ({"kind": "return", "least": 1.0, "once": True}, "success.once: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SuccessSettings(**settings).check()
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_success_may_be_of_the_last_step_or_of_any(once: bool) -> None:
+    """Who has been far on the left may be back at the end."""
+    rule = SuccessSettings(kind="info", key="far", once=once)
+    env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule)
+    rollout = env.rollout(10 * LIMIT, break_when_any_done=False)
+    found = set()
+    for row in rollout.reshape(K * P, -1):
+        been = False
+        for step in row["next"]:
+            far, over = bool(step["observation"][0] < -1), bool(step["done"])
+            been |= far
+            assert step["success"].item() == (over and (been if once else far))
+            found |= {(been, far)} if over else set()
+            been &= not over
+    assert found == {(True, True), (True, False), (False, False)}
 
 
 def test_returns_count_from_the_start_of_each_episode() -> None:
