@@ -20,6 +20,7 @@ from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
+from proposer_rl.models import own_state
 from proposer_rl.report.pictures import draw_run
 from proposer_rl.report.records import TaskFacts, checked
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
@@ -54,6 +55,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         raise
 
 
+@own_state()
 def carry_out(config: RunConfig, path: Path, signals: StopSignals) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 

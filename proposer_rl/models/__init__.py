@@ -21,5 +21,7 @@ from proposer_rl.models.proposer import ProblemHead as ProblemHead
 from proposer_rl.models.proposer import ProposerNetwork as ProposerNetwork
 from proposer_rl.models.proposer import fourier_encoding as fourier_encoding
 from proposer_rl.models.proposer import proposer_actor_critic as proposer_actor_critic
+from proposer_rl.models.torch_state import callers_state as callers_state
+from proposer_rl.models.torch_state import own_state as own_state
 from proposer_rl.models.unet import UNet as UNet
 from proposer_rl.models.unet import orthogonal_ as orthogonal_

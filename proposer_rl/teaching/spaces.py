@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.models import callers_state, own_state
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
@@ -88,6 +89,7 @@ class Parameters(LevelSpace, ParameterSpace):
         (8, True, 'stairs')
     """
 
+    @own_state()
     def __init__(
         self,
         ranges: Ranges,
@@ -184,6 +186,7 @@ class Items(LevelSpace):
         ArgumentError: if there is no item, or not a row of features for each.
     """
 
+    @own_state()
     def __init__(
         self,
         count: int,
@@ -301,7 +304,9 @@ class LevelGenerator(LevelSpace):
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
-            return torch.stack([_wrapped(edit(self.given(own), count, g)) for own, g in rows])
+            with callers_state():
+                made = [edit(self.given(own), count, generator) for own, generator in rows]
+            return torch.stack([_wrapped(one) for one in made])
 
         return edited
 
@@ -311,7 +316,8 @@ class _Drawn:
         self._name, self._draw = name, draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        levels = self._draw(count, generator)
+        with callers_state():
+            levels = self._draw(count, generator)
         if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (count,):
             shape = list(getattr(levels, "shape", ())) or type(levels).__name__
             raise ArgumentError(f"{self._name}={shape}: must give {count} levels, [{count}, ...]")

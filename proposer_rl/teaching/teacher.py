@@ -18,6 +18,7 @@ from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
+from proposer_rl.models import callers_state, own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -84,6 +85,7 @@ class Teacher:
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
+    @own_state()
     @checked
     def __init__(
         self,
@@ -226,6 +228,7 @@ class Teacher:
                 going = self._tickets.states(tickets) != OVER
                 self._tickets.close(self._tickets.find(tickets[going]))
 
+    @own_state()
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
 
@@ -266,6 +269,7 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
+    @own_state()
     def log(self) -> dict[str, Any]:
         """What the curriculum has to tell since the last call; empty if there is nothing.
 
@@ -274,6 +278,7 @@ class Teacher:
         with self._here():
             return self.curriculum.log()
 
+    @own_state()
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed loop needs, tickets that are out included."""
         with self._here():
@@ -291,6 +296,7 @@ class Teacher:
                 else {"shape": list(kept.batch_size), "kept": packed(kept)},
             }
 
+    @own_state()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
@@ -361,6 +367,7 @@ class Teacher:
         self._block, self._at = block, at
         self._rows, self._moved = [], None
 
+    @own_state()
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
         self._tickets.collect(partial(self.curriculum.observe, self.student))
@@ -398,7 +405,8 @@ class Teacher:
         known = "success" in after.keys()
         if not known and self._success is not None:
             rule = self._success
-            after["success"] = rule(after) if callable(rule) else after[rule]
+            with callers_state():
+                after["success"] = rule(after) if callable(rule) else after[rule]
             known = True
         self._require_success(known, "give Teacher(success=...), or the rollout a next success")
         rollout["next"] = after

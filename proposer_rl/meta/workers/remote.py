@@ -13,7 +13,7 @@ from proposer_rl.meta.copies import Trained, taken_out
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.meta.rewards import Reward
 from proposer_rl.meta.settings import ProposerSettings
-from proposer_rl.models import ActorCritic, uniform_noise, use_device
+from proposer_rl.models import ActorCritic, own_state, uniform_noise, use_device
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -41,6 +41,7 @@ class WorkerEnv(SolverTrainingEnv):
         own = taken_out(self, copy - self._copies.start).to("cpu")
         return own._replace(solver=own.solver.consolidate())  # one thing to send, not hundreds
 
+    @own_state()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:
             try:
@@ -55,6 +56,7 @@ class WorkerEnv(SolverTrainingEnv):
         return state.set("reward", torch.full_like(state["return"], torch.nan))
 
 
+@own_state()
 def worker_env(
     make_task: Callable[[str], Task],
     config: ProposerSettings,

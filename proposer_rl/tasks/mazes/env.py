@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
+from proposer_rl.models import own_state
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.dynamics import MOVES, successors
 from proposer_rl.tasks.mazes.level_env import LevelEnv
@@ -50,6 +51,7 @@ class MazeEnv(LevelEnv):
         (tensor([0.9900]), tensor([True]))
     """
 
+    @own_state()
     def __init__(
         self,
         levels: Level,

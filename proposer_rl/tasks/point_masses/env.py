@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import population
+from proposer_rl.models import own_state, population
 from proposer_rl.settings import signed
 
 LEVEL = ("position", "width", "friction")
@@ -54,6 +54,7 @@ class PointMassEnv(EnvBase):
         tensor([ 2.9325, -1.5000])
     """
 
+    @own_state()
     def __init__(
         self,
         levels: TensorDictBase,

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
+from proposer_rl.models import own_state
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.level_env import LevelEnv
 from proposer_rl.tasks.mazes.levels import cell_index
@@ -60,6 +61,7 @@ class ViewMazeEnv(LevelEnv):
         (tensor([0.9892]), tensor([True]))
     """
 
+    @own_state()
     def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
         super().__init__(levels, max_steps)
         batch = self.batch_size
@@ -107,7 +109,7 @@ class ViewMazeEnv(LevelEnv):
         terminated = (there == GOAL).unsqueeze(-1)
         self._agent = agent + does[..., 2:]
         ends = self._after(terminated, tensordict)
-        reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
+        reward = (1 - PENALTY / self.max_steps * ends["step_count"].float()) * terminated
         return TensorDict(
             {
                 "view": self._view(place, direction),
