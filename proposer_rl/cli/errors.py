@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from io import TextIOWrapper
 from pathlib import Path
 from signal import SIGINT
 from typing import NoReturn
@@ -28,6 +29,7 @@ class ConfigError(ValueError):
 
 def command(body: Callable[[], None]) -> None:
     """Run the body of a command; what was foreseen ends it with one line and its exit code."""
+    print_all_signs()
     try:
         body()
     except KeyboardInterrupt:
@@ -36,6 +38,12 @@ def command(body: Callable[[], None]) -> None:
         if exit_code(error) == UNFORESEEN:
             raise
         refuse(error)
+
+
+def print_all_signs() -> None:
+    """Let a question mark stand on standard output for what its encoding does not have."""
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")
 
 
 def refuse(error: Exception, folder: Path | None = None) -> NoReturn:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import shlex
+import sys
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -117,13 +118,22 @@ def _from_here(path: str) -> str:
 def announce(result: dict[str, Any], config: RunConfig, folder: RunFolder, picture: Path) -> None:
     """Print the results; on one screen, unless the run is one of a sweep's."""
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        Console().print(screen(read_progress(folder.path)))
+        console = Console()
+        with console.capture() as shown:
+            console.print(screen(read_progress(folder.path)))
+        say(shown.get().removesuffix("\n"))
     for seed, reached, final in zip(
         config.seeds, result["updates_to_threshold"], result["final"], strict=True
     ):
-        tqdm.write(f"{config.method}, seed {seed}: {_outcome_text(result, reached, final)}")
-    tqdm.write(_cost_text(result, len(config.seeds)))
-    tqdm.write(f"Files: {folder.path}  (picture: {picture.name})")
+        say(f"{config.method}, seed {seed}: {_outcome_text(result, reached, final)}")
+    say(_cost_text(result, len(config.seeds)))
+    say(f"Files: {folder.path}  (picture: {picture.name})")
+
+
+def say(text: str) -> None:
+    """Print a text on standard output, which may be a user's own: in signs that it has."""
+    encoding = sys.stdout.encoding or "utf-8"
+    tqdm.write(text.encode(encoding, "replace").decode(encoding))
 
 
 def _outcome_text(result: dict[str, Any], reached: int | None, final: dict[str, float]) -> str:

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import log_of, logger
-from proposer_rl.cli.outcome import announce, identity, run_name, to_go_on
+from proposer_rl.cli.outcome import announce, identity, run_name, say, to_go_on
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.models import own_state
@@ -45,13 +44,13 @@ def train(config: RunConfig, path: Path, signals: StopSignals) -> float:
         return carry_out(config, path, signals)
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
-        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(path)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
-        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(path)}")
         raise
 
 
@@ -96,7 +95,7 @@ def proceed(
     check_same_run(folder, replace(config, precision=precision))
     finished = _finished(path, config.schedule.updates)
     if finished is not None:
-        tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
+        say(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as write:
         log = None if write is None else log_of(write, path)
