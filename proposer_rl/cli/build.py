@@ -19,7 +19,7 @@ from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
-from proposer_rl.models import available_cores, use_device
+from proposer_rl.models import available_cores, own_state, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals, memory
 from proposer_rl.streams import Streams
@@ -113,7 +113,8 @@ def _check_memory(learner: PPO) -> None:
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """The task on a device; a worker calls it, too."""
     use_device(torch.device(device))
-    return maker(solver=solver, context=context._replace(device=torch.device(device)))
+    with own_state():  # also after whatever a module of one's own sets as it is imported
+        return maker(solver=solver, context=context._replace(device=torch.device(device)))
 
 
 def _curriculum(

@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from io import TextIOWrapper
 from pathlib import Path
 from signal import SIGINT
 from typing import NoReturn, TypeVar
@@ -32,6 +33,7 @@ class ConfigError(ValueError):
 
 def command(body: Callable[[], None]) -> None:
     """Run the body of a command; what was foreseen ends it with one line and its exit code."""
+    print_all_signs()
     try:
         body()
     except KeyboardInterrupt:
@@ -40,6 +42,20 @@ def command(body: Callable[[], None]) -> None:
         if exit_code(error) == UNFORESEEN:
             raise
         refuse(error)
+
+
+def print_all_signs() -> None:
+    """Let a question mark stand on standard output for what its encoding does not have."""
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")
+
+
+def say(text: str) -> None:
+    """Print a text on standard output, which may be a user's own: in signs that it has."""
+    from tqdm import tqdm
+
+    encoding = sys.stdout.encoding or "utf-8"
+    tqdm.write(text.encode(encoding, "replace").decode(encoding))
 
 
 def refuse(error: Exception, folder: Path | None = None) -> NoReturn:

@@ -22,17 +22,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from numpy.typing import NDArray
 from PIL import Image
-from tqdm import tqdm
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
-from proposer_rl.cli.errors import ConfigError, one_line
+from proposer_rl.cli.errors import ConfigError, one_line, say
 from proposer_rl.cli.groups import overrides
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
+from proposer_rl.models import own_state
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
@@ -75,16 +75,17 @@ def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> 
         return carry_out(config, path, signals, shown)
     except Interrupted as stop:
         stopped = f"{one_line(stop).capitalize()}; all is saved"
-        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(path)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
-        tqdm.write(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(path)}")
         raise
 
 
+@own_state()
 def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
 
@@ -125,7 +126,7 @@ def proceed(
     check_same_run(folder, replace(config, precision=precision))
     finished = _finished(path, config.schedule.updates)
     if finished is not None:
-        tqdm.write(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
+        say(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as write:
         log = None if write is None else log_of(write, partial(shown.last_map, path))

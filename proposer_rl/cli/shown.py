@@ -18,8 +18,8 @@ from hydra.types import RunMode
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich.console import Console
-from tqdm import tqdm
 
+from proposer_rl.cli.errors import say
 from proposer_rl.report.terminal import find_progress, overview, read_progress, screen
 from proposer_rl.runs.folder import FAILURE, is_rate
 from proposer_rl.runs.records import level_text
@@ -67,13 +67,16 @@ def announce(
 ) -> None:
     """Print the results; on one screen, unless the run is one of a sweep's."""
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        Console().print(screen(read_progress(folder)))
+        console = Console()
+        with console.capture() as printed:
+            console.print(screen(read_progress(folder)))
+        say(printed.get().removesuffix("\n"))
     for seed, reached, final in zip(
         seeds, result["updates_to_threshold"], result["final"], strict=True
     ):
-        tqdm.write(f"{method}, seed {seed}: {_outcome_text(result, reached, final)}")
-    tqdm.write(_cost_text(result, len(seeds)))
-    tqdm.write(f"Files: {folder}  (picture: {picture.name})")
+        say(f"{method}, seed {seed}: {_outcome_text(result, reached, final)}")
+    say(_cost_text(result, len(seeds)))
+    say(f"Files: {folder}  (picture: {picture.name})")
 
 
 def _outcome_text(

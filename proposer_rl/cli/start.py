@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 
+from proposer_rl.cli.errors import print_all_signs
 from proposer_rl.cli.help import help_text
 
 
 def main() -> None:
     """Entry point of the command."""
     if {"--help", "-h"} & set(sys.argv[1:]):
+        print_all_signs()
         try:
             print(help_text(sys.argv[1:]), flush=True)
         except BrokenPipeError:  # who reads has seen enough, as with `| head`

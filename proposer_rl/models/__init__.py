@@ -23,3 +23,5 @@ from proposer_rl.models.proposer import ProblemHead as ProblemHead
 from proposer_rl.models.proposer import ProposerNetwork as ProposerNetwork
 from proposer_rl.models.proposer import fourier_encoding as fourier_encoding
 from proposer_rl.models.proposer import proposer_actor_critic as proposer_actor_critic
+from proposer_rl.models.torch_state import callers_state as callers_state
+from proposer_rl.models.torch_state import own_state as own_state

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import pickle
 from contextlib import suppress
+from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 from threading import Lock, Thread
 from typing import Any
+
+import torch
 
 
 class TeacherClient:
@@ -41,13 +44,13 @@ class TeacherClient:
 
     def _call(self, name: str, *arguments: Any, **more: Any) -> Any:
         with self._lock:
-            if self._connection is None or self._process != os.getpid():
-                self._connection = Client(self._address, authkey=self._key)
-                self._process = os.getpid()
             try:
+                if self._connection is None or self._process != os.getpid():
+                    self._connection = Client(self._address, authkey=self._key)
+                    self._process = os.getpid()
                 self._connection.send_bytes(pickle.dumps((name, arguments, more)))
                 result, error = pickle.loads(self._connection.recv_bytes())
-            except (EOFError, OSError) as lost:
+            except (AuthenticationError, EOFError, OSError) as lost:  # or its place was taken
                 raise RuntimeError("the process of the teacher has ended") from lost
         if error is not None:
             raise error
@@ -59,7 +62,10 @@ class TeacherServer:
 
     def __init__(self, teacher: Any) -> None:
         self._teacher, self._key = teacher, os.urandom(32)
-        self._listener = Listener(authkey=self._key)
+        try:
+            self._listener = Listener(authkey=self._key)
+        except OSError:  # a socket's path below a long TMPDIR
+            self._listener = Listener(("127.0.0.1", 0), authkey=self._key)
         Thread(target=self._accept, daemon=True).start()
 
     def client(self) -> TeacherClient:
@@ -79,7 +85,18 @@ class TeacherServer:
                 name, arguments, more = pickle.loads(connection.recv_bytes())
                 answer: tuple[Any, Exception | None]
                 try:
-                    answer = getattr(self._teacher, name)(*arguments, **more), None
+                    with self._teacher._here():  # what it computes in its caller's thread is over
+                        _check_precision()
+                        answer = getattr(self._teacher, name)(*arguments, **more), None
                 except Exception as error:
                     answer = None, error
                 connection.send_bytes(pickle.dumps(answer))
+
+
+def _check_precision() -> None:
+    """Refuse to change torch's default precision, which is not a thread's own, beside a loop."""
+    if (dtype := torch.get_default_dtype()) != torch.float32:
+        raise RuntimeError(
+            f"torch's default dtype is {dtype}: a teacher answers clients from a thread beside "
+            "your loop where it is torch.float32"
+        )

@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
+from proposer_rl.models import callers_state, own_state
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
@@ -99,6 +100,7 @@ class Parameters(LevelSpace, ParameterSpace):
         (8, True, 'stairs')
     """
 
+    @own_state()
     def __init__(
         self,
         ranges: Ranges,
@@ -233,6 +235,7 @@ class Items(LevelSpace):
         ArgumentError: if there is no item, or not a row of features for each.
     """
 
+    @own_state()
     def __init__(
         self,
         count: int,
@@ -361,7 +364,8 @@ class LevelGenerator(LevelSpace):
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
-            made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
+            with callers_state():
+                made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
             return torch.stack([_taken("edit", new, n) for new, n in made])
 
         return edited
@@ -372,7 +376,9 @@ class _Drawn:
         self._name, self._draw = name, draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        return _taken(self._name, self._draw(count, generator), count)
+        with callers_state():
+            levels = self._draw(count, generator)
+        return _taken(self._name, levels, count)
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:

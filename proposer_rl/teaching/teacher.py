@@ -20,6 +20,7 @@ from torch.utils._pytree import tree_map_only
 from proposer_rl.curricula import Curriculum, Student, outcome_of, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
+from proposer_rl.models import callers_state, own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
@@ -91,6 +92,7 @@ class Teacher:
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
+    @own_state()
     @checked
     def __init__(
         self,
@@ -241,6 +243,7 @@ class Teacher:
                 self._ledger.drop(self._ledger.find(tickets[going]))
             self._tally.dropped(before - self._ledger.out)
 
+    @own_state()
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """What came of the levels that were proposed, or of those of some tickets.
 
@@ -281,6 +284,7 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
+    @own_state()
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
         """What happened since the last call, and what the curriculum has to tell of it.
 
@@ -305,6 +309,7 @@ class Teacher:
                     lines.write(json.dumps(kept) + "\n")
             return told
 
+    @own_state()
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed loop needs, tickets that are out included."""
         with self._here():
@@ -324,6 +329,7 @@ class Teacher:
                 else {"shape": list(kept.batch_size), "kept": packed(kept)},
             }
 
+    @own_state()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
 
@@ -422,6 +428,7 @@ class Teacher:
             self._tally.count(block.batch.levels[:, some])
             self._counted = self._at
 
+    @own_state()
     def _next(self, count: int) -> Block:
         """What the curriculum proposes, when it has observed what was told."""
         for told, results in self._ledger.take():
@@ -461,7 +468,8 @@ class Teacher:
         known = "success" in after.keys()
         if not known and self._success is not None:
             rule = self._success
-            after["success"] = rule(after) if callable(rule) else after[rule]
+            with callers_state():
+                after["success"] = rule(after) if callable(rule) else after[rule]
             known = True
         self._require_success(known, "give Teacher(success=...), or the rollout a next success")
         rollout["next"] = after

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import available_cores
+from proposer_rl.models import available_cores, callers_state
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.gymnasium.processes import ProcessVectorEnv
@@ -65,10 +65,11 @@ class GymnasiumEnv(EnvBase):
             partial(LevelPlayer, make, parameters, play, success, once) for play in self._plays
         ]
         self._vector: SyncVectorEnv | ProcessVectorEnv
-        if vectorization == "sync":
-            self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
-        else:
-            self._vector = ProcessVectorEnv(players, available_cores())
+        with callers_state():  # as wherever code of theirs runs
+            if vectorization == "sync":
+                self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
+            else:
+                self._vector = ProcessVectorEnv(players, available_cores())
         self._make_specs()
 
     def set_levels(self, levels: TensorDictBase) -> None:
@@ -78,13 +79,15 @@ class GymnasiumEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all environments, and end their processes."""
-        self._vector.close()
+        with callers_state():
+            self._vector.close()
         super().close(raise_if_closed=raise_if_closed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.reshape(-1).cpu().numpy()}
-        seen, _ = self._vector.reset(options=options)
+        with callers_state():
+            seen, _ = self._vector.reset(options=options)
         # Of these TorchRL takes over only the entries of the environments that are reset.
         none = np.zeros(self._vector.num_envs, np.bool_)
         return self._batched(seen, success=none, is_init=~none)
@@ -92,7 +95,8 @@ class GymnasiumEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         space = self._vector.single_action_space
         actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
-        seen, rewards, terminated, truncated, info = self._vector.step(actions)
+        with callers_state():
+            seen, rewards, terminated, truncated, info = self._vector.step(actions)
         none = np.zeros_like(terminated)
         return self._batched(
             seen,

@@ -15,6 +15,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from proposer_rl.models import callers_state
+
 # A forked process need not import torch again, of which it has no use.
 CONTEXT: Any = multiprocessing.get_context(
     "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
@@ -114,6 +116,7 @@ class ProcessVectorEnv:
         return [answer for _, answer in answers]
 
 
+@callers_state()
 def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> None:
     """Step environments until the pipe is closed, or the parent is gone."""
     parents.close()

@@ -44,7 +44,11 @@ def _with_plain_observations(env: Env) -> Env:
         # Any numbers are floats to a vector environment, which keeps whole ones only of their type.
         whole = space.dtype.kind in "biu"
         return TransformObservation(env, partial(_typed, space), space) if whole else env
-    parts = dict(leaves(space))
+    parts: dict[str, spaces.Space[Any]] = {}
+    for name, part in leaves(space):
+        while name in parts:  # a.b is a name with a dot, or b in a
+            name += "'"
+        parts[name] = part
     for name, part in parts.items():
         if not isinstance(part, NUMERIC):
             way = "; a wrapper can make numbers of it"
@@ -66,7 +70,7 @@ def _with_plain_observations(env: Env) -> Env:
         new[NUMBERS] = spaces.flatten_space(rest)
 
     def changed(seen: Any) -> Any:
-        shown = dict(leaves(seen))
+        shown = dict(zip(parts, _in_order(space, seen), strict=True))
         out: dict[str, Any] = {
             f"image {name}": _of_three_axes(_typed(box, shown[name]))
             for name, box in images.items()
@@ -206,6 +210,18 @@ def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, whole
+
+
+def _in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
+    """The parts of an observation, in the order of those of its space."""
+    if isinstance(space, spaces.Dict):
+        for name, inner in space.spaces.items():
+            yield from _in_order(inner, seen[name])
+    elif isinstance(space, spaces.Tuple):
+        for inner, one in zip(space.spaces, seen, strict=True):
+            yield from _in_order(inner, one)
+    else:
+        yield seen
 
 
 def _composed(space: spaces.Space[Any], values: Iterator[Any]) -> Any:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import torch
 from torch import Tensor
 
+from proposer_rl.models import own_state
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_position
 from proposer_rl.tasks.mazes.mechanisms import Draws, Generators, draw_path_first, draw_uniform
 
@@ -27,6 +28,7 @@ _MECHANISMS = {
 MECHANISMS = tuple(_MECHANISMS)
 
 
+@own_state()
 def generate_levels(
     obstacle_fraction: float | Sequence[float] | Tensor,
     path_length: int | Sequence[int] | Tensor,

@@ -117,7 +117,7 @@ def planes(level: Level) -> Tensor:
 def cell_plane(cell: Tensor, grid: Sequence[int]) -> Tensor:
     """Draws cells int64 ``[*B, 2]``, row and column, as binary planes float32 ``[*B, H, W]``."""
     height, width = grid
-    plane = torch.zeros(*cell.shape[:-1], height * width, device=cell.device)
+    plane = torch.zeros(*cell.shape[:-1], height * width, dtype=torch.float32, device=cell.device)
     plane.scatter_(-1, cell_index(cell, width).unsqueeze(-1), 1.0)
     return plane.unflatten(-1, (height, width))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import population
+from proposer_rl.models import own_state, population
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
 from proposer_rl.tasks.mazes.paths import MOVES, successors
@@ -237,6 +237,7 @@ class MazeEnv(LevelEnv):
         (tensor([0.9900]), tensor([True]))
     """
 
+    @own_state()
     def __init__(
         self,
         levels: Level,

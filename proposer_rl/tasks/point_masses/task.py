@@ -17,7 +17,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings, in_first_episode
-from proposer_rl.models import population
+from proposer_rl.models import own_state, population
 from proposer_rl.settings import settings, signed
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.networks import SolverNetwork
@@ -67,6 +67,7 @@ class PointMassEnv(EnvBase):
         tensor([ 2.9325, -1.5000])
     """
 
+    @own_state()
     def __init__(
         self,
         levels: TensorDictBase,

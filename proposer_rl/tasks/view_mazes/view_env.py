@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
 from proposer_rl.learning import play_episodes
-from proposer_rl.models import ActorCritic
+from proposer_rl.models import ActorCritic, own_state
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.levels import cell_index, cell_plane
 from proposer_rl.tasks.mazes.maze_env import LevelEnv
@@ -67,6 +67,7 @@ class ViewMazeEnv(LevelEnv):
         (tensor([0.9892]), tensor([True]))
     """
 
+    @own_state()
     def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
         super().__init__(levels, max_steps)
         batch = self.batch_size
@@ -114,7 +115,7 @@ class ViewMazeEnv(LevelEnv):
         terminated = (there == GOAL_OBJECT).unsqueeze(-1)
         self._agent = agent + does[..., 2:]
         ends = self._after(terminated, tensordict)
-        reward = (1 - PENALTY / self.max_steps * ends["step_count"]) * terminated
+        reward = (1 - PENALTY / self.max_steps * ends["step_count"].float()) * terminated
         return TensorDict(
             {
                 "view": self._view(place, direction),

@@ -1,0 +1,97 @@
+"""Torch's global state: the library computes in its own, and whoever calls it keeps theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
+from typing import NamedTuple
+
+import torch
+
+
+class _State(NamedTuple):
+    """What decides on results wherever nothing else is said."""
+
+    dtype: torch.dtype
+    gradients: bool
+    inference: bool
+    device: torch.device
+
+
+OWN = _State(torch.float32, True, False, torch.device("cpu"))
+# What the callers' state is while the library computes: one entry; None outside.
+_CALLERS: ContextVar[list[_State] | None] = ContextVar("_CALLERS", default=None)
+
+
+def _now() -> _State:
+    return _State(
+        torch.get_default_dtype(),
+        torch.is_grad_enabled(),
+        torch.is_inference_mode_enabled(),
+        torch.empty(0).device,  # told sooner than by torch.get_default_device()
+    )
+
+
+@contextmanager
+def own_state() -> Iterator[None]:
+    """Compute in float32, with gradients and on the CPU wherever nothing else is said.
+
+    Afterwards torch is as the caller has set it, or a module of theirs that was imported meanwhile.
+    The default precision is the whole process's: threads beside this one see float32 meanwhile.
+
+    Example:
+        >>> torch.set_default_dtype(torch.float64)
+        >>> with own_state():
+        ...     torch.ones(1).dtype
+        torch.float32
+        >>> torch.ones(1).dtype, torch.set_default_dtype(torch.float32)
+        (torch.float64, None)
+    """
+    before, outer = _now(), _CALLERS.get()
+    theirs = outer or [before]
+    token = _CALLERS.set(theirs)
+    try:
+        with _switched(before, OWN):
+            yield
+    finally:
+        _CALLERS.reset(token)
+        _set(before if outer else theirs[0])
+
+
+@contextmanager
+def callers_state() -> Iterator[None]:
+    """Inside of :func:`own_state`, run what is the caller's in their state.
+
+    What that changes there is theirs the next time, too. Elsewhere nothing is changed.
+    """
+    theirs = _CALLERS.get()
+    if theirs is None:
+        yield
+        return
+    before = _now()
+    try:
+        with _switched(before, theirs[0]):
+            try:
+                yield
+            finally:
+                theirs[0] = _now()
+    finally:
+        _set(before)
+
+
+@contextmanager
+def _switched(before: _State, state: _State) -> Iterator[None]:
+    """Torch in another state; afterwards gradients and inference mode are as before."""
+    device = nullcontext() if before.device == state.device else state.device
+    with torch.inference_mode(state.inference), device:
+        torch.set_grad_enabled(state.gradients)
+        torch.set_default_dtype(state.dtype)
+        yield
+
+
+def _set(state: _State) -> None:
+    torch.set_grad_enabled(state.gradients)
+    torch.set_default_dtype(state.dtype)
+    if torch.empty(0).device != state.device:
+        torch.set_default_device(None if state.device == OWN.device else state.device)
