@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 import torch
-from proposer_rl.tasks.point_masses.task import PointMassEnv
-from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from tensordict import TensorDict, TensorDictBase, is_tensorclass
 from torchrl.envs.utils import check_env_specs
 
 import proposer_rl as prl
 from proposer_rl.models import callers_state, own_state
+from proposer_rl.tasks.point_masses.task import PointMassEnv
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.teaching.test_teacher import FREE, SPACES
 
