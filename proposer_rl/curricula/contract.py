@@ -56,7 +56,7 @@ class Batch:
     """
 
     levels: Levels
-    notes: TensorDictBase = None  # type: ignore[assignment]
+    notes: TensorDictBase = None
 
     def __post_init__(self) -> None:
         if self.notes is None:
@@ -168,7 +168,8 @@ class Curriculum:
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
-        _warn_of_nothing(type(self))
+        kind: Any = type(self)
+        _warn_of_nothing(kind)
         return {name.strip("_"): saved(getattr(self, name)) for name in self.remembers}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

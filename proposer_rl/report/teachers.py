@@ -84,7 +84,7 @@ def read_log(file: Path) -> Log:
     try:
         if file.stat().st_size > LARGEST_FILE:
             raise ValueError(f"is larger than {LARGEST_FILE:,} bytes")
-        rows: list[Mapping[str, Any]] = read_jsonl(file)
+        rows: Sequence[Mapping[str, Any]] = read_jsonl(file)
         if not rows or not all("told" in row and "drawn" in row for row in rows):
             raise ValueError("is no log of a teacher, as teacher.log(file) writes it")
         names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])

@@ -95,7 +95,7 @@ def _bins(space: Any, levels: Levels) -> dict[str, Tensor]:
 
 
 def _bin_texts(space: Any) -> dict[str, list[str]]:
-    """What each bin of each axis is called; empty where levels cannot be told apart by bins."""
+    """What each bin of each axis is called; empty where there are no bins."""
     if isinstance(space, ParameterSpace):
         labels = getattr(space, "labels", {})
         return {

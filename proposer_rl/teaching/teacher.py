@@ -286,7 +286,7 @@ class Teacher:
 
     @own_state()
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
-        """What happened since the last call, and what the curriculum has to tell of it.
+        """What happened since the last call, and what else the curriculum tells.
 
         For every curriculum: how many levels were ``proposed``, ``told`` and ``dropped``, and are
         ``out`` now; ``mean_return`` and ``mean_success`` of what was told, None where nothing was;
