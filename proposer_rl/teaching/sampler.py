@@ -2,22 +2,48 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from math import inf, isfinite
+from operator import index
 from typing import Any, TypeVar
+from zlib import crc32
 
+from torch import distributed
 from torch.utils.data import Sampler
 
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.teaching.spaces import Items
 from proposer_rl.teaching.teacher import Teacher
-from proposer_rl.teaching.tickets import as_array
 
 T = TypeVar("T")
+
+Answer = tuple[float, float] | None
+"""Success and return of an answer to an item; None if nothing came of it."""
+FEW = 32  # items of which it is too early to say that most are missing
+
+
+@dataclass
+class Epoch:
+    """Items that were drawn, and how many were given of them, with repetitions."""
+
+    drawn: list[int] = field(default_factory=list)
+    place: int = 0
 
 
 class TeacherSampler(Sampler[int]):
     """Items that a teacher proposes, for any loader; whoever scores them tells by item.
+
+    Each item is out until ``repeat`` answers to it have come back, in any order and over any number
+    of calls; the means of these are what the teacher is told.
+
+    In a launch of several ranks every rank makes the same teacher and the same sampler, draws from
+    it in step with the others, and tells what came of its own part: :meth:`tell` and :meth:`drop`
+    gather what all ranks say, where ``torch.distributed`` is initialized, so that all teachers stay
+    the same.
 
     Importing TorchRL makes processes spawn: a script whose loader has workers needs its
     ``if __name__ == "__main__":``.
@@ -48,88 +74,206 @@ class TeacherSampler(Sampler[int]):
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
         self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
+        self._came: dict[int, list[Answer]] = {}  # answers to items of which more are to come
+        self._epoch, self._goes_on = Epoch(), False  # whether the next one is the rest of it
+        self._asked, self._trace = 0, 0  # how many items since the start, and a checksum of them
+        self._check: float = 0  # how many there must be for the next look at what is missing
 
     def __len__(self) -> int:
         return self._length * self._repeat * self._rounds
 
     def __iter__(self) -> Iterator[int]:
-        for start in range(0, self._length, self._group):
-            group = [self._teacher.ask() for _ in range(min(self._group, self._length - start))]
-            for ticket, item in group:
-                self._out[item].append(ticket)
-            for _ in range(self._rounds):
-                for _, item in group:
-                    yield from [item] * self._repeat
+        epoch = self._epoch = self._epoch if self._goes_on else Epoch()
+        self._goes_on = False
+        whole = self._group * self._repeat * self._rounds
+        while epoch.place < len(self):
+            number, place = divmod(epoch.place, whole)
+            start = number * self._group
+            size = min(self._group, self._length - start)
+            while len(epoch.drawn) < start + size:
+                epoch.drawn.append(self._ask())
+            epoch.place += 1
+            yield epoch.drawn[start + place // self._repeat % size]
+        if self._epoch is epoch:
+            self._epoch = Epoch()
+
+    def rewind(self) -> None:
+        """Give the items of this epoch again from its first one, before any new ones.
+
+        For loops that skip what they have had, as with accelerate's ``skip_first_batches``.
+        """
+        self._epoch.place, self._goes_on = 0, True
 
     def tell(self, items: Sequence[int], success: Any, return_: Any = None) -> None:
-        """What came of items, in groups: equal ones next to each other are one result.
+        """What came of items; counts for each when its last answer is there.
 
         Args:
-            items: as they were drawn, with their repetitions, [n].
-            success: of each, from 0 to 1, [n].
+            items: as they were drawn, with their repetitions, in any order, [n].
+            success: of each answer, from 0 to 1; None for one of which nothing came, [n].
             return_: of each; None for the success.
 
         Raises:
-            ArgumentError: for an item that is not out, or another number of results; none of them
-                counts then.
+            ArgumentError: for an item of which not so many answers are out, or another number of
+                results; none of them counts then, on any rank.
         """
-        told = self._told(items)
-        means = self._means("success", success, len(told))
-        returns = means if return_ is None else self._means("return_", return_, len(told))
-        self._teacher.tell([t for _, t in told], returns, means, episodes=self._repeat)
-        self._forget(told)
+        self._count(lambda: _answers(items, success, return_))
 
     def drop(self, items: Sequence[int] | None = None) -> None:
         """Nothing will come of items.
 
         Args:
-            items: as of :meth:`tell`; None for all that are out, as where a resumed loop begins
-                an epoch anew.
+            items: as of :meth:`tell`; None for all that are out, where a resumed loop begins an
+                epoch anew.
         """
-        every = [(item, ticket) for item, tickets in self._out.items() for ticket in tickets]
-        dropped = every if items is None else self._told(items)
-        self._teacher.drop([ticket for _, ticket in dropped])
-        self._forget(dropped)
+        if items is None:
+            self._teacher.drop([*chain.from_iterable(self._out.values())])
+            self._out.clear()
+            self._came.clear()
+            self._epoch, self._goes_on = Epoch(), False
+        else:
+            self._count(lambda: [(item, None) for item in _whole(items)])
 
     def state_dict(self) -> dict[str, Any]:
-        """The tickets of the items that are out; the teacher has a state of its own."""
-        return {"out": {item: list(tickets) for item, tickets in self._out.items() if tickets}}
+        """What is out, and the place in the epoch; the teacher has a state of its own."""
+        return {
+            "groups": [self._repeat, self._group, self._rounds],
+            "out": {item: list(tickets) for item, tickets in self._out.items() if tickets},
+            "came": {item: list(answers) for item, answers in self._came.items()},
+            "drawn": list(self._epoch.drawn),
+            "place": self._epoch.place,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
-        self._out.clear()
-        self._out.update({item: list(tickets) for item, tickets in state["out"].items()})
+        """Go on with it: the next epoch is the rest of the one that was begun.
 
-    def _told(self, items: Sequence[int]) -> list[tuple[int, int]]:
-        """The item and the ticket of each group of items [n]."""
-        numbers = _plain("items", items, int)
-        if len(numbers) % self._repeat:
-            raise ArgumentError(f"items: {len(numbers)} are no groups of {self._repeat}")
-        left = {item: list(self._out[item]) for item in {*numbers} & self._out.keys()}
-        told = []
-        for start in range(0, len(numbers), self._repeat):
-            item = numbers[start]
-            if not left.get(item) or len({*numbers[start : start + self._repeat]}) > 1:
-                raise ArgumentError(f"items={item}: is not out")
-            told.append((item, left[item].pop(0)))
-        return told
+        Raises:
+            ArgumentError: if it is of other groups.
+        """
+        groups = [self._repeat, self._group, self._rounds]
+        if list(state["groups"]) != groups:
+            raise ArgumentError(
+                f"state: of [repeat, group, rounds] = {list(state['groups'])}, not {groups}"
+            )
+        self._out = defaultdict(list)  # JSON has made texts of the items
+        self._out.update({int(item): list(tickets) for item, tickets in state["out"].items()})
+        self._came = {
+            int(item): [answer and (answer[0], answer[1]) for answer in answers]
+            for item, answers in state["came"].items()
+        }
+        self._epoch = Epoch(list(state["drawn"]), state["place"])
+        self._goes_on = bool(self._epoch.drawn)
+        self._asked, self._trace, self._check = sum(map(len, self._out.values())), 0, 0
 
-    def _forget(self, told: list[tuple[int, int]]) -> None:
-        for item, ticket in told:
-            self._out[item].remove(ticket)
+    def _ask(self) -> int:
+        ticket, item = self._teacher.ask()
+        self._out[item].append(ticket)
+        self._asked += 1
+        self._trace = crc32(b"%d " % item, self._trace)
+        return int(item)
 
-    def _means(self, name: str, values: Any, groups: int) -> list[float]:
-        """Of each group the mean of its numbers."""
-        numbers, size = _plain(name, values, float), self._repeat
-        if len(numbers) != groups * size:
-            raise ArgumentError(f"{name}: {len(numbers)} results for {groups * size} items")
-        as_array(name, numbers, (len(numbers),))  # each of them, not their mean alone
-        return [sum(numbers[at : at + size]) / size for at in range(0, len(numbers), size)]
+    def _count(self, read: Callable[[], list[tuple[int, Answer]]]) -> None:
+        """Tell the teacher of the items whose last answers these are."""
+        came: dict[int, list[Answer]] = {}
+        for item, answer in _everywhere(read, self._trace):
+            came.setdefault(item, list(self._came.get(item, ()))).append(answer)
+        told: list[tuple[int, float, float, int]] = []
+        dropped: list[int] = []
+        over: list[tuple[int, int]] = []  # items, and how many of their tickets
+        for item, answers in came.items():
+            tickets = self._out.get(item, [])
+            if len(answers) > len(tickets) * self._repeat:
+                often = f" {len(answers)} times" if tickets else ""
+                raise ArgumentError(f"items={item}: is not out{often}")
+            full = len(answers) // self._repeat
+            for ticket in tickets[:full]:
+                group, answers[:] = answers[: self._repeat], answers[self._repeat :]
+                if results := [answer for answer in group if answer]:
+                    success, return_ = (sum(n) / len(n) for n in zip(*results, strict=True))
+                    told.append((ticket, return_, success, len(results)))
+                else:
+                    dropped.append(ticket)
+            over.append((item, full))
+        if told:
+            ids, returns, successes, episodes = zip(*told, strict=True)
+            self._teacher.tell([*ids], returns, successes, episodes=episodes)
+        self._teacher.drop(dropped)
+        for item, full in over:
+            del self._out[item][:full]
+        self._came.update(came)
+        for item in [item for item in came if not came[item]]:
+            del self._came[item]
+        self._look()
+
+    def _look(self) -> None:
+        """Warn, once, if most items never come back; those in flight are no more as time passes."""
+        if not self._check:
+            self._check = max(4 * self._asked, FEW)
+        if self._asked < self._check:
+            return
+        self._check = 2 * self._asked
+        out = sum(map(len, self._out.values()))
+        if 3 * out > self._asked:
+            self._check = inf
+            warnings.warn(
+                f"results of {out} of {self._asked} items have not come back: repeat, group and "
+                "rounds must be the loop's, and torch.distributed initialized on all ranks",
+                stacklevel=4,
+            )
 
 
-def _plain(name: str, values: Any, kind: Callable[[Any], T]) -> list[T]:
-    """Numbers [n] as Python's, brought from a device all at once."""
+def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
+    """What all ranks read, in their order; one that cannot is refused by all."""
+    try:
+        mine, error = read(), ""
+    except ArgumentError as refused:
+        mine, error = [], str(refused)
+    told = [(trace, error, mine)]
+    if distributed.is_available() and distributed.is_initialized():
+        told *= distributed.get_world_size()
+    if len(told) > 1:
+        distributed.all_gather_object(told, told[0])
+    if len({trace for trace, _, _ in told}) > 1:
+        raise ArgumentError(
+            "teacher: has drawn other items on other ranks; each needs the same seed and state, "
+            "and must draw in step"
+        )
+    for _, error, _ in told:
+        if error:
+            raise ArgumentError(error)
+    return [answer for _, _, answers in told for answer in answers]
+
+
+def _answers(items: Any, success: Any, return_: Any) -> list[tuple[int, Answer]]:
+    """The answers to items [n], each with its item."""
+    numbers, shares = _whole(items), _numbers("success", success)
+    returns = shares if return_ is None else _numbers("return_", return_)
+    for name, values in (("success", shares), ("return_", returns)):
+        if len(values) != len(numbers):
+            raise ArgumentError(f"{name}: {len(values)} results for {len(numbers)} items")
+    answers: list[tuple[int, Answer]] = []
+    for item, share, number in zip(numbers, shares, returns, strict=True):
+        if share is None:
+            answers.append((item, None))
+            continue
+        if not 0 <= share <= 1:
+            raise ArgumentError(f"success={share:g}: must be from 0 to 1")
+        if number is None or not isfinite(number):
+            raise ArgumentError(f"return_={number}: must be finite")
+        answers.append((item, (share, number)))
+    return answers
+
+
+def _whole(items: Any) -> list[int]:
+    return _plain("items: must be whole numbers [n]", items, index)
+
+
+def _numbers(name: str, values: Any) -> list[float | None]:
+    return _plain(f"{name}: must be numbers [n]", values, lambda v: None if v is None else float(v))
+
+
+def _plain(line: str, values: Any, kind: Callable[[Any], T]) -> list[T]:
+    """Numbers [n] as Python's, brought from a device all at once; refused with a line."""
     try:
         return [*map(kind, values.tolist() if hasattr(values, "tolist") else values)]
-    except TypeError as error:
-        raise ArgumentError(f"{name}: must be numbers [n]") from error
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(line) from error

@@ -1,20 +1,38 @@
-"""Items of data sets that a teacher proposes: in a loader, told in groups, resumed."""
+"""Items of data sets that a teacher proposes: in a loader, told in groups, on ranks, resumed."""
 
 from __future__ import annotations
 
 import io
+import json
+import random
+import re
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+from threading import Barrier, local
 from typing import Any
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
+from torch import distributed, multiprocessing
+from torch.utils.data import BatchSampler, DataLoader
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching import sampler as module
 from tests.host_reads import CountedReads
 from tests.teaching.counting import ITEMS, Counting
 
 REPEAT = 3
+
+
+def parts(items: Any, size: int) -> Iterator[Any]:
+    """Lists of so many of them."""
+    each = iter(items)
+    return iter(lambda: [*islice(each, size)], [])
 
 
 def sampled(length: int = 8) -> tuple[Counting, prl.Teacher, prl.TeacherSampler]:
@@ -36,15 +54,42 @@ def test_a_loader_draws_groups_and_each_gets_its_mean() -> None:
     assert curriculum.seen == {n: (2.0 * n, pytest.approx(2 / 3)) for n in range(8)}
 
 
-REFUSED: dict[str, tuple[list[int], Any, str]] = {
-    "an item that is not out": ([0, 0, 0, 7, 7, 7], [1.0] * 6, "items=7: is not out"),
-    "one twice that is out once": ([0] * 6, [1.0] * 6, "items=0: is not out"),
-    "two in a group": ([0, 0, 0, 1, 1, 2], [1.0] * 6, "items=1: is not out"),
-    "part of a group": ([0, 0, 0, 1], [1.0] * 4, "items: 4 are no groups of 3"),
+def test_answers_come_back_in_any_order_in_parts_or_never() -> None:
+    """What is missing of a group is dropped, or still out."""
+    curriculum, teacher, sampler = sampled()
+    answers = [(item, float(k % 2), 10.0 * item + k) for item in range(7) for k in range(REPEAT)]
+    assert [*sampler][: len(answers)] == [item for item, _, _ in answers]
+    random.Random(0).shuffle(answers)
+    lost = [answers.pop(next(i for i, a in enumerate(answers) if a[0] == 5)) for _ in range(2)]
+    lost += [answer for answer in answers if answer[0] == 6]
+    answers = [answer for answer in answers if answer[0] != 6]
+    for part in parts(answers, 4):
+        items, success, return_ = zip(*part, strict=True)
+        sampler.tell(items, success, return_)
+    sampler.drop([item for item, _, _ in lost[:1]])
+    sampler.tell([item for item, _, _ in lost[1:]], [None] * 4)
+    teacher.propose(1)
+    expected = {
+        item: tuple(sum(n) / len(n) for n in zip(*(a[:0:-1] for a in answers if a[0] == item)))  # noqa: B905
+        for item in range(6)
+    }
+    assert curriculum.seen == {item: pytest.approx(means) for item, means in expected.items()}
+    assert sampler.state_dict()["out"] == {7: [7]}
+
+
+REFUSED: dict[str, tuple[Any, Any, str]] = {
+    "an item that is not out": ([0, 0, 0, 7, 7, 7], [1.0] * 6, "items=7: is not out$"),
+    "one twice that is out once": ([0] * 6, [1.0] * 6, "items=0: is not out 6 times"),
+    "an answer more": ([1, 0, 0, 0, 0], [1.0] * 5, "items=0: is not out 4 times"),
     "too few results": ([0, 0, 0, 1, 1, 1], [1.0] * 5, "success: 5 results for 6 items"),
     "no share": ([0, 0, 0, 1, 1, 1], [1.0] * 3 + [9.0] * 3, "success=9: must be from 0 to 1"),
     "a mean of no shares": ([0, 0, 0], [2.0, -1.0, 0.5], "success=2: must be from 0 to 1"),
+    "shares by their mean": ([0, 0, 0], [-1.0, 1.0, 1.0], "success=-1: must be from 0 to 1"),
+    "part of a group": ([0, 1], [0.0, 2.0], "success=2: must be from 0 to 1"),
+    "no number": ([0, 0, 0], [1.0, 1.0, torch.nan], "success=nan: must be from 0 to 1"),
     "no numbers": ([0, 0, 0], torch.ones(3, 1), r"success: must be numbers \[n\]"),
+    "texts": ([0, 0, 0], ["yes"] * 3, r"success: must be numbers \[n\]"),
+    "half an item": ([0.5, 0, 0], [1.0] * 3, r"items: must be whole numbers \[n\]"),
 }
 
 
@@ -55,16 +100,27 @@ def test_what_is_refused_counts_nothing(what: str) -> None:
     items, success, message = REFUSED[what]
     with pytest.raises(ArgumentError, match=message):
         sampler.tell(items, success)
+    with pytest.raises(ArgumentError, match="return_=inf: must be finite"):
+        sampler.tell([0, 0, 0], [1.0] * 3, [1.0, 1.0, torch.inf])
     sampler.tell([0, 0, 0, 1, 1, 1, 2, 2, 2], [1.0] * 9)
     teacher.propose(1)
     assert curriculum.seen == dict.fromkeys(range(3), (1.0, 1.0))
 
 
-def resumed(teacher: prl.Teacher, sampler: prl.TeacherSampler) -> Any:
+def through_torch(state: Any) -> Any:
     file = io.BytesIO()
-    torch.save([teacher.state_dict(), sampler.state_dict()], file)
+    torch.save(state, file)
     file.seek(0)
-    for old, new in zip(torch.load(file, weights_only=True), (made := sampled())[1:], strict=True):
+    return torch.load(file, weights_only=True)
+
+
+def through_json(state: Any) -> Any:
+    return json.loads(json.dumps(state))
+
+
+def resumed(teacher: prl.Teacher, sampler: prl.TeacherSampler) -> Any:
+    states = through_torch([teacher.state_dict(), sampler.state_dict()])
+    for old, new in zip(states, (made := sampled())[1:], strict=True):
         new.load_state_dict(old)
     return made
 
@@ -85,6 +141,192 @@ def test_what_was_out_may_be_told_after_a_resume_or_dropped() -> None:
     teacher.propose(1)
     assert curriculum.seen.keys() == {1, 2}
     assert len(teacher._ledger.blocks) == 1  # that of this proposal
+
+
+SIZES = {"length": 5, "group": 2, "repeat": 2, "rounds": 2}  # the last group is smaller
+
+
+def replayed(seed: int = 0, **sizes: int) -> tuple[prl.Teacher, prl.TeacherSampler]:
+    """A teacher whose draws depend on what it is told."""
+    recipe = prl.curricula.plr(score="learnability", capacity=4, temperature=0.1)
+    teacher = prl.Teacher(recipe, prl.Items(9), seed=seed, block=2)
+    return teacher, prl.TeacherSampler(teacher, **{**SIZES, **sizes})
+
+
+def rest(
+    sampler: prl.TeacherSampler, place: int = 0, skip: int = 0, save: Callable[[], None] = int
+) -> list[int]:
+    """Items of an epoch from a place on; each answer is told when its group comes first."""
+    items = []
+    for at, item in enumerate(islice(sampler, skip, None), place):
+        items.append(item)
+        if at % 8 < (4 if at < 16 else 2):
+            sampler.tell([item], [float(item % 4 == at % 2 == 0)])
+        save()
+    return items
+
+
+def test_an_epoch_goes_on_from_every_place() -> None:
+    """With what was saved there, or past what a loader skips; its order by nested loops."""
+    teacher, sampler = replayed()
+    states: list[Any] = []
+
+    def save() -> None:
+        states.append([through_torch(teacher.state_dict()), through_json(sampler.state_dict())])
+
+    save()
+    whole = rest(sampler, save=save)
+    groups = [whole[:4:2], whole[8:12:2], whole[16:18:2]]
+    assert whole == [item for g in groups for _ in range(2) for item in g for _ in range(2)]
+    assert whole != [*replayed()[1]]  # what is told has an effect
+    teacher, sampler = replayed()
+    for place, (old, state) in enumerate(states[:-1]):
+        for rewound in (False, True):
+            teacher.load_state_dict(old)
+            sampler.load_state_dict(state)
+            if rewound:
+                sampler.rewind()
+            assert rest(sampler, place, rewound * place) == whole[place:]
+    assert len([*sampler]) == len(whole)  # the next one
+    with pytest.raises(ArgumentError, match=r"state: of .* = \[2, 2, 2\], not \[2, 2, 1\]"):
+        replayed(rounds=1)[1].load_state_dict(state)
+
+
+@pytest.mark.parametrize("stateful", [True, False])
+def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
+    """torchdata's by the sampler's state; accelerate's skips what it has had."""
+    package = "torchdata.stateful_dataloader" if stateful else "accelerate"
+    made = pytest.importorskip(package)
+
+    def batches(sampler: prl.TeacherSampler) -> Any:
+        if stateful:
+            return made.StatefulDataLoader(range(9), 4, sampler=sampler)
+        return made.data_loader.DataLoaderShard(
+            range(9), batch_sampler=BatchSampler(sampler, 4, drop_last=False)
+        )
+
+    def train(sampler: prl.TeacherSampler, loader: Any, skip: int = 0) -> Iterator[list[int]]:
+        for count, batch in enumerate(loader, skip):
+            if count in (0, 2):
+                sampler.tell(batch, [float(item % 4 == i % 2 == 0) for i, item in enumerate(batch)])
+            yield batch.tolist()
+
+    whole = [*train(sampler := replayed()[1], batches(sampler))]
+    for steps in range(1, 5):
+        teacher, sampler = replayed()
+        loader = batches(sampler)
+        begun = [*islice(train(sampler, loader), steps)]
+        states = teacher.state_dict(), loader.state_dict() if stateful else sampler.state_dict()
+        teacher, sampler = replayed()
+        loader = batches(sampler)
+        teacher.load_state_dict(states[0])
+        if stateful:
+            loader.load_state_dict(states[1])
+        else:
+            sampler.load_state_dict(states[1])
+            sampler.rewind()
+            loader = made.skip_first_batches(loader, steps)
+        assert [*begun, *train(sampler, loader, steps)] == whole
+
+
+class Ranks:
+    """torch.distributed in threads of this process."""
+
+    def __init__(self, world: int) -> None:
+        self.world, self.meet, self.said = world, Barrier(world, timeout=20), {}
+        self.local = local()
+
+    is_available = is_initialized = staticmethod(lambda: True)
+
+    def get_world_size(self) -> int:
+        return self.world
+
+    def all_gather_object(self, into: list[Any], mine: Any) -> None:
+        self.said[self.local.rank] = through_json(mine)
+        self.meet.wait()
+        into[:] = [self.said[rank] for rank in range(self.world)]
+        self.meet.wait()
+
+    def run(self, of_rank: Callable[[int], Any]) -> list[Any]:
+        def started(rank: int) -> Any:
+            self.local.rank = rank
+            return of_rank(rank)
+
+        with ThreadPoolExecutor(self.world) as pool:
+            return [*pool.map(started, range(self.world))]
+
+
+def of_rank(rank: int, world: int) -> list[int]:
+    """What a rank's sampler draws, every second batch of which it plays, as accelerate's does.
+
+    With groups of 8 answers, half of which are of either rank.
+    """
+    _, sampler = replayed(length=24, repeat=8, group=1, rounds=1)
+    drawn = []
+    for batch in parts(sampler, 8):
+        drawn += batch
+        part = slice(4 * rank, 4 * rank + 4) if world > 1 else slice(8)
+        told = [float(item % 4 == i % 2 == 0) for i, item in enumerate(batch)]
+        sampler.tell(batch[part], told[part])
+    assert not sampler.state_dict()["out"]
+    return drawn
+
+
+def test_all_ranks_have_one_curriculum(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = of_rank(0, 1)
+    ranks = Ranks(2)
+    monkeypatch.setattr(module, "distributed", ranks)
+    assert ranks.run(lambda rank: of_rank(rank, 2)) == [alone, alone]
+
+
+def test_what_one_rank_is_refused_counts_on_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    ranks = Ranks(2)
+    monkeypatch.setattr(module, "distributed", ranks)
+
+    def refused(rank: int) -> None:
+        _, sampler = replayed(length=2)
+        items = [next(iter(sampler))] * 1
+        with pytest.raises(ArgumentError, match="success=2: must be from 0 to 1"):
+            sampler.tell(items, [2.0 * rank])
+        assert not sampler.state_dict()["came"]
+        sampler.drop(items)
+        assert not sampler.state_dict()["came"]  # both answers, one of each rank
+        _, sampler = replayed(seed=rank)
+        with pytest.raises(ArgumentError, match="teacher: has drawn other items on other ranks"):
+            sampler.tell([next(iter(sampler))], [1.0])
+
+    ranks.run(refused)
+
+
+def process(rank: int, folder: str) -> None:
+    distributed.init_process_group(
+        "gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2
+    )
+    Path(folder, f"{rank}").write_text(json.dumps(of_rank(rank, 2)))
+    distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_processes_have_one_curriculum(tmp_path: Path) -> None:
+    multiprocessing.spawn(process, (str(tmp_path),), nprocs=2)
+    drawn = [json.loads((tmp_path / f"{rank}").read_text()) for rank in range(2)]
+    assert drawn == [of_rank(0, 1)] * 2
+
+
+@pytest.mark.parametrize(("part", "delay"), [(1.0, 0), (1.0, 40), (0.5, 0), (0.27, 8)])
+def test_it_is_told_once_that_most_results_are_missing(part: float, delay: int) -> None:
+    """Not if they come late."""
+    sampler = prl.TeacherSampler(prl.Teacher("domain_randomization", prl.Items(500)), 400)
+    late: deque[int] = deque()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for batch in parts(sampler, 8):
+            late += batch[: round(part * 8)]
+            while len(late) > delay:
+                sampler.tell([late.popleft()], [1.0])
+    lines = [str(each.message) for each in caught]
+    assert len(lines) == (part < 1)
+    assert all(re.match(r"results of \d+ of \d+ items have not come back", line) for line in lines)
 
 
 def test_numbers_come_from_a_device_all_at_once() -> None:

@@ -1,0 +1,139 @@
+"""TRL: a curriculum of prompts in a GRPOTrainer, told by its reward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import update_wrapper
+from inspect import iscoroutinefunction
+from pathlib import Path
+from typing import Any
+
+import torch
+from transformers import TrainerCallback
+
+from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching.sampler import TeacherSampler
+from proposer_rl.teaching.spaces import Items
+from proposer_rl.teaching.teacher import Teacher
+
+ROW = "teacher_item"  # the column of the training set that says which row it is
+FILE = "teacher.pt"  # of a checkpoint
+
+
+class TaughtReward(TrainerCallback):
+    """A reward function that tells a teacher, which then draws the trainer's prompts.
+
+        reward = TaughtReward(teacher, solved)
+        trainer = GRPOTrainer(model, reward, config, rows)
+        reward.attach(trainer)
+        trainer.train()
+
+    Groups and their repetitions follow from the trainer's config; an epoch has as many prompts as
+    the training set. Evaluation tells nothing. Checkpoints hold the curriculum, and
+    ``train(resume_from_checkpoint=...)`` goes on with it. In a launch each rank does the same.
+
+    Args:
+        teacher: of :class:`Items`, one for each row of the training set.
+        reward: of completions and columns, as TRL calls it: of each how well it solves its prompt,
+            from 0 to 1; None for one that does not count.
+
+    Raises:
+        ArgumentError: if the teacher's levels are no items, or the function is a coroutine.
+    """
+
+    _trainer: Any = None
+    _sampler: TeacherSampler
+    _loaded = False
+
+    def __init__(self, teacher: Teacher, reward: Callable[..., Sequence[float | None]]) -> None:
+        if not isinstance(teacher.space, Items):
+            raise ArgumentError("teacher: must have a space of Items")
+        if iscoroutinefunction(reward):
+            raise ArgumentError("reward: must be no coroutine: ranks are told in step")
+        self._teacher, self._rows, self._reward = teacher, teacher.space.size, reward
+        self._told = 0  # generations
+        self._again = False  # whether the next one repeats the last that was told
+        update_wrapper(self, reward)  # TRL logs it by its name
+
+    def attach(self, trainer: Any) -> None:
+        """Draw the prompts of a trainer, before it trains.
+
+        Args:
+            trainer: ``GRPOTrainer`` or another that generates groups as that does.
+
+        Raises:
+            ArgumentError: naming what of the trainer does not fit.
+        """
+        rows, config = trainer.train_dataset, trainer.args
+        count = len(rows) if hasattr(rows, "__len__") else "a stream of"
+        if count != self._rows:
+            raise ArgumentError(f"train_dataset: has {count} rows, the teacher {self._rows} items")
+        for name in ("ignore_data_skip", "remove_unused_columns"):
+            if getattr(config, name):
+                raise ArgumentError(f"{name}=True: must be false")
+        self._group = config.generation_batch_size // config.num_generations
+        self._rounds = config.steps_per_generation * config.num_iterations
+        self._groups = -(-self._rows // self._group)  # of an epoch
+        self._sampler = TeacherSampler(
+            self._teacher,
+            self._groups * self._group,
+            repeat=config.num_generations,
+            group=self._group,
+            rounds=self._rounds,
+        )
+        self._trainer = trainer
+        trainer.train_dataset = rows.add_column(ROW, [*range(self._rows)])
+        trainer._get_train_sampler = lambda *_: self._sampler  # TRL asks for it nowhere else
+        trainer.add_callback(self)
+
+    def __call__(self, completions: Sequence[Any], **columns: Any) -> Sequence[float | None]:
+        """The rewards, of which the teacher is told while the model trains."""
+        if self._trainer is None:
+            raise ArgumentError("trainer: missing: call attach(trainer) before it trains")
+        items = columns.pop(ROW, None)
+        rewards = self._reward(completions=completions, **columns)
+        if self._trainer.model.training:
+            if not self._again:
+                self._sampler.tell(items, rewards)
+                self._told += 1
+            self._again = False
+        return rewards
+
+    def load(self, folder: str | Path) -> None:
+        """Go on with the curriculum of a checkpoint that does not lie in the config's output_dir.
+
+        Raises:
+            ArgumentError: if it has none.
+        """
+        file = Path(folder) / FILE
+        if not file.exists():
+            raise ArgumentError(f"resume_from_checkpoint={folder}: has no {FILE}")
+        state = torch.load(file, weights_only=True)
+        self._teacher.load_state_dict(state["teacher"])
+        self._sampler.load_state_dict(state["sampler"])
+        self._sampler.rewind()  # the trainer skips what it has had
+        self._told, self._loaded = state["told"], True
+
+    def on_train_begin(self, args: Any, state: Any, control: Any, **_: Any) -> None:
+        """Where training is resumed, with the curriculum of that step."""
+        if not state.global_step:  # nothing comes of what an earlier training has drawn ahead
+            self._sampler.drop()
+            self._told, self._loaded = 0, False
+            return
+        if not self._loaded:
+            self.load(Path(args.output_dir) / f"checkpoint-{state.global_step}")
+        self._loaded = False
+        # Within the steps of a generation TRL generates again, of prompts that were told before.
+        per_step = args.gradient_accumulation_steps
+        epoch, step = divmod(state.global_step, -(-self._groups * self._rounds // per_step))
+        self._again = self._told > epoch * self._groups + step * per_step // self._rounds
+
+    def on_save(self, args: Any, state: Any, control: Any, **_: Any) -> None:
+        """Put the curriculum into the checkpoint; that of all ranks is the same."""
+        if args.should_save:
+            made = {
+                "teacher": self._teacher.state_dict(),
+                "sampler": self._sampler.state_dict(),
+                "told": self._told,
+            }
+            torch.save(made, Path(args.output_dir) / f"checkpoint-{state.global_step}" / FILE)
