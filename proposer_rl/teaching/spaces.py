@@ -434,7 +434,7 @@ def _warn_of_two(key: str, values: Any) -> None:
         warnings.warn(
             f"{key}={values}: a list is single values, here two and nothing between them; the "
             f"range from {low} to {high} is a tuple, ({low}, {high})",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
