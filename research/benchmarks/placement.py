@@ -65,11 +65,11 @@ def _workers(engine: str, count: int, options: Options) -> list[str]:
 
 
 def _cycle(scale: Scale, options: Options, stack: ExitStack, *workers: str) -> Callable[[], object]:
-    """Rolls the copies of a cycle out, always the same ones."""
+    """Rolls the replicas of a cycle out, always the same ones."""
     made = scale.made(options, "compute.cores=1", *workers)
     stack.enter_context(closing(made.curriculum))
-    copies, solver = trainer_of(made).copies, made.learner.snapshot()[0]
-    return partial(copies.roll_out, solver, Streams(0, "cycle", 0))
+    replicas, solver = trainer_of(made).replicas, made.learner.snapshot()[0]
+    return partial(replicas.roll_out, solver, Streams(0, "cycle", 0))
 
 
 @contextmanager
