@@ -120,7 +120,7 @@ def explained(error: Exception) -> str:
 def unquoted(place: str, read: object) -> str:
     """Of a name that YAML takes for one of its constants."""
     words = {True: "on, yes or true", False: "off, no or false", None: "null or ~"}
-    name = f"{words[read]} without quotes" if read in words else repr(read)  # type: ignore[index]
+    name = f"{words[read]} without quotes" if read in words else repr(read)
     return f'{place}: {name} is no name here; a name has quotes, as in "on":'
 
 
