@@ -8,6 +8,8 @@ import json
 import pickle
 import re
 from collections.abc import Callable
+from multiprocessing import util
+from multiprocessing.connection import Listener
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ import proposer_rl as prl
 from proposer_rl.curricula import Batch, Curriculum
 from proposer_rl.recipes import available
 from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching.remote import TeacherClient
 from tests.curricula.test_contract import same
 from tests.tiny import TASK
 
@@ -760,3 +763,36 @@ def test_a_score_from_gradients_says_what_it_lacks_and_takes_a_function() -> Non
     teacher.observe(prl.outcome_of(rollout))
     assert teacher.log()["mean_score"] == pytest.approx([float(levels["gravity"].mean())])
     assert seen == [(1, 8, 3)]
+
+
+def test_a_client_says_that_its_teacher_has_ended() -> None:
+    listener = Listener()
+    client = TeacherClient(listener.address, b"", 1, ())
+    listener.close()
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="the process of the teacher has ended"):
+            client.ask()
+
+
+def test_clients_where_the_temporary_folder_has_a_long_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("job_" * 30)
+    folder.mkdir()
+    monkeypatch.setattr(util, "get_temp_dir", lambda: str(folder))
+    client = pickle.loads(pickle.dumps(plr().client()))
+    ticket, _ = client.ask()
+    client.tell(ticket, 0.5)
+    with pytest.raises(ArgumentError, match="told before"):
+        client.tell(ticket, 0.5)
+
+
+def test_clients_change_no_precision_of_the_loop() -> None:
+    client = plr().client()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(RuntimeError, match=r"default dtype is torch\.float64: a teacher"):
+            client.ask()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    client.ask()

@@ -55,6 +55,17 @@ PARAMETERS = "  parameters:\n"
             "task/line: a list where there must be a mapping, {NAME: VALUE} (it has lists in "
             "task.parameters)",
         ),
+        *(
+            (
+                (FIRST + FILE.replace("width:", f"{name}:")).encode(),
+                f"task.parameters: {read} without quotes is no name here; a name has quotes",
+            )
+            for name, read in {
+                "on": "on, yes or true",
+                "No": "off, no or false",
+                "~": "null or ~",
+            }.items()
+        ),
         (
             (FIRST + FILE.replace(PARAMETERS, PARAMETERS + AXES)).encode(),
             "task: space: Dictionary should have at most 8 items",
