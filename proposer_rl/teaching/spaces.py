@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +19,8 @@ from torch import Tensor
 from proposer_rl.models import callers_state, own_state
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
-from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
+from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
+from proposer_rl.tasks.ranges import python_values, read_line, read_part, target_in_file
 
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
@@ -79,11 +79,15 @@ class Parameters(LevelSpace, ParameterSpace):
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
             for whole numbers, a list or an array for choices among rising numbers, or among texts.
-            YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of which is warned.
+            Or what task files have: ``{"low", "high", "bins", "target"}`` or ``{"values",
+            "target"}``. YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of
+            which is warned, but as the target of such a mapping a range.
         bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
             twenty parameters or more, 1.
-        target: what is to be mastered, for some of the parameters, by name: a value or a part of
-            the range, as in ``ranges``; the others have all of theirs. None for no target.
+        target: what is to be mastered, for some of the parameters, by name: values, or a part of
+            the range as in ``ranges``; ``{"values", "weights"}``, or ``{"distribution": "norm",
+            "loc", "scale"}``. It goes before the targets in ``ranges``; parameters without one
+            have all of theirs. None for no target.
         named: further distributions like ``target``, by name, for hand-designed curricula.
         seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
 
@@ -113,7 +117,6 @@ class Parameters(LevelSpace, ParameterSpace):
         _check_names("ranges", ranges, ranges)
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
-        ranges = {name: _own(values) for name, values in ranges.items()}
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict.fromkeys(ranges, 8)
@@ -122,10 +125,14 @@ class Parameters(LevelSpace, ParameterSpace):
             counts |= {name: whole(f"bins.{name}", count, 1) for name, count in bins.items()}
         else:
             counts = dict.fromkeys(ranges, whole("bins", bins, 1))
-        self.labels = {name: _labels(values) for name, values in ranges.items()}
+        ranges = {name: python_values(given) for name, given in ranges.items()}
+        in_file = {  # as task files have it, within the range
+            name: given.pop("target")
+            for name, given in ranges.items()
+            if isinstance(given, dict) and "target" in given
+        }
         parts = {
-            name: _bins(f"ranges.{name}", values, counts[name], self.labels[name])
-            for name, values in ranges.items()
+            name: read_line(f"ranges.{name}", given, counts[name]) for name, given in ranges.items()
         }
         try:
             super().__init__(parts, seeded)
@@ -134,13 +141,18 @@ class Parameters(LevelSpace, ParameterSpace):
                 f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
                 "bins=1, which suffices for curricula that need none"
             ) from error
+        self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
+        if in_file:
+            _check_names("target", target or {}, parts)
+            read = {name: target_in_file(one, parts[name]) for name, one in in_file.items()}
+            target = {**read, **(target or {})}
         said = _distributions(target, named)
         self._parts = {name: self._part(name, part) for name, part in said.items()}
         further = {name: ParameterSpace(part, seeded) for name, part in self._parts.items()}
         for key, part in {"ranges": ranges, **said}.items():
             for name, values in part.items():
                 if key == "ranges" or parts[name].wide:
-                    _warn_of_two(f"{key}.{name}", _own(values))
+                    _warn_of_two(f"{key}.{name}", python_values(values))
         self.distributions = {"all": self, **further}
 
     @property
@@ -174,7 +186,8 @@ class Parameters(LevelSpace, ParameterSpace):
             ends = part.low[0].item(), part.high[-1].item()
             low, high = (str(end).removesuffix(".0") for end in ends)
             whole = "" if part.low.is_floating_point() else ", whole"
-            found[name] = f"{low} to {high}{whole}" if part.wide else str(values)
+            said = f"{low} to {high}{whole}" if part.wide else str(values)
+            found[name] = str(part) if isinstance(part, Law) else said
         return found
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
@@ -189,34 +202,15 @@ class Parameters(LevelSpace, ParameterSpace):
         """The bins of a part of the space: one for each parameter or value."""
         _check_names(key, ranges, self.bins)
         parts = dict(self.bins)
-        for name, values in ranges.items():
-            whole, labels = self.bins[name], self.labels[name]
-            where, values = f"{key}.{name}", _own(values)
-            if labels is not None:
-                chosen = values if isinstance(values, list) else [values]
-                if any(value not in labels or chosen.count(value) > 1 for value in chosen):
-                    raise ArgumentError(f"{where}={values!r}: must be among {labels}, each once")
-                parts[name] = points(sorted(labels.index(value) for value in chosen))
-                continue
-            values = [values] if _is_number(values) else values
-            part = _bins(where, values, 1, None)
-            low, high = whole.low[0], whole.high[-1]
+        for name, given in ranges.items():
+            where, line = f"{key}.{name}", self.bins[name]
+            parts[name] = part = read_part(where, given, line)
+            low, high = line.low[0], line.high[-1]
             if part.low[0] < low or part.high[-1] > high:
-                raise ArgumentError(f"{where}={values}: must lie within {low:g} to {high:g}")
-            if not whole.low.is_floating_point() and part.low.is_floating_point():
-                raise ArgumentError(f"{where}={values}: must be whole, as the range is")
-            parts[name] = Bins(part.low.to(whole.low), part.high.to(whole.high))
+                raise ArgumentError(
+                    f"{where}={shown(plain(given))}: must lie within {low:g} to {high:g}"
+                )
         return parts
-
-
-class _Texts(Bins):
-    """The places of texts in their list, which has no order."""
-
-    def moved(self, old: Tensor, noise: Tensor) -> Tensor:
-        """Another place, so many further on."""
-        count = len(self.low)
-        further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
-        return (old + further) % count
 
 
 class Items(LevelSpace):
@@ -419,14 +413,6 @@ def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str,
     return {**({} if target is None else {"target": target}), **(named or {})}
 
 
-def _own(values: Any) -> Any:
-    """A range or values of one as Python's own; what a list has besides numbers and texts stays."""
-    if isinstance(values, list | tuple):
-        own = [plain(value) if getattr(value, "ndim", None) == 0 else value for value in values]
-        return tuple(own) if isinstance(values, tuple) else own
-    return values if isinstance(values, range) else plain(values)
-
-
 def _warn_of_two(key: str, values: Any) -> None:
     """Say how a list is read that a file may have in place of a tuple."""
     if isinstance(values, list) and len(values) == 2 and any(isinstance(v, float) for v in values):
@@ -436,38 +422,6 @@ def _warn_of_two(key: str, values: Any) -> None:
             f"range from {low} to {high} is a tuple, ({low}, {high})",
             stacklevel=4,
         )
-
-
-def _labels(values: Any) -> list[Any] | None:
-    """The values of a list some of which are not numbers; None for any other."""
-    if isinstance(values, list) and any(not _is_number(value) for value in values):
-        return values
-    return None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
-    """The bins of a range."""
-    if labels is not None:
-        places = torch.arange(len(labels))
-        return _Texts(places, places)
-    try:
-        if isinstance(values, range):
-            points(sorted({values.start, values.stop}))  # refuses what int64 cannot hold
-        if isinstance(values, range) and values.step == 1 and len(values) > count:
-            edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
-            low = edges[:-1].ceil().long()
-            return Bins(low, torch.cat([low[1:], torch.tensor([values.stop])]) - 1)
-        if isinstance(values, tuple) and len(values) == 2 and all(map(_is_number, values)):
-            return intervals(float(values[0]), float(values[1]), count)
-        if isinstance(values, list | range) and len(values) and all(map(_is_number, values)):
-            return points(list(values))
-    except (ValueError, OverflowError) as error:
-        raise ArgumentError(f"{key}={shown(values)}: {error}") from error
-    raise ArgumentError(f"{key}={shown(values)}: must be (low, high), a range or a list")
 
 
 def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:

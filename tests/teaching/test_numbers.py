@@ -20,6 +20,7 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
+from proposer_rl.tasks.ranges import RangeSettings, spaces
 from tests.teaching.counting import Counting
 
 NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
@@ -96,6 +97,45 @@ def test_ranges_and_counts_may_be_of_any_library() -> None:
     )
     teacher = prl.Teacher(stages, space, block=np.int64(1))
     assert teacher.ask()[1]["a"] == 2 and teacher.ask()[1]["a"] != 2
+
+
+NORMAL = {"distribution": "norm", "loc": 8.0, "scale": 2.0}
+LINES = {"low": 0.0, "high": 10.0, "bins": 4}, {"values": [1, 2, 4]}
+FILES: list[tuple[dict[str, Any], Any]] = [  # a parameter in a task's file, its target in Python
+    ({**LINES[0], "target": 7.0}, 7.0),
+    ({**LINES[0], "target": [2.0, 5.0]}, (2.0, 5.0)),
+    ({**LINES[0], "target": NORMAL}, NORMAL),
+    ({**LINES[0], "target": {"values": [3, 8.5], "weights": [1, 2]}}, {"values": [3, 8.5], "weights": [1, 2]}),
+    ({**LINES[1], "target": [1, 4]}, np.array([1, 4])),
+    ({**LINES[1], "target": {"values": [1, 4], "weights": [3, 1]}}, {"values": np.array([1, 4]), "weights": (3, 1)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "target"), FILES, ids=[str(file["target"]) for file, _ in FILES])
+def test_a_file_and_python_describe_one_parameter_in_one_way(file: Any, target: Any) -> None:
+    line = file["values"] if "values" in file else (file["low"], file["high"])
+    own = prl.Parameters({"g": line}, bins=4, target={"g": target})
+    read = prl.Parameters(json.loads(json.dumps({"g": file})))
+    assert read.description == own.description
+    task, aim = spaces({"g": RangeSettings(**file)}, seeded=False)
+    assert task.axes == own.axes == read.axes
+    assert task.shares(aim).tolist() == own.target_shares.tolist() == read.target_shares.tolist()
+    drawn = [
+        one.sample(9, torch.Generator().manual_seed(0))["g"].tolist()
+        for one in (aim, own.target, read.target)
+    ]
+    assert drawn[0] == drawn[1] == drawn[2]
+
+
+def test_texts_have_targets_as_numbers_have() -> None:
+    file = {"values": ["flat", "stairs", "gap"], "target": ["gap", "flat"]}
+    space = prl.Parameters(
+        {"h": file}, named={"odd": {"h": {"values": ["gap", "flat"], "weights": [3, 1]}}}
+    )
+    assert space.target_shares.tolist() == [0.5, 0, 0.5]
+    assert space.shares(space.distributions["odd"]).tolist() == [0.25, 0, 0.75]
+    assert prl.Parameters({"h": file}, target={"h": "stairs"}).target_shares.tolist() == [0, 1, 0]
+    assert space.description["named"]["odd"]["h"] == "gap (weight 3) or flat (weight 1)"
 
 
 @pytest.mark.parametrize("where", ["ranges", "target"])
