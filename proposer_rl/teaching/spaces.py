@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 class LevelSpace:
-    """What curricula take for a task: here one that has levels alone.
+    """A task of levels alone, as curricula take one.
 
     Attributes:
         distributions: by name, for hand-designed curricula; ``all`` is the space itself.
@@ -38,12 +38,12 @@ class LevelSpace:
 
     @property
     def space(self) -> LevelSpace:
-        """What levels are chosen from."""
+        """Returns what levels are chosen from."""
         return self
 
     @property
     def target(self) -> Distribution:
-        """What is to be mastered.
+        """Returns what is to be mastered.
 
         Raises:
             ArgumentError: if nothing was said of it.
@@ -54,19 +54,19 @@ class LevelSpace:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What states are compared by: nested dicts of numbers and texts, for JSON."""
+        """Returns what states are compared by: nested dicts of numbers and texts, for JSON."""
         return {"kind": type(self).__qualname__}
 
     def features(self, levels: Levels) -> Tensor:
-        """What a model of outcomes knows of levels: float [*B, F]."""
+        """Returns what a model of outcomes knows of levels: float [*B, F]."""
         return space_features(self, levels)
 
     def given(self, levels: Levels) -> Any:
-        """Levels [*B] as a loop gets them."""
+        """Returns levels [*B] as a loop gets them."""
         return levels
 
     def rows(self, levels: Levels) -> list[Any]:
-        """Levels [n] one by one, as a loop gets them that plays episode by episode."""
+        """Returns levels [n] one by one, for a loop that plays episode by episode."""
         return list(self.given(levels).unbind(0))
 
 
@@ -157,13 +157,13 @@ class Parameters(LevelSpace, ParameterSpace):
 
     @property
     def target_shares(self) -> Tensor:
-        """The target as shares of the bins, float [N]."""
+        """Returns the shares of the target in each bin, float [N]."""
         target: Any = self.target
         return self.shares(target)
 
     @property
     def description(self) -> dict[str, Any]:
-        """Its parameters, their bins, and the target and what else was named."""
+        """Returns the parameters, their bins, and the target and what else was named."""
         named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
         target = {"target": named.pop("target")} if "target" in named else {}
         counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
@@ -177,7 +177,7 @@ class Parameters(LevelSpace, ParameterSpace):
         }
 
     def _said(self, parts: Mapping[str, Bins]) -> dict[str, str]:
-        """Each parameter's values as a text."""
+        """Returns each parameter's values as a text."""
         found = {}
         for name, part in parts.items():
             labels, values = self.labels[name], part.low.tolist()
@@ -191,7 +191,7 @@ class Parameters(LevelSpace, ParameterSpace):
         return found
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
-        """Levels [n] as dicts of numbers and texts."""
+        """Returns levels [n] as dicts of numbers and texts."""
         columns = {str(name): entry.tolist() for name, entry in levels.items()}
         for name, labels in self.labels.items():
             if labels is not None:
@@ -199,7 +199,7 @@ class Parameters(LevelSpace, ParameterSpace):
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
-        """The bins of a part of the space: one for each parameter or value."""
+        """Returns the bins of a part of the space, by parameter."""
         _check_names(key, ranges, self.bins)
         parts = dict(self.bins)
         for name, given in ranges.items():
@@ -241,7 +241,7 @@ class Items(LevelSpace):
         count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
-        lines = torch.arange(count).unsqueeze(-1) if features is None else _table(features)
+        lines = torch.arange(count).unsqueeze(-1) if features is None else _feature_table(features)
         if lines.ndim != 2 or len(lines) != count or not lines.float().isfinite().all():
             raise ArgumentError(
                 f"features={list(lines.shape)}: must have a row of finite numbers for each item"
@@ -250,20 +250,20 @@ class Items(LevelSpace):
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
         for name, given in _distributions(target, named).items():
-            places = _places(name, given, count)
+            places = _item_places(name, given, count)
             parts[name] = _SomeItems(torch.tensor(places))
         self._parts = parts
         self.distributions = {"all": self, **parts}
 
     @property
     def target_shares(self) -> Tensor:
-        """The target as shares of the items, float [N]."""
+        """Returns the shares of the target in each item, float [N]."""
         places: Any = self.target
         return places.places.bincount(minlength=self.size) / len(places.places)
 
     @property
     def description(self) -> dict[str, Any]:
-        """How many, a hash of their features, and the places of the target."""
+        """Returns how many there are, a hash of their features, and the places of the target."""
         known = self.coordinates.contiguous().numpy().tobytes()
         places = {name: one.places.tolist() for name, one in self._parts.items()}
         return {
@@ -274,23 +274,23 @@ class Items(LevelSpace):
         }
 
     def locate(self, levels: TensorDictBase) -> Tensor:
-        """Where items lie, float32 [*B, D]."""
+        """Returns where items lie, float32 [*B, D]."""
         return self.coordinates[levels["item"]]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
-        """The items themselves."""
+        """Returns the items themselves."""
         return TensorDict({"item": choices}, choices.shape)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """Items drawn uniformly."""
+        """Draws items uniformly."""
         return self.generate(torch.randint(self.size, (count,), generator=generator), [])
 
     def given(self, levels: TensorDictBase) -> Tensor:
-        """Places, int64 [*B]."""
+        """Returns places, int64 [*B]."""
         return levels["item"]
 
     def rows(self, levels: TensorDictBase) -> list[int]:
-        """Places as Python's numbers."""
+        """Returns places as Python's numbers."""
         places: list[int] = levels["item"].tolist()
         return places
 
@@ -334,16 +334,16 @@ class LevelGenerator(LevelSpace):
             self.edit = self._edits(edit)
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        """Levels [count]."""
+        """Draws levels [count]."""
         return self.distributions["all"].sample(count, generator)
 
     def given(self, levels: Levels) -> Any:
-        """Levels as the function gives them."""
+        """Returns levels as the function gives them."""
         return levels[DRAWN] if DRAWN in levels.keys() else levels
 
     @property
     def axes(self) -> Any:
-        """There are none.
+        """Refuses, as there are no bins.
 
         Raises:
             ArgumentError: always.
@@ -376,7 +376,7 @@ class _Drawn:
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:
-    """Levels [count] that a function gives, as curricula take them."""
+    """Returns levels [count] that a function gives, as curricula take them."""
     if isinstance(levels, np.ndarray) and levels.dtype.kind in "biuf":
         levels = torch.from_numpy(levels.copy())
     if not isinstance(levels, Tensor) and not is_tensor_collection(levels):
@@ -389,8 +389,8 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
     return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
 
 
-def _table(features: Any) -> Tensor:
-    """Numbers [N, D], whatever they are given as."""
+def _feature_table(features: Any) -> Tensor:
+    """Returns numbers [N, D], whatever they are given as."""
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
     try:
         table = torch.as_tensor(np.array(features) if array else features)
@@ -399,8 +399,8 @@ def _table(features: Any) -> Tensor:
     return table if table.is_floating_point() else table.long()  # small integers would overflow
 
 
-def _places(name: str, given: Any, count: int) -> list[int]:
-    """Places of items, or a single one."""
+def _item_places(name: str, given: Any, count: int) -> list[int]:
+    """Returns places of items, also of a single one, as a list."""
     places = plain(given)
     places = [*places] if isinstance(places, Iterable) else [places]
     if not places or not all(type(one) is int and 0 <= one < count for one in places):
@@ -409,12 +409,12 @@ def _places(name: str, given: Any, count: int) -> list[int]:
 
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
-    """What is said of distributions beside the space itself, by their names."""
+    """Returns what is said of distributions beside the space itself, by their names."""
     return {**({} if target is None else {"target": target}), **(named or {})}
 
 
 def _warn_of_two(key: str, values: Any) -> None:
-    """Say how a list is read that a file may have in place of a tuple."""
+    """Warns of how a list is read that a file may have in place of a tuple."""
     if isinstance(values, list) and len(values) == 2 and any(isinstance(v, float) for v in values):
         low, high = values
         warnings.warn(

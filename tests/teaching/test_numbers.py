@@ -100,15 +100,16 @@ def test_ranges_and_counts_may_be_of_any_library() -> None:
 
 
 NORMAL = {"distribution": "norm", "loc": 8.0, "scale": 2.0}
+WEIGHED = {"values": [3, 8.5], "weights": [1, 2]}
 LINES = {"low": 0.0, "high": 10.0, "bins": 4}, {"values": [1, 2, 4]}
 FILES: list[tuple[dict[str, Any], Any]] = [  # a parameter in a task's file, its target in Python
     ({**LINES[0], "target": 7.0}, 7.0),
     ({**LINES[0], "target": [2.0, 5.0]}, (2.0, 5.0)),
     ({**LINES[0], "target": NORMAL}, NORMAL),
-    ({**LINES[0], "target": {"values": [3, 8.5], "weights": [1, 2]}}, {"values": [3, 8.5], "weights": [1, 2]}),
+    ({**LINES[0], "target": WEIGHED}, {**WEIGHED, "values": np.array([3, 8.5])}),
     ({**LINES[1], "target": [1, 4]}, np.array([1, 4])),
-    ({**LINES[1], "target": {"values": [1, 4], "weights": [3, 1]}}, {"values": np.array([1, 4]), "weights": (3, 1)}),
-]  # fmt: skip
+    ({**LINES[1], "target": {**WEIGHED, "values": [1, 4]}}, {**WEIGHED, "values": (1, 4)}),
+]
 
 
 @pytest.mark.parametrize(("file", "target"), FILES, ids=[str(file["target"]) for file, _ in FILES])

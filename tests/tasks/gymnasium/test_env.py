@@ -13,10 +13,9 @@ from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
+from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
+from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError, plays
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.gymnasium.processes import LostProcessError
-from proposer_rl.tasks.gymnasium.settings import Step, SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 

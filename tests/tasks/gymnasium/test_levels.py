@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.gymnasium.player import ParameterSettings
 from proposer_rl.tasks.parameters import Bins, ParameterSpace, points
 from proposer_rl.tasks.ranges import spaces
 from tests.tasks.gymnasium.toys import PARAMETERS

@@ -12,11 +12,11 @@ import pytest
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
+    ParameterSettings,
     Play,
     RefusedLevelError,
     imported,
 )
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
 
 LEVEL = {"speed": 1.25, "width": 2.0, "begin": 1, "wind": -1}

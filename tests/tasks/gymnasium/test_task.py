@@ -20,9 +20,9 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium import env, pictures
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings, ParameterSettings
+from proposer_rl.tasks.gymnasium import batched_env, pictures
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
 from tests.tasks.gymnasium.odd import Line, odd
 from tests.tasks.gymnasium.toys import NO_BOX2D, PARAMETERS, TINY, WALK, Walk, walk_task
 from tests.test_readme import ROOT, commands, write_files
@@ -108,7 +108,7 @@ def picture(record: dict[str, Any]) -> np.ndarray:
         ({"env_id": "tests.tasks.gymnasium.test_task:Endless-v0"}, "max_steps: missing"),
         (
             {"network": NetworkSettings(hidden=[8], channels=[4])},
-            r"network.channels=\[4\]: is of images, of which none is seen",
+            r"network.channels=\[4\]: has no effect where no image is seen",
         ),
     ],
 )
@@ -161,7 +161,7 @@ def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_processes_change_no_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(env, "available_cores", lambda: 3)
+    monkeypatch.setattr(batched_env, "available_cores", lambda: 3)
     measured = []
     for vectorization in ("sync", "async"):
         task = walk_task(vectorization=vectorization)
@@ -224,7 +224,7 @@ def test_pictures_show_the_level_and_the_episode(
     still, moved = task.record(levels[0], None), task.record(levels[0], rollout[0])
     assert max(picture(still[0]).shape[:2]) == pictures.LONGER_SIDE
     assert not np.array_equal(picture(still[0]), picture(still[1]))
-    assert (task.facts["key"] == pictures.KEY) is drawn
+    assert (task.facts["key"] == pictures.FRAMES) is drawn
     assert np.array_equal(picture(still[0]), picture(moved[0])) is not drawn
     assert still[0]["text"][0] == "half length 0.1"
     assert still[0]["level"]["seed"] == int(levels["seed"][0, 0])

@@ -33,18 +33,19 @@ from torchrl.envs import (
 )
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, read, write
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.attributes import (
+    AttributeRefusedError,
+    read_attribute,
+    write_attribute,
+)
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
+    ParameterSettings,
     Play,
     WrapperError,
-)
-from proposer_rl.tasks.gymnasium.settings import (
-    NetworkSettings,
-    ParameterSettings,
-    SuccessSettings,
 )
 from tests.tasks.gymnasium.odd import (
     LIMIT,
@@ -220,9 +221,12 @@ KINDS = odd(__init__=with_parts)
 )
 def test_a_number_gets_to_where_its_path_leads(path: str) -> None:
     environment = gymnasium.make(KINDS).unwrapped
-    kind = type(read(environment, path))
-    write(environment, path, 0.0)
-    assert float(read(environment, path)) == 0.0 and type(read(environment, path)) is kind
+    kind = type(read_attribute(environment, path))
+    write_attribute(environment, path, 0.0)
+    assert (
+        float(read_attribute(environment, path)) == 0.0
+        and type(read_attribute(environment, path)) is kind
+    )
     assert environment.gravity[:2].tolist() == [0.0, 0.0]  # type: ignore[attr-defined]
 
 
@@ -243,14 +247,14 @@ def test_a_number_gets_to_where_its_path_leads(path: str) -> None:
 )
 def test_what_cannot_hold_the_number_refuses_it(path: str, message: str) -> None:
     with pytest.raises(AttributeRefusedError, match=message):
-        write(gymnasium.make(KINDS).unwrapped, path, 0.5)
+        write_attribute(gymnasium.make(KINDS).unwrapped, path, 0.5)
 
 
 def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
     environment: Any = gymnasium.make("PassesOn-v0").unwrapped
     with pytest.raises(AttributeRefusedError, match="only passes 'drag' on"):
-        write(environment, "drag", 0.5)
-    write(environment, "inner.drag", 0.5)
+        write_attribute(environment, "drag", 0.5)
+    write_attribute(environment, "inner.drag", 0.5)
     assert environment.drag == 0.5
 
 
@@ -281,7 +285,7 @@ def test_wrappers_that_begin_anew_with_each_episode_are_welcome() -> None:
 
 def test_a_parameter_that_changes_nothing_is_told() -> None:
     ignored = ParameterSettings(set="option", values=[0, 1], target=0)
-    with pytest.warns(UserWarning, match="parameters.typo: .* does it arrive?"):
+    with pytest.warns(UserWarning, match="parameters.typo: .* may not read this parameter"):
         line_task(odd(), parameters={"typo": ignored})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -451,7 +455,7 @@ def test_what_is_only_drawn_arrives(drawn: bool) -> None:
         render=lambda self: np.full((8, 8, 3), 50 * self.hill * drawn, np.uint8),
     )
     hill = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
-    warned = pytest.warns(UserWarning, match="parameters.hill: .* does it arrive?")
+    warned = pytest.warns(UserWarning, match="parameters.hill: .* may not read this parameter")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with nullcontext() if drawn else warned:
