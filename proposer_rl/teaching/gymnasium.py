@@ -11,8 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, entries, number, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -156,7 +156,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                     f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
                 )
             try:
-                write(self.env.unwrapped, path, _plain(self._level[name]))
+                write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
             except AttributeRefusedError as error:
                 raise ArgumentError(f"set.{name}={path!r}: {error}") from error
         left_out = [name for name in names if name not in (*how, SEED)]
@@ -183,7 +183,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if success is None:
             return
         try:
-            now = number(success, f"success={self._rule!r}: what came of an episode")
+            now = as_number(success, f"success={self._rule!r}: what came of an episode")
         except UnfitEnvironmentError as error:
             raise ArgumentError(str(error)) from error
         self._succeeded = max(now, self._succeeded or 0.0) if self._once else now

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.models import Population, draw_at, joint_categorical, normal
-from proposer_rl.tasks.gymnasium.networks import SolverNetwork
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings
-from proposer_rl.tasks.gymnasium.spaces import plain
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork
+from proposer_rl.tasks.gymnasium.spaces import plain_env
 from tests.tasks.gymnasium.odd import Mixed
 
 SETTINGS = NetworkSettings(hidden=[16, 8], channels=[4, 6])
@@ -135,7 +134,7 @@ def test_what_is_seen_becomes_numbers_and_images(space: Any, shapes: Any) -> Non
     """By Gymnasium's own flattening, and pixel by pixel."""
     env: Any = gymnasium.make("Mixed-v0")
     env.unwrapped.observation_space = space
-    made = plain(env)
+    made = plain_env(env)
     shown: Any = made.observation_space
     boxes = shown.spaces if isinstance(shown, spaces.Dict) else {"observation": shown}
     assert {name: box.shape for name, box in boxes.items()} == shapes
