@@ -28,8 +28,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula import slots as rows
 from proposer_rl.curricula.batches import CPU, level_keys, moved
+from proposer_rl.curricula.slots import Floats, draw_row, insert_row
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
@@ -168,7 +168,7 @@ def draw_slots(
     slots = torch.zeros(len(generators), count, dtype=torch.int64)
     for copy in _copies(wanted, len(slots)):
         noise = torch.rand(count, generator=generators[copy], dtype=torch.float64).numpy()
-        drawn = rows.draw(_row(entries, copy), by_score[copy], rule.staleness, noise)
+        drawn = draw_row(_row(entries, copy), by_score[copy], rule.staleness, noise)
         slots[copy] = torch.from_numpy(drawn)
         entries["draws"][copy].scatter_add_(0, slots[copy], torch.ones_like(slots[copy]))
     return slots
@@ -192,7 +192,7 @@ def insert(
         wanted: bool [K], of the copies whose levels are inserted; None for all.
     """
 
-    def weigh(falling: rows.Floats) -> rows.Floats:
+    def weigh(falling: Floats) -> Floats:
         count = torch.tensor([len(falling)])
         return shares_by_rank(torch.from_numpy(falling), count, rule).numpy()
 
@@ -203,7 +203,7 @@ def insert(
     for copy in _copies(wanted, len(keys)):
         score, best = _of_equals(keys[copy], fresh["score"][copy], fresh["best"][copy])
         given = _row(entries, copy), keys[copy].numpy(), score.numpy(), rule.staleness, weigh
-        source, again = map(torch.from_numpy, rows.insert(*given, by_rank))
+        source, again = map(torch.from_numpy, insert_row(*given, by_rank))
         there = entries["best"][copy]
         there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
         slots = (source >= 0).nonzero().flatten()
@@ -243,6 +243,23 @@ def rescore(
         there.copy_(_mean_of_slots(there, slots, entry))
     there = buffer["best"]
     there.scatter_reduce_(1, slots, best.to(there), "amax")
+
+
+def lineage(buffer: TensorDictBase, most: int) -> Tensor:
+    """Slots of a buffer [n] that hold the longest line of levels, each edited from the one before.
+
+    At most the last ``most`` of it.
+    """
+    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
+    parents = [place.get(key) for key in buffer["parent"].tolist()]
+    longest: list[int] = []
+    for slot in range(len(parents)):
+        line, parent = [slot], parents[slot]
+        while parent is not None and parent not in line and len(line) < most:
+            line.append(parent)
+            parent = parents[parent]
+        longest = max(longest, line, key=len)
+    return torch.tensor(longest[::-1])
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:

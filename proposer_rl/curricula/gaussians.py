@@ -34,7 +34,7 @@ class MixtureCurriculum(Curriculum):
     drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
     fitted to the points and the progress of the last ``refit``, from which all but a part of the
     draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
-    :func:`fit` and :func:`draw`).
+    :func:`fit_mixture` and :func:`draw_points`).
 
     Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.
     Bins and not points are compared: between two points with a border of bins in between, the
@@ -101,7 +101,7 @@ class MixtureCurriculum(Curriculum):
         self._warmup, self._exploration, self._rounded = warmup, exploration, rounded
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
-        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit
+        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit_mixture
         self._fitted = 0  # episodes at the last fit
         self._inbox = Inbox()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
@@ -171,7 +171,7 @@ class MixtureCurriculum(Curriculum):
         last = {name: entry[:, -self._refit :] for name, entry in self._history.items()}
         seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [K, refit, D + 1]
         self._mixtures = [
-            fit(own, self._components, s.generator("mixture"))
+            fit_mixture(own, self._components, s.generator("mixture"))
             for own, s in zip(seen, streams, strict=True)
         ]
         self._fitted = episodes
@@ -183,14 +183,14 @@ class MixtureCurriculum(Curriculum):
         if not self._mixtures:
             return uniform
         explored = torch.rand(count, generator=generator) < self._exploration
-        drawn = draw(*self._mixtures[student], count, generator)
+        drawn = draw_points(*self._mixtures[student], count, generator)
         kept = drawn.clamp(-1, 1)
         clipped = (kept != drawn).any(-1) & ~explored
         self._drawn = self._drawn + torch.stack([(~explored).sum(), clipped.sum()])
         return torch.where(explored.unsqueeze(-1), uniform, kept)
 
 
-def fit(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """The mixture of 2 to ``most`` Gaussians with the least AIC.
 
     Full covariances, expectation maximisation from one start by k-means
@@ -224,13 +224,15 @@ def fit(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, 
     return torch.from_numpy(best.means_), torch.from_numpy(best.covariances_)
 
 
-def draw(means: Tensor, covariances: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def draw_points(
+    means: Tensor, covariances: Tensor, count: int, generator: torch.Generator
+) -> Tensor:
     """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
 
     Where no Gaussian has progress, all are alike.
 
     Args:
-        means: of the Gaussians, as :func:`fit` gives them.
+        means: of the Gaussians, as :func:`fit_mixture` gives them.
         covariances: likewise.
         count: number P of draws.
         generator: of the CPU.

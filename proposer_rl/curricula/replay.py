@@ -16,8 +16,8 @@ One loop with options, which is what the methods differ in:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval
@@ -40,18 +40,23 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
+    lineage,
     replay_weights,
     rescore,
 )
-from proposer_rl.curricula.children import Edit, Parents, easiness, lineage, parents_among
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.scores import Scored, Scorer, unseen
+from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
+Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
+"""Levels [K, n] after so many small random edits each, student k's from generator k."""
+Parents = Literal["batch", "easy"]
+
+EASY = 4  # parents of a batch of edits, where they are not all of the batch
 SHOWN = 6  # levels of each kind that a reader is shown
 
 
@@ -397,3 +402,30 @@ class ReplayCurriculum(Curriculum):
         if self._edits:
             shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
         return {caption: buffer["level"][which] for caption, which in shown.items()}
+
+
+def parents_among(evidence: TensorDictBase) -> Tensor:
+    """Places of the parents of so many children as there are levels: int64 [K, n].
+
+    All that was trained on; or where evidence [K, n] has the entry ``easy``, the few levels with
+    most of it.
+    """
+    count = evidence.shape[1]
+    if "easy" not in evidence.keys():
+        return torch.arange(count).expand(evidence.shape)
+    easiest = evidence["easy"].topk(min(EASY, count), -1).indices
+    return easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
+
+
+def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
+    """Mean absolute advantage minus mean return of levels [K, n]: what "easy" parents have most of.
+
+    Of the published ones, those with the lowest return minus value loss (the authors' code, dcd).
+    """
+    if "rollout" not in outcome.keys():
+        raise ValueError("parents=easy: the outcome has no rollout")
+    rollout = outcome["rollout"]
+    ended = episodes(rollout)
+    loss = Scorer("l1_value_loss", "episodes")
+    lost = loss.of_rollouts(student, [rollout], unseen(ended.ended.shape)).score
+    return lost - (ended.total / ended.ended.clamp(1)).cpu()

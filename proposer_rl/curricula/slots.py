@@ -27,7 +27,9 @@ Weigh = Callable[[Floats], Floats]
 ONE_BY_ONE = 128
 
 
-def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) -> NDArray[np.int64]:
+def draw_row(
+    numbers: Numbers, by_score: Floats, staleness: float, noise: Floats
+) -> NDArray[np.int64]:
     """Draw slots one after another: each draw advances the clock and makes its level fresh.
 
     Args:
@@ -107,7 +109,7 @@ class Ranks:
         return first + int(self._slots[first:last].searchsorted(slot))
 
 
-def insert(
+def insert_row(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
 ) -> tuple[Places, Places]:
     """Insert levels one after another into the slots of a row, or many of them at once.

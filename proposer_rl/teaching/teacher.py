@@ -23,18 +23,26 @@ from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
 from proposer_rl.models import callers_state, own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
+from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
-from proposer_rl.tasks.parameters import LARGEST
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
-from proposer_rl.teaching.segments import LEVEL_ID, ended
+from proposer_rl.teaching.results import (
+    COUNTS,
+    LEVEL_ID,
+    RESULTS,
+    argument,
+    as_array,
+    as_ids,
+    as_number,
+    as_outcome,
+    ended,
+)
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tally import Tally
-from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome, check_values
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -217,13 +225,13 @@ class Teacher:
             if success is None:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
-                numbers = {name: _number(name, value) for name, value in told.items()}
+                numbers = {name: as_number(name, value) for name, value in told.items()}
                 self._check_score(told)
                 self._ledger.tell_one(ids, numbers)
                 self._scored = "score" in told
                 self._tally.told(1, numbers["return"], numbers.get("success"))
             else:
-                self._tell(self._ids(ids), told)
+                self._tell(as_ids(ids), told)
 
     def drop(self, ids: Any = None) -> None:
         """Nothing will come of these levels: episodes that were cut off.
@@ -238,7 +246,7 @@ class Teacher:
                 self._ledger.drop_all()
                 self._whole.clear()
             else:
-                tickets = self._ids(ids)
+                tickets = as_ids(ids)
                 going = self._ledger.states(tickets) != OVER
                 self._ledger.drop(self._ledger.find(tickets[going]))
             self._tally.dropped(before - self._ledger.out)
@@ -263,14 +271,14 @@ class Teacher:
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
                 if kept is not None:  # of episodes that were not cut off since
-                    states = self._ledger.states(self._ids(kept[LEVEL_ID].reshape(-1)))
+                    states = self._ledger.states(as_ids(kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
                     self._observe_rollout(tickets, whole)
                 self._kept = left
                 return
-            tickets = self._proposed() if ids is None else self._ids(ids)
+            tickets = self._proposed() if ids is None else as_ids(ids)
             if "rollout" in outcome.keys():
                 self._observe_rollout(tickets, outcome["rollout"])
             else:
@@ -446,7 +454,7 @@ class Teacher:
     def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
-            name: as_array(_argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
+            name: as_array(argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
             for name, value in told.items()
         }
         self._check_score(told)
@@ -507,32 +515,3 @@ class Teacher:
                 "need ask(n) and its tickets"
             )
         return np.arange(out[0].start, out[0].end)
-
-    def _ids(self, ids: Any) -> NDArray[np.int64]:
-        """Tickets as an array [n] on the CPU."""
-        array = np.asarray(ids.detach().cpu() if isinstance(ids, Tensor) else ids)
-        if array.size == 0:
-            return np.zeros(0, np.int64)
-        if array.ndim > 1 or array.dtype.kind not in "iu":
-            raise ArgumentError(
-                f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
-            )
-        return array.reshape(-1).astype(np.int64)
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        told = f"{_argument(name)}={shown(value)}"
-        raise ArgumentError(f"{told}: must be a number of float32") from error
-    if not -LARGEST <= number <= LARGEST:
-        raise ArgumentError(f"{_argument(name)}={number}: must be finite in float32")
-    # Arrays take a while to make; few numbers need one.
-    if name in COUNTS or (name == "success" and not 0 <= number <= 1):
-        check_values(name, np.array([number]))
-    return number
-
-
-def _argument(name: str) -> str:
-    return "return_" if name == "return" else name

@@ -20,7 +20,7 @@ from torchrl.envs import (
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
-from proposer_rl.teaching.segments import LEVEL_ID
+from proposer_rl.teaching.results import LEVEL_ID
 from proposer_rl.teaching.teacher import Success, Teacher
 
 NONE = -1  # the identity of no level
