@@ -20,7 +20,7 @@ from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_single_bin
 
-LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
+LEAST_STORED = 6  # earlier episodes, below which progress is 0
 CHUNK = 2**16  # earlier episodes that are compared at once
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
@@ -108,7 +108,7 @@ class MixtureCurriculum(Curriculum):
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n] of the bins nearest to the points drawn."""
+        """Draws points, and returns levels [K, n] of the bins nearest to them."""
         self._take_in()
         self._fit(streams)
         drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
@@ -124,7 +124,7 @@ class MixtureCurriculum(Curriculum):
         return self._inbox.batch(levels, **notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Put tasks and returns aside for the histories."""
+        """Keeps tasks and returns, which the next proposal adds to the histories."""
         self._inbox.check(batch, outcome)
         notes = batch.notes
         self._counts += counts_of_bins(notes["bins"], self.space)
@@ -132,7 +132,7 @@ class MixtureCurriculum(Curriculum):
         self._inbox.put(batch, points=notes["points"], bins=notes["bins"], returns=returns)
 
     def log(self) -> dict[str, Any]:
-        """Counts, the mixtures, and how often a draw was clipped."""
+        """Returns counts of levels by bin, the mixtures, and how often a draw was clipped."""
         self._take_in()
         if not self._history:
             return {}
@@ -148,7 +148,7 @@ class MixtureCurriculum(Curriculum):
         }
 
     def _take_in(self) -> None:
-        """Add tasks, returns and progress to the histories."""
+        """Adds tasks, returns and progress to the histories."""
         for evidence in self._inbox.take():
             points, returns = evidence["points"], evidence["returns"]
             tasks = self.space.coordinates.double()[evidence["bins"]] if self._rounded else points
@@ -163,7 +163,7 @@ class MixtureCurriculum(Curriculum):
             }
 
     def _fit(self, streams: Sequence[Streams]) -> None:
-        """Fit new mixtures if it is time."""
+        """Fits new mixtures if it is time."""
         episodes = self._history["returns"].shape[1] if self._history else 0
         due = episodes // self._refit > self._fitted // self._refit
         if episodes < self._warmup or not due:
@@ -177,7 +177,7 @@ class MixtureCurriculum(Curriculum):
         self._fitted = episodes
 
     def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
-        """A batch of points for one student, float64 [n, D]."""
+        """Draws a batch of points for one student, float64 [n, D]."""
         size = self.space.coordinates.shape[1]
         uniform = 2 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 1
         if not self._mixtures:
@@ -191,7 +191,7 @@ class MixtureCurriculum(Curriculum):
 
 
 def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The mixture of 2 to ``most`` Gaussians with the least AIC.
+    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the least AIC.
 
     Full covariances, expectation maximisation from one start by k-means
     (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
@@ -227,7 +227,7 @@ def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[
 def draw_points(
     means: Tensor, covariances: Tensor, count: int, generator: torch.Generator
 ) -> Tensor:
-    """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
+    """Draws points from a mixture's Gaussians, each in proportion to its mean's progress.
 
     Where no Gaussian has progress, all are alike.
 
@@ -250,7 +250,7 @@ def draw_points(
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:
-    """The place nearest to each point, the last of equally near ones.
+    """Finds the place nearest to each point, the last of equally near ones.
 
     Args:
         points: float [n, D].
@@ -278,7 +278,7 @@ def nearest(points: Tensor, places: Tensor) -> Tensor:
 def absolute_progress(
     tasks: Tensor, returns: Tensor, new_tasks: Tensor, new_returns: Tensor
 ) -> Tensor:
-    """|r - r'| of new episodes, r' the return on the nearest of earlier tasks; else 0.
+    """Returns |r - r'| of new episodes, with r' the return on the nearest of earlier tasks.
 
     Portelas et al. 2019 (arXiv 1910.07224), equation of the absolute learning progress. As in their
     code, it is 0 as long as no more than five are stored.

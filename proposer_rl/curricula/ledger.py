@@ -1,4 +1,4 @@
-"""One record of which levels are where: by rising id, each waiting, out, told or over."""
+"""One record of which levels are where: by rising id, each waiting, out, returned or over."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from proposer_rl.task import Levels
 
 Ids = NDArray[np.int64]
 
-WAITING, OUT, TOLD, OVER = range(4)
+WAITING, OUT, RETURNED, OVER = range(4)
 """Proposed; handed out; with a result that has not been observed; observed or dropped."""
 STATES = ("has not been handed out", "", "has been told before", "is over")
 
@@ -146,7 +146,7 @@ class Ledger:
         for block, which, place in parts:
             for name, result in results.items():
                 block.results[name][:, place] = result[:, which]
-            block.state[:, place] = TOLD
+            block.state[:, place] = RETURNED
         self.told = True
 
     def tell_one(self, id: int, results: Mapping[str, Any], student: int = 0) -> None:
@@ -162,7 +162,7 @@ class Ledger:
         assert block is not None
         for name, result in results.items():
             block.results[name][student, place] = result
-        block.state[student, place] = TOLD
+        block.state[student, place] = RETURNED
         self.told = True
 
     def drop(self, parts: list[Found]) -> None:
@@ -187,7 +187,7 @@ class Ledger:
             block.state[block.state == OUT] = OVER
 
     def take(self, settled: bool = False) -> Iterator[tuple[Batch, dict[str, NDArray[Any]]]]:
-        """Yields what has been told since the last time, block by block, and forgets what is over.
+        """Yields the results since the last time, block by block, and forgets what is over.
 
         Args:
             settled: whether a block is taken only when none of its levels waits. Its batch is then
@@ -205,7 +205,7 @@ class Ledger:
                 block.places = np.flatnonzero((state != OVER).all(0))
                 kept = torch.from_numpy(block.places).expand(len(state), -1)
                 block.batch = block.batch.keep(kept)
-            ready = np.flatnonzero((state == TOLD).all(0))
+            ready = np.flatnonzero((state == RETURNED).all(0))
             if not len(ready):
                 continue
             part = ready if block.places is None else block.places.searchsorted(ready)

@@ -69,7 +69,7 @@ PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is c
 def logistic_ridge(
     features: Tensor, labels: Tensor, weights: Tensor, ridge: float
 ) -> tuple[Tensor, Tensor]:
-    """Fit K logistic regressions by Newton's method; all coefficients are penalised.
+    """Fits K logistic regressions by Newton's method; all coefficients are penalised.
 
     Args:
         features: float64 [K, m, F].
@@ -83,7 +83,7 @@ def logistic_ridge(
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
 
     def at(beta: Tensor) -> tuple[Tensor, Tensor]:
-        """Log odds [K, m], and the loss [K]."""
+        """Returns log odds [K, m], and the loss [K]."""
         z = _times(features, beta)
         misfit = torch.nn.functional.softplus(z) - labels * z
         return z, (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
@@ -110,7 +110,7 @@ def logistic_ridge(
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Fit K linear regressions to values, float64 [K, m]; else as :func:`logistic_ridge`.
+    """Fits K linear regressions to values float64 [K, m], with the rest as in logistic_ridge.
 
     Returns:
         Coefficients, float64 [K, F], all of which are penalised.
@@ -121,10 +121,10 @@ def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float
 
 
 class OutcomeModel:
-    """What K students would reach on levels, by what came of the last batches.
+    """Predicts what K students would reach on levels, from the outcomes of the last batches.
 
     Args:
-        labels: what the probability is of: ``"success"``, as outcomes tell it; or
+        labels: what the probability is of: ``"success"``, as outcomes have it; or
             ``"above_worst"``, a return above the lowest that there ever was. Where failures all
             have the same return, the two are one. Where every step is rewarded, nearly every
             episode is above the worst: no level is silent, and each teaches something.
@@ -139,14 +139,14 @@ class OutcomeModel:
         self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
-        # One that is not needed is not always told.
+        # Outcomes do not always have an entry that nobody needs.
         self.reads = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
 
     def add(self, features: Tensor, outcome: Mapping[str, Tensor], *, as_old: bool = False) -> None:
-        """Take in a batch.
+        """Adds a batch to the data.
 
         Args:
             features: float64 [K, m, F]; a constant one is a further intercept.
@@ -162,7 +162,7 @@ class OutcomeModel:
         self._fitted = None
 
     def predict(self, features: Tensor) -> TensorDict:
-        """What to expect on levels with features float64 [K, n, F]: a tensordict [K, n].
+        """Predicts the outcome of levels with features float64 [K, n, F]: a tensordict [K, n].
 
         ``success``, ``return`` and ``spread``, the variance of the return, each float64. Before
         there is any row they are 0.5, 0 and 0 everywhere.
@@ -185,18 +185,18 @@ class OutcomeModel:
         )
 
     def labels(self, outcome: Mapping[str, Tensor]) -> Tensor:
-        """What an outcome [K, m] is to the model, in [0, 1]: float64 [K, m]."""
+        """Returns the labels in [0, 1] that the model takes from an outcome: float64 [K, m]."""
         if self._labels == "success":
             return outcome["success"]
         worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
         return (outcome["return"] > worst + EQUAL * (1 + worst.abs())).double()
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows, and the worst return."""
+        """Returns the data, and the worst return."""
         return {"batches": [dict(batch) for batch in self._batches], "worst": self._worst}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
+        """Puts back what :meth:`state_dict` returned."""
         self._batches = [dict(batch) for batch in state["batches"]]
         self._worst, self._fitted = state["worst"], None
 
@@ -269,7 +269,7 @@ class Modelled(Combinator):
         self._first: list[Tensor] | None = []  # that came back, [2, K, n]; None once judged
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """What the curriculum proposes to a student of whom the model speaks."""
+        """Returns what the curriculum proposes, with a student whose performance is predicted."""
         self._take_in()
         self._has_taken = False
         batch = self.parts[0].propose(_answering(student, self._predict), count, streams)
@@ -278,10 +278,10 @@ class Modelled(Combinator):
         return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Put the outcome aside for the model, and pass it on.
+        """Keeps the outcome for the model, and passes it on to the curriculum.
 
         Raises:
-            ValueError: if the outcome tells no success and success is what is labelled.
+            ValueError: if the outcome has no success and success is what is labelled.
         """
         self._inbox.check(batch, outcome)
         if self._labels == "success" and "success" not in outcome.keys():
@@ -293,16 +293,16 @@ class Modelled(Combinator):
             self._judge(outcome)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it; what comes back next is not the first any more."""
+        """Puts back what :meth:`state_dict` returned; labels are not judged again."""
         super().load_state_dict(state)
         self._first = None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Improve the curriculum, by what the model says of the student."""
+        """Improves the curriculum, with a student whose performance the model predicts."""
         return super().improve(_answering(student, self._predict), streams)
 
     def log(self) -> dict[str, Any]:
-        """Besides, how right the model was about the levels that came back, before it saw them.
+        """Returns also how right the model was about levels before it saw their outcomes.
 
         ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``,
         that of one number for all; ``reliability``, for each tenth of the probabilities how many
@@ -334,7 +334,7 @@ class Modelled(Combinator):
         }
 
     def _judge(self, outcome: TensorDictBase) -> None:
-        """Warn where the first levels that come back show that their labels say little."""
+        """Warns where the first outcomes show that the labels say little."""
         returns = outcome["return"].double().cpu()
         success = outcome.get("success", torch.full_like(returns, torch.nan)).double().cpu()
         self._first = [*(self._first or []), torch.stack([returns, success])]
@@ -357,7 +357,7 @@ class Modelled(Combinator):
             )
 
     def _take_in(self) -> None:
-        """Take in what came back since the last proposal, of whichever batches: it has one age."""
+        """Adds the outcomes since the last proposal to the model's data as one batch."""
         if not (taken := self._inbox.take()):
             return
         evidence: Any = torch.cat(taken, 1)
@@ -378,7 +378,7 @@ class Modelled(Combinator):
 
 
 class _Fitted(NamedTuple):
-    """Regressions on features and age, and the mean and deviation of returns [K, 1]."""
+    """The coefficients of fitted regressions, and the mean and deviation of returns [K, 1]."""
 
     beta: Tensor
     covariance: Tensor
@@ -393,7 +393,7 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def _answering(student: Student, predict: Callable[[Levels], TensorDict]) -> Student:
-    """A student whose performance a model tells; all else it does itself."""
+    """Returns a student whose performance a model predicts, and that does all else itself."""
     own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
     answering = Student(
         gamma=student.gamma,

@@ -21,7 +21,7 @@ SHOWN = 6  # levels that a reader is shown
 
 
 class SamplingCurriculum(Curriculum):
-    """Fresh levels of one distribution in every batch, whatever came of the last one.
+    """Draws every batch from one fixed distribution: the target, or domain randomization.
 
     Args:
         distribution: to draw from.
@@ -31,7 +31,7 @@ class SamplingCurriculum(Curriculum):
         self._distribution = distribution
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws of the distribution, each student's from its own streams."""
+        """Draws levels [K, n], each student's from its own streams."""
         levels = fresh_levels(self._distribution, count, streams, "levels")
         return Batch(levels)
 
@@ -79,7 +79,7 @@ class SelectionCurriculum(Curriculum):
         self.scores = torch.zeros(0)  # float64 [K, keep]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n]: some of those kept, then new ones.
+        """Returns levels [K, n]: some of those kept, then new ones.
 
         Raises:
             DivergedError: if fewer of the candidates have a score than are kept.
@@ -97,7 +97,7 @@ class SelectionCurriculum(Curriculum):
         return Batch(levels, TensorDict({}, (len(streams), count)))
 
     def _select(self, student: Student, streams: Sequence[Streams]) -> None:
-        """Keep the best of new candidates."""
+        """Scores new candidates, and keeps the best of them."""
         levels = fresh_levels(self._new_levels, self._candidates, streams, "candidates")
         scored = self.scorer(student, levels, streams)
         known = int(scored.score.isfinite().sum(-1).min())
@@ -111,7 +111,7 @@ class SelectionCurriculum(Curriculum):
         self.kept = levels_at(levels.cpu(), best.indices[:, : self._keep])
 
     def log(self) -> dict[str, Any]:
-        """The scores of what is kept, and the first student's best levels."""
+        """Returns the scores of what is kept, and the first student's best levels."""
         if not len(self.kept):
             return {}
         return {
@@ -122,10 +122,10 @@ class SelectionCurriculum(Curriculum):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """What is kept, too."""
+        """Returns also the levels that are kept."""
         return super().state_dict() | {"kept": packed(self.kept)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
+        """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self.kept = of_kind(self._template, state["kept"])

@@ -23,10 +23,10 @@ ENDS = ("done", "terminated", "truncated", "success")
 
 
 def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
-    """Returns what curricula observe, [K, n], of the results [K, n] that were told.
+    """Returns the outcome [K, n] that curricula observe, from results [K, n] by name.
 
-    Where nothing was told, which is NaN, there was one episode of one step; what is missing of
-    another result for one level is left out for all.
+    NaN is a result that the loop did not give: a count is then 1; another result that is missing
+    for one level is left out for all.
     """
     outcome = {}
     for name, result in results.items():
@@ -41,7 +41,7 @@ def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
 def as_array(
     name: str, value: Any, shape: tuple[int, ...], for_all: bool = False
 ) -> NDArray[np.float64]:
-    """Numbers of a shape as an array on the CPU, whatever they are given as.
+    """Returns numbers as an array of a shape on the CPU, whatever they are given as.
 
     Args:
         name: of the argument.
@@ -79,7 +79,7 @@ def as_number(name: str, value: Any) -> float:
     """Returns one result as a number.
 
     Raises:
-        ArgumentError: as :func:`as_array`.
+        ArgumentError: see :func:`as_array`.
     """
     try:
         number = float(value)
@@ -116,7 +116,7 @@ def as_ids(ids: Any) -> NDArray[np.int64]:
 
 
 def check_values(name: str, array: NDArray[np.float64]) -> None:
-    """Refuse what is no share of successes, or no count.
+    """Refuses what is no share of successes, or no count.
 
     Raises:
         ArgumentError: naming the argument.
@@ -136,7 +136,7 @@ def check_values(name: str, array: NDArray[np.float64]) -> None:
 def ended(
     rollout: TensorDictBase, kept: TensorDictBase | None = None
 ) -> tuple[NDArray[np.int64], TensorDictBase, TensorDictBase]:
-    """The episodes that end in a rollout, and what of it belongs to others.
+    """Returns the episodes that end in a rollout, and the steps of those that do not.
 
     Args:
         rollout: [*B, T] with ``level_id``, a number for each level that was begun, by which
