@@ -64,9 +64,9 @@ class LevelTransform(Transform):
             rollout alone, then needs ``reset_at_each_iter``.
 
     Raises:
-        ArgumentError: if the teacher is of several students, or reads rollouts while ``tell``
-            is true; at the first reset, if the environment has no such reward or success, resets itself, or
-            is one of several that levels do not get into from outside.
+        ArgumentError: if the teacher is of several students, or reads rollouts while ``tell`` is
+            true; at the first reset, if the environment has no such reward or success, resets
+            itself, or is one of several that levels do not get into from outside.
     """
 
     def __init__(
