@@ -19,7 +19,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Space, refuse_single_bin
 
 Measure = Literal["success", "return"]
-MANY = 10_000  # levels of a scoring pass, beyond which its cost is told
+MANY = 10_000  # levels of a scoring pass, beyond which there is a warning
 
 
 class BinCurriculum(Curriculum):

@@ -208,14 +208,14 @@ def insert(
         there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
         slots = (source >= 0).nonzero().flatten()
         which = source[slots]
-        told = {
+        kept = {
             "best": best,
             "parent": fresh.get("parent", none)[student],
             "generation": fresh.get("generation", none)[student],
             "draws": none[student],
             "reached": fresh.get("reached", unknown)[student],
         }
-        for name, entry in told.items():
+        for name, entry in kept.items():
             there = entries[name][student]
             there[slots] = entry[which].to(there)
         entries["level"][student, slots] = moved(fresh["level"][student, which], CPU)

@@ -229,13 +229,13 @@ class Mixed(Combinator):
 
     def log(self) -> dict[str, Any]:
         """Returns the log of each curriculum, whose entries begin with its number."""
-        told: dict[str, Any] = {}
+        record: dict[str, Any] = {}
         levels: dict[str, Any] = {}
         for i, part in enumerate(self.parts):
             log = part.log()
             levels |= {f"{i}: {caption}": some for caption, some in log.pop("levels", {}).items()}
-            told |= {f"{i}_{key}": value for key, value in log.items()}
-        return {**told, "levels": levels} if levels else told
+            record |= {f"{i}_{key}": value for key, value in log.items()}
+        return {**record, "levels": levels} if levels else record
 
 
 def _mixes(curriculum: Curriculum) -> bool:

@@ -73,11 +73,11 @@ class Ledger:
     Attributes:
         next: the id of the next level.
         blocks: those in which something is not over.
-        told: whether there is a result that :meth:`take` has not given.
+        returned: whether there is a result that :meth:`take` has not given.
     """
 
     def __init__(self, kinds: Mapping[str, type]) -> None:
-        self.next, self.told = 0, False
+        self.next, self.returned = 0, False
         self.blocks: list[Block] = []
         self._kinds = dict(kinds)
 
@@ -147,7 +147,7 @@ class Ledger:
             for name, result in results.items():
                 block.results[name][:, place] = result[:, which]
             block.state[:, place] = RETURNED
-        self.told = True
+        self.returned = True
 
     def tell_one(self, id: int, results: Mapping[str, Any], student: int = 0) -> None:
         """Notes the results of one level of one student.
@@ -163,7 +163,7 @@ class Ledger:
         for name, result in results.items():
             block.results[name][student, place] = result
         block.state[student, place] = RETURNED
-        self.told = True
+        self.returned = True
 
     def drop(self, parts: list[Found]) -> None:
         """Notes that nothing more comes of ids that were found."""
@@ -197,7 +197,7 @@ class Ledger:
         Yields:
             A part of a batch [K, m], and its results [K, m] by name.
         """
-        for block in self.blocks if self.told or settled else ():
+        for block in self.blocks if self.returned or settled else ():
             state = block.state
             if settled and (state == WAITING).any():
                 continue
@@ -216,7 +216,7 @@ class Ledger:
             for name, kind in self._kinds.items():
                 if kind is object:
                     block.results[name][:, ready] = None
-        self.told = False
+        self.returned = False
         self.blocks = [b for b in self.blocks if not _is_over(b)]
 
     def _refuse(self, id: int, state: int) -> NoReturn:
@@ -228,7 +228,7 @@ class Ledger:
         """Returns all of it, with the levels that are not over."""
         return {
             "next": self.next,
-            "told": self.told,
+            "returned": self.returned,
             "blocks": [
                 {
                     "start": block.start,
@@ -267,7 +267,7 @@ class Ledger:
                 for name, result in kept["results"].items()
             }
             self.blocks.append(block)
-        self.next, self.told = state["next"], state["told"]
+        self.next, self.returned = state["next"], state["returned"]
 
 
 def _is_over(block: Block) -> bool:

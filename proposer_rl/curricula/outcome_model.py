@@ -62,7 +62,7 @@ EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the
 ANSWERED = ("performance", "exact_performance")
 FIRST = 128  # levels that came back first, by which it is judged what the labels say
 ALIKE = 0.95  # share of them with one label, beyond which that is nearly nothing
-WRONG = 0.1  # share of them that were told another success, beyond which it should be read
+WRONG = 0.1  # share of them with another success than their label, beyond which it should be read
 PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
 
 
@@ -245,7 +245,7 @@ class Modelled(Combinator):
         labels, ridge, half_life: see the model.
     """
 
-    remembers = ("_model", "_inbox", "_told", "_has_taken")
+    remembers = ("_model", "_inbox", "_seen", "_has_taken")
 
     @checked
     def __init__(
@@ -265,7 +265,7 @@ class Modelled(Combinator):
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._inbox = Inbox()
         self._has_taken = False  # whether anything since the last proposal, as logs make it
-        self._told: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
+        self._seen: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
         self._first: list[Tensor] | None = []  # that came back, [2, K, n]; None once judged
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -310,12 +310,12 @@ class Modelled(Combinator):
         """
         self._take_in()
         log = super().log()
-        if not self._told:
+        if not self._seen:
             return log
         predicted, label = (
-            torch.cat([told[name] for told in self._told], 1) for name in ("predicted", "label")
+            torch.cat([seen[name] for seen in self._seen], 1) for name in ("predicted", "label")
         )
-        self._told = []
+        self._seen = []
         part = (predicted * PARTS).long().clamp(max=PARTS - 1)
         sums = [
             torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
@@ -343,7 +343,7 @@ class Modelled(Combinator):
             return
         self._first = None
         label = OutcomeModel(labels="above_worst").labels({"return": first[0]})
-        wrong = (first[1] - label).abs().nanmean()  # NaN where none was told
+        wrong = (first[1] - label).abs().nanmean()  # NaN where there is none
         found = f"labels=above_worst: {float(label.mean()):.0%} of the first returns are that"
         if wrong > WRONG:
             warnings.warn(
@@ -362,7 +362,7 @@ class Modelled(Combinator):
             return
         evidence: Any = torch.cat(taken, 1)
         label = self._model.labels(evidence)
-        self._told.append({"predicted": evidence["predicted"], "label": label})
+        self._seen.append({"predicted": evidence["predicted"], "label": label})
         self._model.add(evidence["features"], evidence, as_old=self._has_taken)
         self._has_taken = True
 

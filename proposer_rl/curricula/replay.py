@@ -218,7 +218,7 @@ class ReplayCurriculum(Curriculum):
         age = buffer["clock"] - buffer["touched"]
         shares = replay_weights(buffer["score"], age, filled, self._rule)
         count = filled.sum(-1)
-        told = {
+        record = {
             "replayed": self._came_back["replayed"] / max(self._came_back["levels"], 1),
             "filled": count.tolist(),
             "effective_levels": (1 / shares.square().sum(-1)).tolist(),
@@ -227,9 +227,9 @@ class ReplayCurriculum(Curriculum):
             "levels": self._shown(),
         }
         if len(self._last):
-            told["distinct_levels"] = [len(own.unique()) for own in level_keys(self._last)]
+            record["distinct_levels"] = [len(own.unique()) for own in level_keys(self._last)]
         self._came_back = {"levels": 0, "replayed": 0}
-        return told
+        return record
 
     def state_dict(self) -> dict[str, Any]:
         """Returns also the buffers, and what is known of the levels that were trained on."""

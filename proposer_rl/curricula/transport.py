@@ -115,11 +115,11 @@ class TransportCurriculum(BinCurriculum):
 
     def log(self) -> dict[str, Any]:
         """Returns also how many bins are allowed, and the distance W2 to the target."""
-        told = super().log()
-        if told:
-            told["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
-            told["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
-        return told
+        record = super().log()
+        if record:
+            record["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
+            record["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
+        return record
 
 
 def shares_of_bins(shares: Tensor, space: Space) -> Tensor:

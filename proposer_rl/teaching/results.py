@@ -84,8 +84,8 @@ def as_number(name: str, value: Any) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        told = f"{argument(name)}={shown(value)}"
-        raise ArgumentError(f"{told}: must be a number of float32") from error
+        given = f"{argument(name)}={shown(value)}"
+        raise ArgumentError(f"{given}: must be a number of float32") from error
     if not -LARGEST <= number <= LARGEST:
         raise ArgumentError(f"{argument(name)}={number}: must be finite in float32")
     # Arrays take a while to make; few numbers need one.

@@ -176,7 +176,7 @@ class TeacherSampler(Sampler[int]):
         came: dict[int, list[Answer]] = {}
         for item, answer in _everywhere(read, self._trace):
             came.setdefault(item, list(self._came.get(item, ()))).append(answer)
-        told: list[tuple[int, float, float, int]] = []
+        whole: list[tuple[int, float, float, int]] = []
         dropped: list[int] = []
         over: list[tuple[int, int]] = []  # items, and how many of their tickets
         for item, answers in came.items():
@@ -189,12 +189,12 @@ class TeacherSampler(Sampler[int]):
                 group, answers[:] = answers[: self._repeat], answers[self._repeat :]
                 if results := [answer for answer in group if answer]:
                     success, return_ = (sum(n) / len(n) for n in zip(*results, strict=True))
-                    told.append((ticket, return_, success, len(results)))
+                    whole.append((ticket, return_, success, len(results)))
                 else:
                     dropped.append(ticket)
             over.append((item, full))
-        if told:
-            ids, returns, successes, episodes = zip(*told, strict=True)
+        if whole:
+            ids, returns, successes, episodes = zip(*whole, strict=True)
             self._teacher.tell([*ids], returns, successes, episodes=episodes)
         self._teacher.drop(dropped)
         for item, full in over:
@@ -227,20 +227,20 @@ def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
         mine, error = read(), ""
     except ArgumentError as refused:
         mine, error = [], str(refused)
-    told = [(trace, error, mine)]
+    said = [(trace, error, mine)]
     if distributed.is_available() and distributed.is_initialized():
-        told *= distributed.get_world_size()
-    if len(told) > 1:
-        distributed.all_gather_object(told, told[0])
-    if len({trace for trace, _, _ in told}) > 1:
+        said *= distributed.get_world_size()
+    if len(said) > 1:
+        distributed.all_gather_object(said, said[0])
+    if len({trace for trace, _, _ in said}) > 1:
         raise ArgumentError(
             "teacher: has drawn other items on other ranks; each needs the same seed and state, "
             "and must draw in step"
         )
-    for _, error, _ in told:
+    for _, error, _ in said:
         if error:
             raise ArgumentError(error)
-    return [answer for _, _, answers in told for answer in answers]
+    return [answer for _, _, answers in said for answer in answers]
 
 
 def _answers(items: Any, success: Any, return_: Any) -> list[tuple[int, Answer]]:

@@ -13,7 +13,7 @@ from proposer_rl.tasks.parameters import Bins, ParameterSpace
 from proposer_rl.teaching.spaces import Items
 
 MOST_PARTS = 64  # of a data set, whose items are counted in
-MOST_BINS = 4096  # of a space that only tells coordinates, among which the nearest is searched
+MOST_BINS = 4096  # of a space that only has coordinates, among which the nearest is searched
 
 
 class Tally:
@@ -36,7 +36,7 @@ class Tally:
 
     def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
         """Counts the results of tickets, numbers or arrays."""
-        self._told += tickets
+        self._returned += tickets
         for name, values in (("return", returns), ("success", success)):
             if values is not None:
                 total, number = self._sums.get(name, (0.0, 0))
@@ -57,7 +57,7 @@ class Tally:
         means = {name: total / number for name, (total, number) in self._sums.items()}
         found = {
             "proposed": self._proposed,
-            "told": self._told,
+            "told": self._returned,
             "dropped": self._dropped,
             "out": out,
             "mean_return": means.get("return"),
@@ -71,7 +71,7 @@ class Tally:
         return found
 
     def _clear(self) -> None:
-        self._proposed = self._told = self._dropped = 0
+        self._proposed = self._returned = self._dropped = 0
         self._sums: dict[str, tuple[float, int]] = {}
         self._drawn = {
             name: torch.zeros(len(texts), dtype=torch.int64) for name, texts in self._texts.items()

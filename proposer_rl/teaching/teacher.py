@@ -218,20 +218,20 @@ class Teacher:
                 or not finite, another shape.
         """
         given = (return_, success, score, episodes, steps)
-        told = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
+        results = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
         with self._here():
             if "rollout" in self.reads:
                 raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
             if success is None:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
-                numbers = {name: as_number(name, value) for name, value in told.items()}
-                self._check_score(told)
+                numbers = {name: as_number(name, value) for name, value in results.items()}
+                self._check_score(results)
                 self._ledger.tell_one(ids, numbers)
-                self._scored = "score" in told
+                self._scored = "score" in results
                 self._tally.returned(1, numbers["return"], numbers.get("success"))
             else:
-                self._tell(as_ids(ids), told)
+                self._tell(as_ids(ids), results)
 
     def drop(self, ids: Any = None) -> None:
         """Gives up levels of which no results will come, as of episodes that were cut off.
@@ -285,10 +285,10 @@ class Teacher:
                 if "rollout" in self.reads:
                     raise ArgumentError("outcome: has no rollout, which this curriculum reads")
                 self._require_success("success" in outcome.keys(), "put it into the outcome")
-                told = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
-                if "return" not in told:
+                results = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
+                if "return" not in results:
                     raise ArgumentError(f"outcome={sorted(outcome.keys())}: has no return")
-                self._tell(tickets, told)
+                self._tell(tickets, results)
             if ids is None:
                 self._whole.clear()
 
@@ -310,12 +310,12 @@ class Teacher:
         """
         with self._here():
             self._count()
-            told = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
+            record = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
             if file is not None:
-                kept = {name: value for name, value in told.items() if name != "levels"}
+                kept = {name: value for name, value in record.items() if name != "levels"}
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
                     lines.write(json.dumps(kept) + "\n")
-            return told
+            return record
 
     @own_state()
     def state_dict(self) -> dict[str, Any]:
@@ -439,8 +439,8 @@ class Teacher:
     @own_state()
     def _next(self, count: int) -> Block:
         """Lets the curriculum observe the results there are, and returns what it then proposes."""
-        for told, results in self._ledger.take():
-            self.curriculum.observe(self.student, told, as_outcome(results))
+        for batch, results in self._ledger.take():
+            self.curriculum.observe(self.student, batch, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
         self._proposals += 1
@@ -451,15 +451,15 @@ class Teacher:
         levels = moved(block.batch.levels, self.device).clone()
         return self._given(levels[0] if self._alone else levels)
 
-    def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
+    def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
             name: as_array(argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
-            for name, value in told.items()
+            for name, value in results.items()
         }
-        self._check_score(told)
+        self._check_score(results)
         self._ledger.tell(self._ledger.find(ids), arrays)
-        self._scored = "score" in told
+        self._scored = "score" in results
         self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
@@ -495,8 +495,8 @@ class Teacher:
         self._ledger.drop(parts)
         self._tally.returned(len(ids), numbers["return"], numbers.get("success"))
 
-    def _check_score(self, told: Mapping[str, Any]) -> None:
-        if self._scored not in (None, "score" in told):
+    def _check_score(self, results: Mapping[str, Any]) -> None:
+        if self._scored not in (None, "score" in results):
             how = "missing: other levels were told with one" if self._scored else "others had none"
             raise ArgumentError(f"score: {how}; give it for all or for none")
 

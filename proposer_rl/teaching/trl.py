@@ -52,7 +52,7 @@ class TaughtReward(TrainerCallback):
             raise ArgumentError("reward: must be no coroutine: ranks are told in step")
         self._teacher, self._rows, self._reward = teacher, teacher.space.size, reward
         self._told = 0  # generations
-        self._again = False  # whether the next one repeats the last that was told
+        self._again = False  # whether the next one repeats the last that was reported
         update_wrapper(self, reward)  # TRL logs it by its name
 
     def attach(self, trainer: Any) -> None:
@@ -123,7 +123,7 @@ class TaughtReward(TrainerCallback):
         if not self._loaded:
             self.load(Path(args.output_dir) / f"checkpoint-{state.global_step}")
         self._loaded = False
-        # Within the steps of a generation TRL generates again, of prompts that were told before.
+        # Within the steps of a generation TRL generates again, of prompts whose rewards it has.
         per_step = args.gradient_accumulation_steps
         epoch, step = divmod(state.global_step, -(-self._groups * self._rounds // per_step))
         self._again = self._told > epoch * self._groups + step * per_step // self._rounds
