@@ -64,7 +64,8 @@ MISREAD = [
      "task: space: Dictionary should have at most 8 items"),
     *((WHOLE.replace("width:", f"{name}:").encode(),
        f"task.parameters: {read} without quotes is no name here; a name has quotes")
-      for name, read in {"on": "on, yes or true", "No": "off, no or false", "~": "null or ~"}.items()),
+      for name, read in (
+          ("on", "on, yes or true"), ("No", "off, no or false"), ("~", "null or ~"))),
 ]  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("own_folder")

@@ -186,7 +186,7 @@ def test_all_numbers_are_seen_whatever_their_names_are(space: Any) -> None:
     env.unwrapped.observation_space = space
     seen = space.sample()
     env.unwrapped.seen = lambda: reordered(seen)
-    shown = plain(env).reset()[0]
+    shown = plain_env(env).reset()[0]
     assert sorted(shown) == sorted(spaces.flatten(space, seen))
     env.unwrapped.seen = lambda: seen
-    assert list(plain(env).reset()[0]) == list(shown)
+    assert list(plain_env(env).reset()[0]) == list(shown)
