@@ -140,6 +140,14 @@ def test_texts_have_targets_as_numbers_have() -> None:
     assert space.description["named"]["odd"]["h"] == "gap (weight 3) or flat (weight 1)"
 
 
+def test_laws_that_differ_a_little_are_told_apart() -> None:
+    """States are compared by their spaces' descriptions."""
+    laws = [{**NORMAL, "loc": 8.0000001}, {**NORMAL, "scale": 2.0000001}, NORMAL]
+    laws += [{"values": [1.0, 2.0000001], "weights": [1, w]} for w in (1, 1.0000001)]
+    targets = [prl.Parameters({"g": (0.0, 9.0)}, target={"g": law}).description for law in laws]
+    assert len({json.dumps(target) for target in targets}) == len(laws)
+
+
 @pytest.mark.parametrize("where", ["ranges", "target"])
 def test_two_numbers_in_a_list_are_two_and_that_is_said_once(where: str) -> None:
     """A file has no tuples: what is meant as a range would be two values in silence."""
@@ -327,7 +335,7 @@ def test_the_largest_results_harm_no_curriculum(name: str) -> None:
 
 @given(st.floats())
 def test_results_are_those_that_float32_can_keep(number: float) -> None:
-    """Of one ticket and of several alike, against NumPy's conversion."""
+    """One ticket and several alike, against NumPy's conversion."""
     with np.errstate(over="ignore"):
         kept = bool(np.isfinite(np.float32(number)))
     for told in (number, [number]):
