@@ -125,10 +125,13 @@ def make(
             asks = first.kind <= first.POSITIONAL_OR_KEYWORD and first.default is first.empty
             if free and asks and hints.get(first.name, Any) in (Any, Components):
                 return target(run, **arguments(target, settings, [first.name]))
-        given |= {name: getattr(run, name) for name in OF_A_RUN if name in parameters}
-        for name in [name for name in OF_A_TASK if name in parameters]:
-            if parameters[name].default is inspect.Parameter.empty or hasattr(run.task, name):
-                given[name] = getattr(run.task, name)
+        for name in [name for name in parameters if name not in given]:
+            if name in OF_A_RUN:
+                given[name] = getattr(run, name)
+            elif name in OF_A_TASK:
+                needed = parameters[name].default is inspect.Parameter.empty
+                if needed or hasattr(run.task, name):
+                    given[name] = getattr(run.task, name)
         parts = {
             name: (part, [*inspect.signature(part).parameters])
             for name, hint in hints.items()

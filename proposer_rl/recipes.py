@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
+from inspect import isfunction
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,13 +93,17 @@ def own_recipe(
     Raises:
         ArgumentError: if it cannot be imported by its name.
     """
-    name = f"{make.__module__}.{make.__qualname__}"
-    if make.__module__ == "__main__" or "<" in name:
+    return Recipe(group, make.__name__, settings, _dotted("make", make))
+
+
+def _dotted(name: str, function: Any) -> str:
+    dotted = f"{function.__module__}.{function.__qualname__}"
+    if function.__module__ == "__main__" or "<" in dotted:
         raise _refusal(
-            f"make={name}: must be importable, as a class or function of a module is, so that "
+            f"{name}={dotted}: must be importable, as a class or function of a module is, so that "
             "watch, eval and play can make it again"
         )
-    return Recipe(group, make.__name__, settings, name)
+    return dotted
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
@@ -171,11 +176,13 @@ def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
 
 
 def override(key: str, value: Any) -> str:
-    """A key and its value as an override of Hydra's.
+    """A key and its value, of a function its dotted name, as an override of Hydra's.
 
     Raises:
         ArgumentError: naming the key, as :func:`override_value`.
     """
+    if isfunction(value):
+        value = _dotted(key.lstrip("+"), value)
     try:
         return f"{key}={override_value(value)}"
     except ValueError as error:
