@@ -1,13 +1,13 @@
-"""Methods: how a curriculum is put together from the task's parts. A method's config names one.
+"""How a curriculum is made of what its config says and of what the run has.
 
-Each is a factory of the run's :class:`Components` and the config's numbers, which are mostly those
-of the curriculum that it makes.
+``_target_`` of a config names the curriculum's class, see :func:`make`. The functions here are for
+curricula that one class and its settings do not make, such as those with a Proposer.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,27 +18,18 @@ from tensordict import TensorDict
 from proposer_rl.curricula import (
     Curriculum,
     Filtered,
-    FirstOrderCurriculum,
     FirstOrderProposer,
-    LearningProgressCurriculum,
-    MixtureCurriculum,
     Modelled,
     PairedProposer,
     ProposerCurriculum,
     ProposerTrainer,
-    ReplayCurriculum,
     ReplayRule,
-    SampledFirstOrderCurriculum,
     SampledFirstOrderProposer,
     SamplingCurriculum,
     Schedule,
     Scorer,
-    SelectionCurriculum,
-    SomeBins,
     TaskStudent,
-    TransportCurriculum,
 )
-from proposer_rl.curricula.scores import Source
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings, load_agent
 from proposer_rl.meta import rewards
 from proposer_rl.meta.assembly import (
@@ -52,12 +43,12 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.replicas import ReplicasInWorkers, worker_env
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic
+from proposer_rl.recipes import file_content
 from proposer_rl.runs.checkpoint import CheckpointError, State, learnt_curriculum
-from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
+from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, arguments, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, LocatedTarget, Space, Task
+from proposer_rl.task import Distribution, Space, Task
 
-F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
 
@@ -73,7 +64,7 @@ Given its device; it can be pickled.
 
 
 class Components(NamedTuple):
-    """What a method's factory gets.
+    """What a run has, of which curricula are made.
 
     Attributes:
         task: what is to be learnt.
@@ -92,102 +83,102 @@ class Components(NamedTuple):
     workers: Workers | None = None
 
 
-def _takes_numbers_of(*makers: Any, given: str = "") -> Callable[[F], F]:
-    """Put the numbers of a curriculum and its parts in the place of a factory's ``**numbers``.
+OF_A_RUN = ("task", "proposer", "seeds")
+OF_A_TASK = ("space", "target", "target_shares", "features", "edit")
+PARTS = (Scorer, ReplayRule)  # of curricula, made of settings that stand beside the curriculum's
+
+
+class UnfitTaskError(TypeError):
+    """A curriculum asks for something that the task does not define."""
+
+
+def make(
+    target: Callable[..., T], settings: Mapping[str, Any], run: Components, /, **given: Any
+) -> T:
+    """Calls a class or function with settings that its signature allows, and with the run's parts.
+
+    It gets by the names of its parameters:
+
+    - ``task``, ``proposer`` and ``seeds`` of the run; ``space``, ``target``, ``target_shares``,
+      ``features`` and ``edit`` of the task, those with a default only where the task has them;
+    - a :class:`Scorer` or :class:`ReplayRule`, made of the settings that these take;
+    - the other settings.
+
+    A function whose first parameter has none of these names, no default, and no type or the type
+    :class:`Components`, gets the run itself there, and the settings alone.
 
     Args:
-        makers: the parts' classes, and last the curriculum's, whose numbers have names alone.
-        given: the name of one that the factory gives itself.
+        target: what is called.
+        settings: by name.
+        run: what the run has.
+        given: further arguments.
+
+    Raises:
+        ArgumentError: as :func:`~proposer_rl.settings.arguments`.
+        UnfitTaskError: if the task lacks what is asked of it.
     """
+    parameters = inspect.signature(target).parameters
+    hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    try:
+        for first in [*parameters.values()][:1]:
+            free = first.name not in {*OF_A_RUN, *OF_A_TASK, *given, *settings}
+            asks = first.kind <= first.POSITIONAL_OR_KEYWORD and first.default is first.empty
+            if free and asks and hints.get(first.name, Any) in (Any, Components):
+                return target(run, **arguments(target, settings, [first.name]))
+        for name in [name for name in parameters if name not in given]:
+            if name in OF_A_RUN:
+                given[name] = getattr(run, name)
+            elif name in OF_A_TASK:
+                needed = parameters[name].default is inspect.Parameter.empty
+                if needed or hasattr(run.task, name):
+                    given[name] = getattr(run.task, name)
+        parts = {
+            name: (part, [*inspect.signature(part).parameters])
+            for name, hint in hints.items()
+            for part in PARTS
+            if hint in (part, part | None) and name not in given
+        }
+        theirs = [name for _, names in parts.values() for name in names]
+        read = arguments(target, settings, [*given, *parts], theirs)
+        for name, (part, names) in parts.items():
+            own = {key: read.pop(key) for key in names if key in read}
+            given[name] = part(**arguments(part, own))
+        return target(**given, **read)
+    except AttributeError as error:
+        if error.obj is not run.task:
+            raise
+        raise UnfitTaskError(
+            f"needs {error.name} of a task, which {type(run.task).__name__} does not define"
+        ) from error
 
-    def decorate(factory: F) -> F:
-        own = [p for p in inspect.signature(factory).parameters.values() if p.name != "numbers"]
-        numbers = {}
-        for make in makers:
-            hints = get_type_hints(make.__init__, include_extras=True)
-            for number in inspect.signature(make).parameters.values():
-                known = {given, *(p.name for p in own)}
-                named = number.kind is number.KEYWORD_ONLY or make is not makers[-1]
-                if named and number.name not in known:
-                    numbers[number.name] = number.replace(kind=number.KEYWORD_ONLY)
-                    factory.__annotations__[number.name] = hints[number.name]
-        every = sorted([*own, *numbers.values()], key=lambda p: p.kind)
-        factory.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
-        return factory
 
-    return decorate
+def filtered(curriculum: Curriculum, settings: Mapping[str, Any], run: Components) -> Filtered:
+    """Makes a curriculum that draws more levels than are trained on, and keeps some.
 
-
-@checked
-@_takes_numbers_of(Filtered)
-def filtered(
-    curriculum: Curriculum,
-    /,
-    score: str = "learnability",
-    source: Source = "exact",
-    rollouts: Count = 8,
-    **numbers: Any,
-) -> Filtered:
-    """A curriculum that draws more levels than are trained on, and keeps some.
-
-    Args:
-        curriculum: any.
-        score: of the levels; see :class:`Scorer`.
-        source: of the score.
-        rollouts: on each level, from episodes.
-        numbers: those of :class:`Filtered`.
+    What the settings do not say is as in ``conf/filter/learnability.yaml``.
     """
-    return Filtered(curriculum, Scorer(score, source, rollouts), **numbers)
+    settings = file_content("filter/learnability")["filter"] | settings
+    return make(Filtered, settings, run, curriculum=curriculum)
 
 
-@checked
-@_takes_numbers_of(Modelled)
-def modelled(curriculum: Curriculum, task: Any, /, **numbers: Any) -> Modelled:
-    """A curriculum that asks a model of outcomes wherever it would ask about performance.
+def modelled(curriculum: Curriculum, settings: Mapping[str, Any], run: Components) -> Modelled:
+    """Makes a curriculum that asks a model of outcomes wherever it would ask about performance.
 
     Raises:
         ArgumentError: if the task's levels have no features.
     """
-    task.features(task.space.sample(1, Streams(0).generator())[None])
-    return Modelled(curriculum, task.features, **numbers)
+    run.task.features(run.task.space.sample(1, Streams(0).generator())[None])
+    return make(Modelled, settings, run, curriculum=curriculum)
 
 
-def _part(make: Callable[..., T], numbers: dict[str, Any]) -> T:
-    """A part of a curriculum, of its own among the numbers; the others remain there."""
-    own = inspect.signature(make).parameters.keys() & numbers.keys()
-    return make(**{name: numbers.pop(name) for name in own})
+def target(target: Distribution) -> SamplingCurriculum:
+    """Trains on the target distribution itself: the paper's baseline."""
+    return SamplingCurriculum(target)
 
 
-def _of_task(make: Callable[..., Curriculum], *parts: str) -> Callable[..., Curriculum]:
-    """The factory of a curriculum of which the task gives the first arguments, by these names."""
-
-    @_takes_numbers_of(make)
-    def factory(run: Components, /, **numbers: Any) -> Curriculum:
-        if "target_shares" in parts:
-            _require_target_shares(run.task)
-        return make(*(getattr(run.task, part) for part in parts), **numbers)
-
-    factory.__doc__ = f"Make a :class:`~{make.__module__}.{make.__qualname__}` for the run's task."
-    return factory
-
-
-def _require_target_shares(task: Task) -> None:
-    if not isinstance(task, LocatedTarget):
-        raise TypeError(
-            f"this curriculum goes by where the target lies: {type(task).__name__} must "
-            "define target_shares, the target as shares of the space's bins"
-        )
-
-
-target = _of_task(SamplingCurriculum, "target")
-"""Train on the target distribution itself (the paper's baseline)."""
-domain_randomization = _of_task(SamplingCurriculum, "space")
-"""Train on levels drawn uniformly from the Proposer's space."""
-alp_gmm = _of_task(MixtureCurriculum, "space")
-learning_progress = _of_task(LearningProgressCurriculum, "space")
-first_order_gain = _of_task(FirstOrderCurriculum, "space", "target")
-currot = _of_task(TransportCurriculum, "space", "target_shares")
-first_order_sampled = _of_task(SampledFirstOrderCurriculum, "space", "target_shares")
+def domain_randomization(space: Space) -> SamplingCurriculum:
+    """Trains on levels drawn uniformly from the Proposer's space."""
+    return SamplingCurriculum(space)
 
 
 @checked
@@ -294,43 +285,13 @@ def frozen_proposer(components: Components, checkpoint: str | None) -> ProposerC
     )
 
 
-@_takes_numbers_of(Scorer, ReplayRule, ReplayCurriculum, given="edit")
-def replay(
-    components: Components, new_levels: dict[str, list[float]] | None = None, **numbers: Any
-) -> ReplayCurriculum:
-    """Train on levels that are kept by their scores.
-
-    Args:
-        components: the task.
-        new_levels: the bins that new levels come from: for some of the space's axes, by name, the
-            values that count; None for the whole space.
-        numbers: those of :class:`Scorer`, :class:`ReplayRule` and :class:`ReplayCurriculum`.
-    """
-    task = components.task
-    try:
-        new = task.space if new_levels is None else SomeBins(task.space, new_levels)
-    except ArgumentError as error:
-        raise ArgumentError(f"new_levels.{str(error).removeprefix('values.')}") from error
-    scorer, rule = _part(Scorer, numbers), _part(ReplayRule, numbers)
-    curriculum = ReplayCurriculum(new, scorer, rule, edit=getattr(task, "edit", None), **numbers)
-    curriculum.check(len(components.seeds))
-    return curriculum
-
-
-@_takes_numbers_of(Scorer, SelectionCurriculum)
-def learnability(components: Components, **numbers: Any) -> SelectionCurriculum:
-    """Train on levels that stood out among many, and on new ones."""
-    return SelectionCurriculum(components.task.space, _part(Scorer, numbers), **numbers)
-
-
-@_takes_numbers_of(FirstOrderProposer, given="probe_levels")
 def first_order_proposer(
     components: Components,
     epochs: Count,
     learning_rate: Positive,
     entropy_coeff: NotNegative,
     checkpoint: str | None = None,
-    **numbers: Any,
+    **settings: Any,
 ) -> FirstOrderProposer:
     """Makes a Proposer that is rewarded for each problem with its first-order share of the gain.
 
@@ -341,34 +302,27 @@ def first_order_proposer(
         learning_rate: of the policy.
         entropy_coeff: of the policy.
         checkpoint: of such a policy that has learnt; None for a new one.
-        numbers: see :class:`FirstOrderProposer`.
+        settings: see :class:`FirstOrderProposer`.
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
-    return FirstOrderProposer(*policy, probe_levels=components.proposer.probe_levels, **numbers)
+    return make(FirstOrderProposer, settings, components, **policy)
 
 
-@_takes_numbers_of(SampledFirstOrderProposer, given="probe_levels")
 def first_order_proposer_sampled(
     components: Components,
     epochs: Count,
     learning_rate: Positive,
     entropy_coeff: NotNegative,
     checkpoint: str | None = None,
-    **numbers: Any,
+    **settings: Any,
 ) -> SampledFirstOrderProposer:
     """Makes a Proposer that is rewarded by the Solver's own training episodes, without an oracle.
 
-    The arguments are those of :func:`first_order_proposer`; ``numbers`` those of
+    The arguments are those of :func:`first_order_proposer`; ``settings`` those of
     :class:`SampledFirstOrderProposer`.
-
-    Raises:
-        TypeError: if the task does not say where its target lies.
     """
-    task: Any = components.task
-    _require_target_shares(task)
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
-    probes = components.proposer.probe_levels
-    return SampledFirstOrderProposer(*policy, task.target_shares, probe_levels=probes, **numbers)
+    return make(SampledFirstOrderProposer, settings, components, **policy)
 
 
 def paired(
@@ -393,9 +347,7 @@ def paired(
             "continue_episodes=True: the second Solver trains on whole levels, an update for each "
             "of the first one's; give False"
         )
-    antagonist = TaskStudent(task, second)
-    probes = components.proposer.probe_levels
-    return PairedProposer(*policy, probe_levels=probes, antagonist=antagonist)
+    return make(PairedProposer, {}, components, antagonist=TaskStudent(task, second), **policy)
 
 
 def _problem_policy(
@@ -404,10 +356,10 @@ def _problem_policy(
     learning_rate: float,
     entropy_coeff: float,
     checkpoint: str | None,
-) -> tuple[Space, Distribution, ActorCritic, PPOSettings]:
-    """Returns space, target, a policy that draws each problem by itself, and its PPO's numbers."""
+) -> dict[str, Any]:
+    """Returns a policy that draws each problem by itself, its PPO's numbers, and its probes."""
     _one_solver(components)
-    task, config = components.task, components.proposer
+    config = components.proposer
     action = config.action if isinstance(config.action, ProblemSettings) else ProblemSettings()
     if action.ratio == "joint":
         raise ProposerError("action.ratio=joint: here each draw is rewarded by itself")
@@ -415,7 +367,8 @@ def _problem_policy(
     numbers = replace(
         config.ppo, epochs=epochs, learning_rate=learning_rate, entropy_coeff=entropy_coeff
     )
-    return task.space, task.target, agent, PPOSettings(horizon=1, **asdict(numbers))
+    settings = PPOSettings(horizon=1, **asdict(numbers))
+    return {"agent": agent, "settings": settings, "probe_levels": config.probe_levels}
 
 
 def _agent(components: Components, config: ProposerSettings, checkpoint: str | None) -> ActorCritic:

@@ -10,6 +10,8 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
+from inspect import isfunction
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +23,7 @@ CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.par
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
 CONSTANTS = {"null", "true", "false", "nan", "inf"}
 MISSING = "???"  # in a file: to be given
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # in a file: to another setting
 KEYS = {"task": ("task",), "method": ("curriculum", "model")}
 """Below which keys of the configuration the settings of a group's files stand."""
 
@@ -91,13 +94,17 @@ def own_recipe(
     Raises:
         ArgumentError: if it cannot be imported by its name.
     """
-    name = f"{make.__module__}.{make.__qualname__}"
-    if make.__module__ == "__main__" or "<" in name:
+    return Recipe(group, make.__name__, settings, _dotted("make", make))
+
+
+def _dotted(name: str, function: Any) -> str:
+    dotted = f"{function.__module__}.{function.__qualname__}"
+    if function.__module__ == "__main__" or "<" in dotted:
         raise _refusal(
-            f"make={name}: must be importable, as a class or function of a module is, so that "
+            f"{name}={dotted}: must be importable, as a class or function of a module is, so that "
             "watch, eval and play can make it again"
         )
-    return Recipe(group, make.__name__, settings, name)
+    return dotted
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
@@ -170,11 +177,13 @@ def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
 
 
 def override(key: str, value: Any) -> str:
-    """A key and its value as an override of Hydra's.
+    """A key and its value, of a function its dotted name, as an override of Hydra's.
 
     Raises:
         ArgumentError: naming the key, as :func:`override_value`.
     """
+    if isfunction(value):
+        value = _dotted(key.lstrip("+"), value)
     try:
         return f"{key}={override_value(value)}"
     except ValueError as error:
@@ -226,10 +235,26 @@ def file_content(name: str) -> dict[str, Any]:
         if isinstance(default, str) and default != "_self_":
             base = default.removesuffix("@_global_").removeprefix("/")
             parts.append(file_content(base if "/" in base else f"{group}/{base}"))
+    return merged(*parts, content)
+
+
+def merged(*settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings below some keys, those of later ones over those before; None in place of all."""
     found: dict[str, Any] = {}
-    for part in (*parts, content):
-        for key, value in part.items():
-            found[key] = (found.get(key) or {}) | value if isinstance(value, dict) else value
+    for some in settings:
+        for key, value in some.items():
+            own = isinstance(value, Mapping)
+            found[key] = {**(found.get(key) or {}), **value} if own else value
+    return found
+
+
+def resolved(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a file, with what they refer to in ``train.yaml`` in its place."""
+    train, found = yaml_file("train"), dict(settings)
+    for name, value in settings.items():
+        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
+        if reference is not None:
+            found[name] = reduce(lambda place, key: place[key], reference[1].split("."), train)
     return found
 
 

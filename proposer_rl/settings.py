@@ -104,7 +104,10 @@ def signed(made: type[T]) -> type[T]:
 
 
 def arguments(
-    function: Callable[..., Any], values: Mapping[str, Any], given: Collection[str] = ()
+    function: Callable[..., Any],
+    values: Mapping[str, Any],
+    given: Collection[str] = (),
+    others: Collection[str] = (),
 ) -> dict[str, Any]:
     """Check arguments against the signature of what will be called with them.
 
@@ -117,6 +120,7 @@ def arguments(
         function: a class or function.
         values: by name.
         given: names of arguments that it gets otherwise.
+        others: names of values that something else will be called with, which stay as they are.
 
     Returns:
         The same arguments, with the values as the signature's types have them.
@@ -136,7 +140,7 @@ def arguments(
         ...
         proposer_rl.settings.ArgumentError: rat: unknown; there are: rate, source
     """
-    check_names(function, values, given)
+    check_names(function, values, given, others=others)
     return _checked_values(function, values)
 
 
@@ -145,11 +149,12 @@ def check_names(
     values: Mapping[str, Any],
     given: Collection[str] = (),
     missing: bool = True,
+    others: Collection[str] = (),
 ) -> None:
     """Refuse unknown names, and if asked those that are missing; see :func:`arguments`."""
     parameters = inspect.signature(function).parameters.values()
     named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-    known = [p.name for p in named if p.name not in ("self", *given)]
+    known = [*others, *(p.name for p in named if p.name not in ("self", *given))]
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
     for name in values:
         if name not in known and not takes_any:

@@ -235,7 +235,7 @@ WRONG_COMMANDS = [
     (["+method=hand_designed", "curriculum.until=3"], "curriculum.until=3: input should be a"),
     (["+method=target", "checkpoint=other"], "checkpoint=other: method=target takes none; those"),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
-    (["+method=plr", "+curriculum.x=1"], "curriculum.x: unknown; there are: new_levels, score,"),
+    (["+method=plr", "+curriculum.x=1"], "curriculum.x: unknown; there are: score, source,"),
     (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
     (["+method=perf_gain", "+ablation=paper_literal", "+scale=quick"], "+scale: must come before"),

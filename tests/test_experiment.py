@@ -177,10 +177,10 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
     class Demanding(SamplingCurriculum):
-        needs = ("episode_law",)
+        needs = ("optimal_return",)
 
     cars = mountain_cars()
-    with pytest.raises(UnfitStudentError, match="Demanding needs a student with episode_law"):
+    with pytest.raises(UnfitStudentError, match="Demanding needs a student with optimal_return"):
         Experiment(
             cars,
             cars.learner([Streams(0)]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from datetime import datetime
 from io import BytesIO, TextIOWrapper
@@ -35,6 +36,7 @@ from proposer_rl.recipes import (
     recipe_function,
 )
 from tests.commands import trained_run
+from tests.curricula.test_scores import DOTTED, shortfall
 from tests.same_run import assert_same_run
 from tests.tiny import EXAMPLES
 
@@ -197,9 +199,37 @@ def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.Mon
     assert run.summary["method"] == "again"
 
 
-def test_what_cannot_be_imported_again_is_refused() -> None:
+def test_a_score_of_ones_own_in_a_run_and_in_a_teacher(tmp_path: Path) -> None:
+    small: dict[str, Any] = {"score": shortfall, "capacity": 16, "fill": 0.5}
+    curriculum = prl.curricula.plr(**small)
+    run = prl.train("maze", curriculum, updates=2, folder=tmp_path / "python", **SMOKE)
+    words = ["+method=plr", "+scale=smoke", "curriculum.capacity=16", "curriculum.fill=0.5"]
+    words += [f"curriculum.score={DOTTED}", "schedule.updates=2", "compute.progress=false"]
+    assert_same_run(run.folder, trained_run(tmp_path / "shell", *words))
+    assert json.loads((run.folder / "config.json").read_text())["curriculum"]["score"] == DOTTED
+
+    around = {"score": lambda student, outcome: -outcome["return"], "source": "episodes"}
+    teacher = prl.Teacher(
+        curriculum,
+        prl.Parameters({"gravity": (0.0, 1.0)}),
+        filter={**around, "times": 2},
+        block=8,
+        play=lambda levels, generator: {"return": levels["gravity"]},
+    )
+    ids, levels = teacher.ask(8)
+    teacher.tell(ids, levels["gravity"])
+    teacher.ask(8)  # by which the outcomes have been taken
+    mean = float(1 - levels["gravity"].mean())
+    assert teacher.log()["mean_score"] == pytest.approx([mean])
+    assert teacher.state_dict()["of"]["curriculum"]["score"] == "shortfall"
+
+
+def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(prl.ArgumentError, match="must be importable"):
         own_recipe("method", lambda parts: None)
+    curriculum = prl.curricula.plr(score=lambda student, outcome: outcome["return"])
+    with pytest.raises(prl.ArgumentError, match=r"^curriculum\.score=.*: must be importable"):
+        prl.train("maze", curriculum, folder=tmp_path / "run", **SMOKE)
 
 
 @pytest.mark.parametrize(

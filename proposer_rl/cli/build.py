@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import RunConfig, curriculum_maker, key, task_maker
+from proposer_rl.cli.config import CANNOT_BE_CALLED, RunConfig, key, located, task_maker
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
@@ -18,7 +18,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
-from proposer_rl.methods import Components, ProposerError, Workers, filtered, modelled
+from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
 from proposer_rl.models import available_cores, own_state, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals, memory
@@ -126,12 +126,12 @@ def _curriculum(
         signals.check()
 
     workers = _workers(config, task)
-    components = Components(task, config.proposer, config.seeds, on_update, workers)
+    run = Components(task, config.proposer, config.seeds, on_update, workers)
     with (
-        key("curriculum", "curriculum: ", (TypeError, ValueError)),
+        key("curriculum", "curriculum: ", CANNOT_BE_CALLED),
         key("proposer", kinds=(ProposerError,)),
     ):
-        curriculum = curriculum_maker(config.curriculum)(components)
+        curriculum = make(*located("curriculum", config.curriculum), run)
         if not isinstance(curriculum, Curriculum):
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
@@ -146,10 +146,10 @@ def _curriculum(
         _check_cycle(config)
     if config.filter is not None:
         with key("filter"):
-            curriculum = filtered(curriculum, **config.filter)
+            curriculum = filtered(curriculum, config.filter, run)
     if config.model is not None:
         with key("model"):
-            curriculum = modelled(curriculum, task, **config.model)
+            curriculum = modelled(curriculum, config.model, run)
     return curriculum
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,8 @@ LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
+# Bad input, and what is said of annotations that name nothing.
+CANNOT_BE_CALLED = (ValueError, TypeError, NameError)
 
 
 @contextmanager
@@ -180,39 +182,27 @@ def read_config(config: DictConfig) -> RunConfig:
 
 def task_maker(values: Mapping[str, Any]) -> partial[Any]:
     """What makes the task of these settings, given ``solver`` and ``context``."""
-    return _maker("task", values, lambda _: GIVEN_TO_TASKS)
+    target = f"task._target_={values.get('_target_')}"
+    make, own = located("task", values)
+    for missing in set(GIVEN_TO_TASKS) - {*inspect.signature(make).parameters}:
+        raise ConfigError(f"{target}: makes no task: it takes no argument {missing!r}")
+    with key("task", f"{target}: ", CANNOT_BE_CALLED):
+        return partial(make, **arguments(make, own, GIVEN_TO_TASKS))
 
 
-def curriculum_maker(values: Mapping[str, Any]) -> partial[Any]:
-    """What makes the curriculum of these settings, given its parts as the first argument."""
-    return _maker("curriculum", values, lambda names: names[:1])
-
-
-def _maker(
-    name: str, values: Mapping[str, Any], given: Callable[[list[str]], Sequence[str]]
-) -> partial[Any]:
-    """The callable that ``_target_`` names with its arguments, of which some may be made, too."""
+def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Returns what ``_target_`` names, and the other settings, some of which are made by Hydra."""
     target = values.get("_target_")
     if not isinstance(target, str):
         raise ConfigError(f"{name}._target_: missing: the class or function that makes the {name}")
     try:
         made = instantiate({**values, "_partial_": True}, _convert_="all")
-        known = [*inspect.signature(made.func).parameters]
+        inspect.signature(made.func)
     except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
         inner = re.search(r"full_key: (\w+?)\W*\d*\W*$", str(error))  # of a list the place, too
         wrong = f"{name}.{inner[1]}" if inner else f"{name}._target_={target}"
         raise ConfigError(f"{wrong}: {_why_not_found(error)}") from error
-    others = given(known)
-    for missing in set(others) - set(known):
-        raise ConfigError(
-            f"{name}._target_={target}: makes no {name}: it takes no argument {missing!r}"
-        )
-    try:
-        return partial(made.func, **arguments(made.func, made.keywords, others))
-    except ArgumentError as error:
-        raise ConfigError(f"{name}.{error}") from error
-    except (NameError, TypeError) as error:  # of annotations that name nothing
-        raise ConfigError(f"{name}._target_={target}: {one_line(error)}") from error
+    return made.func, made.keywords
 
 
 def saved_config(folder: Path) -> RunConfig:

@@ -20,13 +20,10 @@ and the expectation of 1 / (1 + exp(-z)) about
 (MacKay 1992, "The evidence framework applied to classification networks", Neural Computation 4):
 near one half where there are no data, whatever beta says.
 
-Mean and spread of the return come from linear regressions. With r_i the returns, brought to mean 0
-and deviation 1 by their weights,
+The mean of the return comes from a linear regression. With r_i the returns, brought to mean 0 and
+deviation 1 by their weights,
 
-    minimise  sum_i w_i (r_i - a . phi_i)^2 + ridge |a|^2,
-    minimise  sum_i w_i ((r_i - a . phi_i)^2 - b . phi_i)^2 + ridge |b|^2,
-
-and the variance of a level's return is max(b . phi, 0), in units of the returns again.
+    minimise  sum_i w_i (r_i - a . phi_i)^2 + ridge |a|^2.
 """
 
 from __future__ import annotations
@@ -164,12 +161,12 @@ class OutcomeModel:
     def predict(self, features: Tensor) -> TensorDict:
         """Predicts the outcome of levels with features float64 [K, n, F]: a tensordict [K, n].
 
-        ``success``, ``return`` and ``spread``, the variance of the return, each float64. Before
-        there is any row they are 0.5, 0 and 0 everywhere.
+        ``success`` and ``return``, each float64. Before there is any row they are 0.5 and 0
+        everywhere.
         """
         shape = features.shape[:2]
         if not self._batches:
-            same = {"success": 0.5, "return": 0.0, "spread": 0.0}
+            same = {"success": 0.5, "return": 0.0}
             return TensorDict({k: features.new_full(shape, v) for k, v in same.items()}, shape)
         self._fitted = fitted = self._fitted or self._fit()
         phi = torch.cat([torch.zeros_like(features[..., :1]), features], -1)  # of age 0
@@ -179,7 +176,6 @@ class OutcomeModel:
             {
                 "success": (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid(),
                 "return": fitted.middle + fitted.unit * _times(phi, fitted.mean),
-                "spread": fitted.unit**2 * _times(phi, fitted.spread).clamp(min=0),
             },
             shape,
         )
@@ -219,14 +215,11 @@ class OutcomeModel:
         unit = unit.where(unit > EQUAL * (1 + middle.abs()), 1.0)  # returns that are all alike
         phi = torch.cat([-ages.unsqueeze(-1), entries["features"]], -1)
         returns = (entries["return"] - middle) / unit
-        mean = linear_ridge(phi, returns, weights, self._ridge)
-        residuals = (returns - _times(phi, mean)).square()
         return _Fitted(
             *logistic_ridge(phi, self.labels(entries), weights, self._ridge),
             middle,
             unit,
-            mean,
-            linear_ridge(phi, residuals, weights, self._ridge),
+            linear_ridge(phi, returns, weights, self._ridge),
         )
 
 
@@ -385,7 +378,6 @@ class _Fitted(NamedTuple):
     middle: Tensor
     unit: Tensor
     mean: Tensor
-    spread: Tensor
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

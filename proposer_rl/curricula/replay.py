@@ -17,7 +17,7 @@ One loop with options, which is what the methods differ in:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from annotated_types import Interval
@@ -26,6 +26,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import (
     CPU,
+    SomeBins,
     device_of,
     fresh_levels,
     level_keys,
@@ -50,7 +51,7 @@ from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, Levels
+from proposer_rl.task import Distribution, Levels, Space
 
 Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
 """Levels [K, n] after so many small random edits each, student k's from generator k."""
@@ -64,9 +65,11 @@ class ReplayCurriculum(Curriculum):
     """Draws each student's batch from a buffer of levels by their scores.
 
     Args:
-        new_levels: where levels come from that are not edited.
+        space: where levels come from that are not edited.
         scorer: of levels.
         rule: how levels are drawn, and which one makes room for another.
+        new_levels: of the space, the bins that they come from: for some of its axes, by name, the
+            values that count; None for the whole space.
         capacity: levels N of the buffer.
         fill: share of the capacity that must have been scored before any is replayed.
         replay_probability: q; has no effect where ``synchronous``.
@@ -81,6 +84,7 @@ class ReplayCurriculum(Curriculum):
             on.
         co_learnability: what is added to the scores of the levels trained on before, for each unit
             by which the scores of those trained on now have fallen (TRACED, arXiv 2506.19997).
+        seeds: of the students; as many as there are of them can be refused at once.
 
     Raises:
         DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
@@ -93,10 +97,11 @@ class ReplayCurriculum(Curriculum):
     @checked
     def __init__(
         self,
-        new_levels: Distribution,
+        space: Distribution,
         scorer: Scorer,
         rule: ReplayRule | None = None,
         *,
+        new_levels: dict[str, list[float]] | None = None,
         capacity: Count = 4000,
         fill: Positive = 0.5,
         replay_probability: Annotated[float, Interval(gt=0, le=1)] = 0.5,
@@ -107,6 +112,7 @@ class ReplayCurriculum(Curriculum):
         parents: Parents = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
+        seeds: Sequence[int] = (0,),
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
         if train_on_new and synchronous:
@@ -129,12 +135,19 @@ class ReplayCurriculum(Curriculum):
         aside = not train_on_new or edits or renew
         self.needs = scorer.needs if aside else scorer.asks
         self.reads = (*scorer.reads, "rollout") if self._easy else scorer.reads
-        self.scorer, self._new_levels, self._rule = scorer, new_levels, rule or ReplayRule()
+        self._new_levels = space
+        if new_levels is not None:
+            try:
+                self._new_levels = SomeBins(cast(Space, space), new_levels)
+            except ArgumentError as error:
+                said = str(error).removeprefix("values.")
+                raise ArgumentError(f"new_levels.{said}") from error
+        self.scorer, self._rule = scorer, rule or ReplayRule()
         self._capacity, self._warm = capacity, fill * capacity
         self._probability = replay_probability
         self._synchronous, self._train_on_new = synchronous, train_on_new
         self._renew, self._co_learnability = renew, co_learnability
-        self._template = new_levels.sample(1, torch.Generator())[0]
+        self._template = self._new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, 0, self._capacity)
         self._inbox = Inbox(self._template)
@@ -145,6 +158,7 @@ class ReplayCurriculum(Curriculum):
         self._before: dict[str, Tensor] = {}
         self._scored = 0  # new levels of each student
         self._came_back = {"levels": 0, "replayed": 0}
+        self.check(len(seeds))
 
     def check(self, students: int) -> None:
         """Refuses several students, if each would decide by itself how many new levels to score.

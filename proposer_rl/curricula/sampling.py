@@ -44,7 +44,7 @@ class SelectionCurriculum(Curriculum):
     while the student trains.
 
     Args:
-        new_levels: where levels come from.
+        space: where levels come from.
         scorer: of them.
         candidates: levels M that are scored for each student.
         keep: of them.
@@ -60,7 +60,7 @@ class SelectionCurriculum(Curriculum):
     @checked
     def __init__(
         self,
-        new_levels: Distribution,
+        space: Distribution,
         scorer: Scorer,
         *,
         candidates: Count = 2048,
@@ -72,8 +72,8 @@ class SelectionCurriculum(Curriculum):
             raise ArgumentError(f"keep={keep}: must be at most candidates={candidates}")
         self.needs, self.reads = scorer.needs, scorer.plays_for
         self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
-        self._new_levels, self.scorer = new_levels, scorer
-        self._template = new_levels.sample(1, torch.Generator())[0]
+        self._new_levels, self.scorer = space, scorer
+        self._template = space.sample(1, torch.Generator())[0]
         self._proposed = 0
         self.kept: Levels = self._template.expand(0, keep)  # [K, keep], by falling score
         self.scores = torch.zeros(0)  # float64 [K, keep]

@@ -11,28 +11,27 @@ With V the critic, gamma the discount and lambda the decay of the traces,
 
 the error of one step, A_t the generalised advantage, which is the sum of
 (gamma lambda)^i delta_(t+i), p the probability of success, J the expected return, J* the largest
-that any policy reaches, and R the highest return ever seen on the level, or from evaluation the
-expected highest of as many episodes as ``rollouts``:
+that any policy reaches, and R the highest return ever seen on the level:
 
 =======================  =============================  ====================================
 score                    from episodes                  from evaluation
 =======================  =============================  ====================================
 positive_value_loss      mean of max(A_t, 0)
 l1_value_loss            mean of abs(A_t)
-one_step_td_error        mean of abs(delta_t)           its expectation
-max_mc                   mean of R - V(s_t)             its expectation
+max_mc                   mean of R - V(s_t)
 learnability             p (1 - p) of the share p       p (1 - p)
-return_variance          that of the returns            that of the return
 regret                   R - mean return                J* - J
-spread                                                  return_variance by a model, scaled
-gradient_norm            the same of a policy gradient  squared norm of the gradient of J
+gradient_norm            squared norm of a policy       squared norm of the gradient of J
+                         gradient
 =======================  =============================  ====================================
+
+Another score is a function of one's own, of outcomes: see :class:`Scorer`.
 
 Where a loop gives what came of an episode but no rollout, the episode counts as one step, and in
 the critic's place stands the return of the level when it was trained on before (of a new level the
 mean of these over the buffer): value losses are then absolute learning progress (Portelas et al.
-2019, arXiv 1910.07224), and only ``return_variance`` and ``gradient_norm`` cannot be had. A score
-that the loop gives itself takes the place of all this.
+2019, arXiv 1910.07224), and only ``gradient_norm`` cannot be had. A score that the loop gives
+itself takes the place of all this.
 
 Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
 MaxMC: the latter, appendix; learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4),
@@ -44,39 +43,70 @@ the optimum.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pkgutil import resolve_name
 from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.exact_scores import EXACT, in_coins
+from proposer_rl.curricula.contract import outcome_of
 from proposer_rl.curricula.student import VALUE, Student, advantages
 from proposer_rl.learning import succeeded
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels
+from proposer_rl.task import Levels, NoSuccessError
 
 Source = Literal["episodes", "exact"]
 
+OwnScore = Callable[[Student, TensorDictBase], Tensor]
+"""A score of levels [K, n] by what came of episodes on them: float [K, n].
+
+Called with the student, whose ``gamma`` and ``lmbda`` are those of a critic if there is one, and
+the outcome, see :func:`~proposer_rl.curricula.outcome_of`. Higher is more to learn; minus infinity
+where nothing can be said.
+"""
+
 ASKS = {"gradient_norm": ("policy_gradient_norms",)}  # of a student, from episodes
-READS = {
-    "learnability": ("success",),
-    "return_variance": ("rollout",),
-    "gradient_norm": ("rollout",),
-}
+READS = {"learnability": ("success",), "gradient_norm": ("rollout",)}
 AT_ONCE = 1024  # levels of each Solver that are evaluated at once
 
 STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
     "positive_value_loss": lambda student, rollout, _: advantages(student, rollout).clamp_min(0),
     "l1_value_loss": lambda student, rollout, _: advantages(student, rollout).abs(),
-    "one_step_td_error": lambda student, rollout, _: advantages(student, rollout, lmbda=0.0).abs(),
     "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double(),
 }
 """Scores of every single step of a rollout [K, P, T], float64 and of that shape.
 
 The last argument is R, the highest return ever seen on each level, [K, P].
 """
+
+
+def learnability(student: Student, levels: Levels) -> Tensor:
+    """Returns p (1 - p) of the probability p of success, float [K, n].
+
+    Raises:
+        NoSuccessError: if there is no success.
+    """
+    performance = student.exact_performance(levels)
+    if "success" not in performance.keys():
+        raise NoSuccessError(
+            "learnability: this task tells no success, only the return; of the scores regret and "
+            "gradient norms take that"
+        )
+    success = performance["success"]
+    return success * (1 - success)
+
+
+EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = {
+    "learnability": (("exact_performance",), learnability),
+    "regret": (
+        ("optimal_return", "exact_performance"),
+        lambda s, levels: s.optimal_return(levels) - s.exact_performance(levels)["return"],
+    ),
+    "gradient_norm": (("gradient_norms",), lambda s, levels: s.gradient_norms(levels)),
+}
+"""Of each score what it needs of a student, and what it is: float [K, n] of levels [K, n]."""
 
 
 class Episodes(NamedTuple):
@@ -88,7 +118,6 @@ class Episodes(NamedTuple):
         ended: episodes of each level, int64 [K, P].
         successes: those of them that were a success, int64 [K, P].
         total: sum of their undiscounted returns, float64 [K, P].
-        squares: sum of the squares of these, float64 [K, P].
         best: the highest of these, float64 [K, P]; minus infinity without episodes.
     """
 
@@ -96,7 +125,6 @@ class Episodes(NamedTuple):
     ended: Tensor
     successes: Tensor
     total: Tensor
-    squares: Tensor
     best: Tensor
 
 
@@ -116,7 +144,6 @@ def episodes(rollout: TensorDictBase) -> Episodes:
         ended=count,
         successes=(succeeded(rollout) & done).sum(-1),
         total=returns.where(exists, 0.0).sum(-1),
-        squares=returns.square().where(exists, 0.0).sum(-1),
         best=returns.where(exists, -torch.inf).amax(-1),
     )
 
@@ -139,13 +166,13 @@ def unseen(shape: Sequence[int]) -> Tensor:
 
 
 class Scorer:
-    """One of the scores, from one of its sources.
+    """One of the scores, from one of its sources, or a function of one's own.
 
     Args:
-        score: its name; see the table above.
+        score: its name, see the table above; or, from episodes, an :data:`OwnScore` or the dotted
+            name of one, ``my_module.my_score``.
         source: whether it is read off episodes or asked of the student.
-        rollouts: played on each level that is scored without training on it, from episodes;
-            from evaluation, the episodes of which ``max_mc`` takes the expected highest return.
+        rollouts: played on each level that is scored without training on it, from episodes.
 
     Attributes:
         from_episodes: whether levels are scored by playing on them.
@@ -161,20 +188,22 @@ class Scorer:
     plays_for: tuple[str, ...] = ()
 
     @checked
-    def __init__(self, score: str, source: Source, rollouts: Count = 1) -> None:
-        self._name, self.rollouts, self.from_episodes = score, rollouts, source == "episodes"
-        available = {
-            "episodes": [*STEPWISE, "learnability", "return_variance", "regret", "gradient_norm"],
-            "exact": [*EXACT],
-        }[source]
-        if score not in available:
-            raise ArgumentError(f"score={score!r}: from source={source} there are {available}")
+    def __init__(self, score: str | OwnScore, source: Source, rollouts: Count = 1) -> None:
+        self.rollouts, self.from_episodes = rollouts, source == "episodes"
+        self._own = _own_score(score)
+        self._name = name = score if isinstance(score, str) else score.__qualname__
+        available = [*STEPWISE, *READS, "regret"] if self.from_episodes else [*EXACT]
+        if self._own is None and name not in available:
+            more = ", and functions of your own, as my_module.my_score" * self.from_episodes
+            raise ArgumentError(f"score={name!r}: from source={source} there are {available}{more}")
+        if self._own is not None and not self.from_episodes:
+            raise ArgumentError(f"score={name}: a function of your own needs source=episodes")
         if self.from_episodes:
-            self.asks: tuple[str, ...] = ASKS.get(score, ())
-            self.reads: tuple[str, ...] = READS.get(score, ())
+            self.asks: tuple[str, ...] = ASKS.get(name, ())
+            self.reads: tuple[str, ...] = READS.get(name, ())
             self.needs: tuple[str, ...] = ("play", *self.asks)
         else:
-            self.asks, self.reads = EXACT[score][0], ()
+            self.asks, self.reads = EXACT[name][0], ()
             self.needs = self.asks
         self.plays_for = tuple(entry for entry in self.reads if entry != "rollout")
 
@@ -200,7 +229,10 @@ class Scorer:
         for entry in self.reads:
             if not {entry, "rollout"} & {*outcome.keys()}:
                 raise ValueError(f"score={self._name}: the outcome has no {entry}")
-        if "rollout" in outcome.keys():
+        if self._own is not None:
+            reached = outcome["return"].float().cpu()
+            scored = Scored(self._by_own(student, outcome), torch.maximum(best, reached))
+        elif "rollout" in outcome.keys():
             scored = self.of_rollouts(student, [outcome["rollout"]], best)
         else:
             told = {name: entry.cpu() for name, entry in outcome.items()}
@@ -222,7 +254,7 @@ class Scorer:
         """
         split = [episodes(rollout) for rollout in rollouts]
         _, *numbers = zip(*split, strict=True)  # weights may be of several lengths
-        ended, successes, total, squares, highest = map(torch.stack, numbers)
+        ended, successes, total, highest = map(torch.stack, numbers)
         count, some = ended.sum(0), ended.sum(0).clamp(1)
         best = torch.maximum(best.to(count.device).double(), highest.amax(0))
         mean = total.sum(0) / some
@@ -238,8 +270,6 @@ class Scorer:
             score = torch.stack(each).sum(0) / some
         elif self._name == "regret":
             score = best - mean
-        elif self._name == "return_variance":
-            score = (squares.sum(0) / some - mean.square()).clamp_min(0)
         else:
             share = successes.sum(0) / some
             score = share * (1 - share)
@@ -274,20 +304,54 @@ class Scorer:
                     )
                     for again in range(self.rollouts)
                 ]
-                if "next" in played[0].keys():
-                    scored.append(self.of_rollouts(student, played, unseen(some.shape[:2])))
-                else:
-                    told: Any = torch.stack(played).cpu()  # [rollouts, K, P]
-                    mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
-                    outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
-                    scored.append(self.of_outcome(student, outcome, best, known[batch]))
+                scored.append(self._of_played(student, played, known[batch]))
             else:
                 _, ask = EXACT[self._name]
                 with torch.no_grad():
-                    score = ask(student, some, self.rollouts).double().cpu()
+                    score = ask(student, some).double().cpu()
                 scored.append(Scored(score, unseen(score.shape)))
-        score, best = (torch.cat(entries, 1) for entries in zip(*scored, strict=True))
-        return Scored(in_coins(score) if self._name == "spread" else score, best)
+        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
+
+    def _of_played(
+        self, student: Student, played: Sequence[TensorDictBase], before: Tensor
+    ) -> Scored:
+        """Score levels [K, n] by rollouts or outcomes of playing on them; see :meth:`__call__`."""
+        none, rollouts = unseen(before.shape), "next" in played[0].keys()
+        if self._own is not None:
+            outcomes = map(outcome_of, played) if rollouts else played
+            each = [self.of_outcome(student, outcome, none, before) for outcome in outcomes]
+            score, best = (torch.stack(entries) for entries in zip(*each, strict=True))
+            return Scored(score.mean(0), best.amax(0))
+        if rollouts:
+            return self.of_rollouts(student, played, none)
+        told: Any = torch.stack([*played]).cpu()  # [rollouts, K, P]
+        mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
+        outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
+        return self.of_outcome(student, outcome, best, before)
+
+    def _by_own(self, student: Student, outcome: TensorDictBase) -> Tensor:
+        """Returns one's own score of an outcome [K, n], float64."""
+        assert self._own is not None
+        score, shape = self._own(student, outcome), outcome.batch_size
+        if not isinstance(score, Tensor) or score.shape != shape or bool(score.isnan().any()):
+            raise ValueError(f"score={self._name}: must return a tensor {list(shape)} without NaN")
+        ended = outcome.get("episodes", torch.ones(shape)).cpu() > 0
+        return score.double().cpu().where(ended, -torch.inf)
+
+
+def _own_score(score: str | OwnScore) -> OwnScore | None:
+    """Returns the function that a score is or names with dots; None for one of the table."""
+    if not isinstance(score, str):
+        return score
+    if "." not in score:
+        return None
+    try:
+        found: OwnScore = resolve_name(score)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ArgumentError(f"score={score}: {error}") from error
+    if not callable(found):
+        raise ArgumentError(f"score={score}: must be a function")
+    return found
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
@@ -300,7 +364,6 @@ def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: 
     score = {
         "positive_value_loss": gained.clamp_min(0),
         "l1_value_loss": gained.abs(),
-        "one_step_td_error": gained.abs(),
         "max_mc": best - value,
         "regret": best - reached,
         "learnability": success * (1 - success),

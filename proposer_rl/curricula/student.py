@@ -31,8 +31,6 @@ from proposer_rl.meta.first_order import (
 )
 from proposer_rl.task import (
     DifferentiableTask,
-    EnumerableTask,
-    EpisodeLaw,
     Levels,
     OptimalTask,
     Task,
@@ -89,8 +87,6 @@ class Student:
     """Each student's behaviour on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
     optimal_return: Callable[[Levels], Tensor]
     """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
-    episode_law: Callable[[Levels], EpisodeLaw]
-    """The law of each student's episodes on levels [K, n]."""
     gradient_norms: Callable[[Levels], Tensor]
     """Squared length of the gradient of the return on each level, float [K, n]."""
     policy_gradient_norms: Callable[[TensorDictBase], Tensor]
@@ -196,7 +192,6 @@ class TaskStudent(Student):
         """Returns why the task does not allow the function of that name; None if it does."""
         kinds: dict[str, tuple[type, str]] = {
             "optimal_return": (OptimalTask, "optimal_return(levels)"),
-            "episode_law": (EnumerableTask, "episode_law(agent, levels)"),
             **dict.fromkeys(
                 ("gradient_norms", "target_direction", "alignment"),
                 (DifferentiableTask, "differentiable_performance(agent, levels)"),
@@ -231,11 +226,6 @@ class TaskStudent(Student):
 
     def _optimal_return(self, levels: Levels) -> Tensor:
         return cast(OptimalTask, self._task).optimal_return(levels)
-
-    @torch.no_grad()
-    def _episode_law(self, levels: Levels) -> EpisodeLaw:
-        self.spend(evaluations=levels.shape[-1])
-        return cast(EnumerableTask, self._task).episode_law(self._learner.agent, levels)
 
     def _gradient_norms(self, levels: Levels) -> Tensor:
         self.spend(evaluations=levels.shape[-1])

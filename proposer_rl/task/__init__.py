@@ -7,8 +7,6 @@ from proposer_rl.task.protocols import ComputeContext as ComputeContext
 from proposer_rl.task.protocols import DifferentiableTask as DifferentiableTask
 from proposer_rl.task.protocols import Distribution as Distribution
 from proposer_rl.task.protocols import EditableTask as EditableTask
-from proposer_rl.task.protocols import EnumerableTask as EnumerableTask
-from proposer_rl.task.protocols import EpisodeLaw as EpisodeLaw
 from proposer_rl.task.protocols import LevelResult as LevelResult
 from proposer_rl.task.protocols import Levels as Levels
 from proposer_rl.task.protocols import LocatedTarget as LocatedTarget

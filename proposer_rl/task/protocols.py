@@ -131,36 +131,6 @@ class OptimalTask(Protocol):
         """Returns the largest expected return that a policy reaches on levels [*B]: float [*B]."""
 
 
-class EpisodeLaw(NamedTuple):
-    """The law of a Solver's episodes on levels [*B], in two tables.
-
-    Attributes:
-        outcome: returns that an episode can have, float64 [*B, O].
-        probability: of each, float64 [*B, O].
-        weight: of every step that can be taken, a state with an action: the expectation of its
-            share of an episode's steps, float64 [*B, M]. So the sum of weight times any number is
-            the expectation of that number's mean over the steps of an episode.
-        reward: of the step, float64 [*B, M].
-        value: that the critic gives the state before it, float64 [*B, M].
-        next_value: the same of the state after it, 0 where the step terminates the episode.
-    """
-
-    outcome: Tensor
-    probability: Tensor
-    weight: Tensor
-    reward: Tensor
-    value: Tensor
-    next_value: Tensor
-
-
-@runtime_checkable
-class EnumerableTask(Protocol):
-    """A task all of whose episodes can be enumerated: exact scores of spread and of the critic."""
-
-    def episode_law(self, agent: ActorCritic, levels: Levels) -> EpisodeLaw:
-        """Returns the law of the episodes of K Solvers, each on its own levels [K, E]."""
-
-
 @runtime_checkable
 class EditableTask(Protocol):
     """A task whose levels can be changed a little."""

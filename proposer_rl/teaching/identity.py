@@ -32,16 +32,6 @@ def of_classes(curriculum: Curriculum) -> str:
     return type(curriculum).__qualname__ + within
 
 
-def plain(value: Any) -> Any:
-    """A setting as JSON has it; what JSON cannot hold by the name of its type."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    known = value is None or isinstance(value, bool | int | float | str)
-    return value if known else type(value).__qualname__
-
-
 def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Refuse the state of another one.
 

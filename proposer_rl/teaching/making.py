@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+import json
+from collections.abc import Mapping, Sequence
 from pkgutil import resolve_name
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, filtered, modelled
-from proposer_rl.recipes import Recipe, file_content, filter_content, recipe_function, yaml_file
-from proposer_rl.settings import ArgumentError, arguments
-from proposer_rl.teaching.identity import of_classes, plain
-
-REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # to another setting, as the files have them
-AROUND = ("filter", "model")  # what a curriculum is put into
+from proposer_rl.methods import Components, UnfitTaskError, filtered, make, modelled
+from proposer_rl.recipes import (
+    Recipe,
+    file_content,
+    filter_content,
+    merged,
+    recipe_function,
+    resolved,
+)
+from proposer_rl.settings import ArgumentError, plain
+from proposer_rl.teaching.identity import of_classes
 
 
 def make_curriculum(
@@ -31,74 +33,45 @@ def make_curriculum(
     Returns:
         The curriculum; its name or class and all settings that were said of it, for JSON.
     """
+    run = Components(space, ProposerSettings(), seeds)
     asked: dict[str, Any] = {}
     if isinstance(curriculum, str):
         curriculum = recipe_function("method", curriculum)()
     if isinstance(curriculum, Recipe):
-        file = {} if curriculum.target else file_content(f"method/{curriculum.name}")
-        asked = _merged({key: file[key] for key in AROUND if key in file}, curriculum.by_key())
-        named, settings = curriculum.name, _settings(curriculum, file)
-        curriculum = _made(curriculum, file, settings, space, seeds)
+        named, asked = curriculum.name, _settings(curriculum)
+        own = asked.pop("curriculum")
+        try:
+            curriculum = make(resolve_name(own.pop("_target_")), own, run)
+        except UnfitTaskError as error:
+            raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
     else:
-        named, settings = of_classes(curriculum), {}
+        named, own = of_classes(curriculum), {}
     if isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(curriculum).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
     if filter is not None:
-        asked = _merged(asked, filter_content(filter))
-    around = {key: asked[key] for key in AROUND if asked.get(key) is not None}
+        asked = merged(asked, filter_content(filter))
+    around = {key: asked[key] for key in ("filter", "model") if asked.get(key) is not None}
     if "filter" in around:
-        curriculum = filtered(curriculum, **around["filter"])
+        curriculum = filtered(curriculum, around["filter"], run)
     if "model" in around:
-        curriculum = modelled(curriculum, space, **around["model"])
-    return curriculum, plain({"kind": named, **settings, **around})
+        curriculum = modelled(curriculum, around["model"], run)
+    described = json.dumps(plain({"kind": named, **own, **around}), default=_name)
+    return curriculum, json.loads(described)
 
 
-def _settings(recipe: Recipe, file: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a curriculum itself: its file's, and over them the recipe's."""
+def _settings(recipe: Recipe) -> dict[str, Any]:
+    """The settings of a recipe by key, over those of its file."""
+    if recipe.target:
+        return {"curriculum": {**recipe.settings, "_target_": recipe.target}}
+    file = file_content(f"method/{recipe.name}")
     # What a file makes of a class of its own is the default of the function, too.
-    named = file.get("curriculum", {}).items()
+    named = file["curriculum"].items()
     there = {name: value for name, value in named if not isinstance(value, Mapping)}
-    there.pop("_target_", None)
-    train = yaml_file("train")
-    own = recipe.by_key().get("curriculum", {})
-    return {**{name: _resolved(value, train) for name, value in there.items()}, **own}
+    return merged({**file, "curriculum": resolved(there)}, recipe.by_key())
 
 
-def _made(
-    recipe: Recipe,
-    file: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    space: Any,
-    seeds: Sequence[int],
-) -> Curriculum:
-    make: Callable[..., Any] = resolve_name(recipe.target or file["curriculum"]["_target_"])
-    read = arguments(make, settings, [*inspect.signature(make).parameters][:1])
-    try:
-        made: Curriculum = make(Components(space, ProposerSettings(), seeds), **read)
-    except AttributeError as error:
-        if error.obj is not space:
-            raise
-        raise ArgumentError(
-            f"curriculum={recipe.name}: needs {error.name} of a task, which this space of levels "
-            "has not; give a task in its place"
-        ) from error
-    return made
-
-
-def _merged(settings: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by key, those of the second over those of the first; None in place of all."""
-    found = dict(settings)
-    for key, own in more.items():
-        found[key] = None if own is None else {**(found.get(key) or {}), **own}
-    return found
-
-
-def _resolved(value: Any, settings: Mapping[str, Any]) -> Any:
-    """The value, or what it refers to."""
-    reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-    if reference is None:
-        return value
-    return reduce(lambda place, name: place[name], reference[1].split("."), settings)
+def _name(value: Any) -> str:
+    return getattr(value, "__qualname__", type(value).__qualname__)

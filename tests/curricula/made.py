@@ -145,7 +145,6 @@ MADE: dict[str, Make] = {
     "traced": lambda: replay("regret", "exact", co_learnability=0.5, edits=2),
     "gradients": lambda: replay("gradient_norm", "exact"),
     "policy gradients": lambda: replay("gradient_norm"),
-    "law": lambda: replay("max_mc", "exact"),
     "sfl": selection,
     "sfl from episodes": lambda: selection("episodes"),
     "progress": lambda: LearningProgressCurriculum(SPACE, probes=2, every=2),
@@ -169,9 +168,7 @@ MADE: dict[str, Make] = {
     ),
     "progress on a model": lambda: modelled(LearningProgressCurriculum(SPACE, probes=2)),
     "edits on a model": lambda: modelled(replay("learnability", "exact", edits=3)),
-    "spread": lambda: modelled(
-        Filtered(SamplingCurriculum(SPACE), Scorer("spread", "exact"), times=3)
-    ),
+    "filter on a model": lambda: modelled(filtered(SamplingCurriculum(SPACE))),
     "schedule": lambda: Schedule([SamplingCurriculum(SPACE), replay(train_on_new=True)], [2]),
     "filtered schedule": lambda: filtered(
         Schedule([SamplingCurriculum(TARGET), replay(train_on_new=True)], [1])

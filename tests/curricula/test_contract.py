@@ -39,7 +39,7 @@ EVERY = {**MADE, **LEARNED}
 every = pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
 # What differs from another in a score alone, or in where that comes from, remembers the same.
 SCORES = {
-    *("easy", "regret", "plr of regret", "law", "accel of regret", "gradients"),
+    *("easy", "regret", "plr of regret", "accel of regret", "gradients"),
     *("policy gradients", "sfl from episodes", "filtered from episodes", "filtered perf_gain"),
     *("filtered paired", "filtered schedule", "alp_gmm, exact", "synchronous"),
 }
@@ -213,7 +213,9 @@ WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase
 }
 
 
-@pytest.mark.parametrize("name", ["plr", "progress of episodes", "alp_gmm", "paired", "spread"])
+@pytest.mark.parametrize(
+    "name", ["plr", "progress of episodes", "alp_gmm", "paired", "filter on a model"]
+)
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:
     curriculum, student = EVERY[name](), TaskStudent(TASK, solvers([0]))
@@ -317,7 +319,6 @@ def test_a_student_that_lacks_something_is_named() -> None:
     for task, need, reason in (
         (cars, "target_direction", "MountainCarTask must define differentiable_performance"),
         (cars, "optimal_return", "MountainCarTask must define optimal_return"),
-        (cars, "episode_law", "MountainCarTask must define episode_law"),
         (windows, "exact_performance", "ViewMazeTask tells performance by playing, which is not"),
     ):
         poor = TaskStudent(task, task.learner([Streams(0)]))

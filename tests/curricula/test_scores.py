@@ -8,12 +8,15 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula import Student, TaskStudent
+from proposer_rl.curricula import Student, TaskStudent, outcome_of
 from proposer_rl.curricula.scores import STEPWISE, Scorer, episodes, unseen
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
+from proposer_rl.task import NoSuccessError
+from tests.curricula.scripted import Scripted
 from tests.tiny import TASK, evaluate, learners
 
 LEARNER = Student(gamma=0.9, lmbda=0.5)
@@ -69,9 +72,7 @@ def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
         ("positive_value_loss", played(FAILED, success=True), 0.0),  # nothing is bootstrapped
         ("positive_value_loss", played(FAILED, success=False, after=0.3), 0.02),
         ("max_mc", played(FAILED, success=False), -0.23),  # -0.20 if the maximum began at 0
-        ("one_step_td_error", played(FIRST), 0.28),  # 0.375 without the last step
         ("learnability", played(FIRST, SHORT), 0.0),
-        ("return_variance", played(FIRST, SHORT), 0.0001),  # of 0.97 and 0.99
         ("regret", played(FIRST, SHORT), 0.01),  # 0.99 - (0.97 + 0.99) / 2
     ],
 )
@@ -91,7 +92,7 @@ def test_the_best_return_of_a_level_is_remembered() -> None:
 
 def test_only_episodes_that_end_count() -> None:
     whole, cut = played(FIRST), played(FIRST, SECOND, cut=1)
-    for name in (*STEPWISE, "return_variance", "regret"):
+    for name in (*STEPWISE, "regret"):
         assert score(name, cut) == pytest.approx(score(name, whole), abs=1e-6)
     assert score("l1_value_loss", played(FIRST, cut=1)) == -torch.inf
 
@@ -103,7 +104,7 @@ def test_rollouts_are_pooled_by_episodes() -> None:
     assert score("positive_value_loss", played(FIRST), played(SHORT)) == pytest.approx(together)
 
 
-@pytest.mark.parametrize("name", [*STEPWISE, "learnability", "return_variance", "regret"])
+@pytest.mark.parametrize("name", [*STEPWISE, "learnability", "regret"])
 def test_the_same_episodes_again_leave_a_score_as_it_was(name: str) -> None:
     parts = [FIRST, SHORT, SECOND]
     assert score(name, played(*parts, *parts)) == pytest.approx(score(name, played(*parts)))
@@ -133,7 +134,6 @@ def test_episodes_are_those_of_a_plain_loop(
     assert int(found.ended) == len(ends)
     assert int(found.successes) == sum(success for _, success in ends)
     assert float(found.total) == pytest.approx(sum(returns), abs=1e-5)
-    assert float(found.squares) == pytest.approx(sum(r * r for r in returns), abs=1e-5)
     assert float(found.best) == pytest.approx(max(returns), abs=1e-6)
     torch.testing.assert_close(found.weight.flatten().float(), weight)
 
@@ -247,6 +247,64 @@ def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own()
     assert float(found.best) == 0.5
     outcome["score"] = torch.tensor([[7.0]])
     assert float(Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, *known).score) == 7
-    for name, lacking in (("return_variance", "rollout"), ("learnability", "success")):
+    for name, lacking in (("gradient_norm", "rollout"), ("learnability", "success")):
         with pytest.raises(ValueError, match=f"score={name}: the outcome has no {lacking}"):
             Scorer(name, "episodes").of_outcome(LEARNER, outcome.select("return"), *known)
+
+
+def test_learnability_needs_a_task_that_tells_success() -> None:
+    blind = Scripted(torch.rand(1, 3), told="return")
+    with pytest.raises(NoSuccessError, match="this task tells no success, only the return") as no:
+        Scorer("learnability", "exact")(blind, torch.tensor([[0, 1]]), [Streams(0)])
+    assert no.value.exit_code == 2
+
+
+def shortfall(student: Student, outcome: TensorDictBase) -> Tensor:
+    """A score of one's own: what is missing to a return of one."""
+    return 1 - outcome["return"]
+
+
+DOTTED = f"{__name__}.shortfall"
+
+
+@pytest.mark.parametrize("own", [shortfall, DOTTED], ids=["function", "name"])
+def test_a_score_of_ones_own_is_what_its_function_says_of_the_outcome(own: Any) -> None:
+    scorer, known = Scorer(own, "episodes", rollouts=2), (NONE, NONE)
+    outcome = outcome_of(played(FIRST))
+    assert float(scorer.of_outcome(LEARNER, outcome, *known).score) == pytest.approx(0.03)
+    told = TensorDict({"return": torch.tensor([[0.25]])}, [1, 1])  # by a loop that plays itself
+    assert float(scorer.of_outcome(LEARNER, told, *known).score) == 0.75
+    unfinished = outcome_of(played(FIRST, cut=1))
+    assert float(scorer.of_outcome(LEARNER, unfinished, *known).score) == -torch.inf
+    told["score"] = torch.tensor([[7.0]])
+    assert float(scorer.of_outcome(LEARNER, told, *known).score) == 7
+
+    rollouts = iter([played(FIRST), played(SHORT)])  # what is only played is scored by the mean
+    found = scorer(Student(play=lambda *_: next(rollouts)), torch.zeros(1, 1), [Streams(0)])
+    assert float(found.score) == pytest.approx((0.03 + 0.01) / 2)
+    assert float(found.best) == pytest.approx(0.99)
+
+
+@pytest.mark.parametrize(
+    ("score", "source", "message"),
+    [
+        ("luck", "episodes", "score='luck': from source=episodes there are .*my_module.my_score"),
+        ("spread", "exact", r"score='spread': from source=exact there are \['learnability', 'reg"),
+        ("my_parts.luck", "episodes", "score=my_parts.luck: No module named 'my_parts'"),
+        (f"{__name__}.luck", "episodes", "has no attribute 'luck'"),
+        (f"{__name__}.LEARNER", "episodes", "must be a function"),
+        (shortfall, "exact", "score=shortfall: a function of your own needs source=episodes"),
+        (3, "episodes", "score=3: input should be a valid string, or callable"),
+    ],
+)
+def test_what_is_no_score_is_refused(score: Any, source: Any, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        Scorer(score, source)
+
+
+@pytest.mark.parametrize(
+    "wrong", [lambda *_: torch.ones(3), lambda *_: 1.0, lambda *_: torch.full((1, 1), torch.nan)]
+)
+def test_what_is_no_number_for_each_level_is_refused(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=r"must return a tensor \[1, 1\] without NaN"):
+        Scorer(wrong, "episodes").of_outcome(LEARNER, outcome_of(played(FIRST)), NONE, NONE)

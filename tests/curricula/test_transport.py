@@ -18,7 +18,7 @@ from proposer_rl.curricula.transport import (
     step_towards,
 )
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, currot
+from proposer_rl.methods import Components, make
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
@@ -232,9 +232,9 @@ def test_a_space_finds_its_own_bins() -> None:
 
 
 def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
-    parts = Components(SimpleNamespace(), ProposerSettings(), [0])
-    with pytest.raises(TypeError, match="SimpleNamespace must define target_shares"):
-        currot(parts)
+    parts = Components(SimpleNamespace(space=None), ProposerSettings(), [0])
+    with pytest.raises(TypeError, match="needs target_shares of a task, which SimpleNamespace"):
+        make(TransportCurriculum, {}, parts)
 
 
 @pytest.mark.parametrize("seed", [46, 105, 164])

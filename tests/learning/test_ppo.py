@@ -539,7 +539,6 @@ def test_an_exact_evaluation_stays_on_the_device(monkeypatch: pytest.MonkeyPatch
         found = [
             TASK.performance(agent, measured, torch.Generator())["success"],
             TASK.probe(agent, measured),
-            TASK.episode_law(agent, measured.unsqueeze(0)).probability,
         ]
     assert crossings.count == 0
     assert {each.device.type for each in found} == {"meta"}

@@ -3,8 +3,8 @@
 A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs. Both
 evaluators have one signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W], generator)``
 gives a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The exact evaluator
-draws nothing from the generator. What it sums up in one number, :func:`success_from_cells`,
-:func:`expected_visits` and :func:`episode_law` have for each cell, step and outcome.
+draws nothing from the generator. What it sums up in one number, :func:`success_from_cells` and
+:func:`expected_visits` have for each cell.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
-from proposer_rl.task import EpisodeLaw
 from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 from proposer_rl.tasks.mazes.paths import (
@@ -303,63 +302,6 @@ def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
         tensor([[1.7500, 0.2500, 0.0000]])
     """
     return _presence(level, policy.flatten(1), max_steps).sum(0).view(level.walls.shape)
-
-
-def episode_law(
-    levels: Level, policy: Tensor, values: Tensor, max_steps: int = 25, step_penalty: float = 0.01
-) -> EpisodeLaw:
-    """Returns the law of episodes: their outcomes, and the steps that they are made of.
-
-    With p_t(c) the probability that step t + 1 begins at cell c, and g_t(c) the expectation of
-    1 / (steps of the episode) for one that is at c after t of them, the weight of action a at c is
-
-        sum over t < T of  p_t(c) policy(a | c) g_(t+1)(where a leads),
-
-    g_t being 1 / t at the goal and g_T = 1 / T everywhere: one pass forwards and one backwards.
-
-    Args:
-        levels: Levels ``[*B]``.
-        policy: Action probabilities, float ``[*B, 4, H, W]``.
-        values: What a critic says of every cell, float ``[*B, H, W]``.
-        max_steps: Step limit T of an episode.
-        step_penalty: Cost of a step.
-
-    Returns:
-        T + 1 outcomes, of success after 1 to T steps and of none, and 4 H W steps; float64.
-
-    Example:
-        Uniformly random moves in a corridor: one step, two steps, or failure.
-
-        >>> policy, values = torch.full((4, 1, 2), 0.25), torch.zeros(1, 2)
-        >>> law = episode_law(Level.from_text("SG"), policy, values, max_steps=2)
-        >>> law.outcome
-        tensor([ 0.9900,  0.9800, -0.0200], dtype=torch.float64)
-        >>> law.probability
-        tensor([0.2500, 0.1875, 0.5625], dtype=torch.float64)
-    """
-    policy, values = policy.double().flatten(-2), values.double().flatten(-2)
-    following = successors(levels)  # [*B, 4, H*W]
-    goal = cell_index(levels.goal, levels.walls.shape[-1])[..., None, None]
-    wins = following == goal
-    here = _presence(levels, policy, max_steps)
-    weight, share = torch.zeros_like(policy), torch.full_like(values, 1 / max_steps)
-    for step in range(max_steps, 0, -1):
-        after = share.unsqueeze(-2).expand_as(policy).gather(-1, following)
-        ahead = policy * after.where(~wins, 1 / step)
-        weight += here[step - 1].unsqueeze(-2) * ahead
-        share = ahead.sum(-2)
-    won = (here * (policy * wins).sum(-2)).sum(-1).movedim(0, -1)  # [*B, T], by each step
-    gains = 1 - step_penalty * torch.arange(1, max_steps + 1, device=won.device).double()
-    outcome = torch.cat([gains, gains[-1:] - 1])
-    value = values.unsqueeze(-2).expand_as(policy)
-    return EpisodeLaw(
-        outcome=outcome.expand(*won.shape[:-1], -1),
-        probability=torch.cat([won, 1 - won.sum(-1, keepdim=True)], -1),
-        weight=weight.flatten(-2),
-        reward=(wins.double() - step_penalty).flatten(-2),
-        value=value.flatten(-2),
-        next_value=value.gather(-1, following).where(~wins, 0.0).flatten(-2),
-    )
 
 
 def _presence(levels: Level, policy: Tensor, max_steps: int) -> Tensor:

@@ -13,14 +13,13 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.models import ActorCritic, Population, cell_logits, cell_maps, map_actor_critic
-from proposer_rl.task import ComputeContext, EpisodeLaw, LevelResult, for_copies
+from proposer_rl.models import ActorCritic, Population, cell_logits, map_actor_critic
+from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
-    episode_law,
     optimal_return,
     policy_path,
     worst_mean,
@@ -183,12 +182,6 @@ class MazeTask(GridTask):
     def optimal_return(self, levels: Level) -> Tensor:
         """Returns the largest expected return of any policy on levels [*B]: float [*B]."""
         return optimal_return(levels, *self._rules)
-
-    def episode_law(self, agent: ActorCritic, levels: Level) -> EpisodeLaw:
-        """Returns the exact law of K Solvers' episodes, each on its own levels [K, E]."""
-        logits, values = cell_maps(agent, planes(levels))
-        policy = logits.softmax(-3, dtype=torch.float64)
-        return episode_law(levels, policy, values.squeeze(-3), *self._rules)
 
     def probe(self, agent: ActorCritic, levels: Level) -> Tensor:
         """Returns planes and the Solvers' logit maps of levels [C]: float [K, C, 3 + A, H, W]."""

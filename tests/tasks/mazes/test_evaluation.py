@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections import Counter
-from itertools import product
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +12,6 @@ from proposer_rl.tasks.mazes import Level, generate_levels
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
-    episode_law,
     expected_visits,
     optimal_return,
     policy_path,
@@ -352,48 +348,3 @@ def test_the_evaluator_tells_the_same_of_the_start() -> None:
         steps = expected_visits(level, logits.softmax(0), STEPS).sum()
         torch.testing.assert_close(success, result["success"])
         torch.testing.assert_close(success - 0.5 * steps, result["return"])
-
-
-LIMIT, PENALTY = 4, 0.3
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_law_of_an_episode_is_that_of_all_its_actions(seed: int) -> None:
-    """Every sequence of actions is played, and counts with its probability."""
-    levels = random_levels(2, 2, 3, 0.2, seed)
-    generator = torch.Generator().manual_seed(seed)
-    policy = torch.randn(2, 4, 2, 3, generator=generator, dtype=torch.float64).softmax(-3)
-    values = torch.randn(2, 2, 3, generator=generator, dtype=torch.float64)
-    found = episode_law(levels, policy, values, LIMIT, PENALTY)
-    for i, level in enumerate(levels):
-        returns: Counter[float] = Counter()
-        weight, reward, value, after = np.zeros((4, 4, 2, 3))
-        for actions in product(range(4), repeat=LIMIT):
-            cell, chance, total, steps = tuple(level.start.tolist()), 1.0, 0.0, []
-            for action, step in zip(
-                actions, play(level, list(actions), LIMIT, PENALTY), strict=True
-            ):
-                there, paid, terminated, truncated = step
-                place = (action, *cell)
-                chance *= float(policy[i, action, cell[0], cell[1]])
-                steps.append(place)
-                total += paid
-                reward[place], value[place] = paid, values[i, cell[0], cell[1]]
-                after[place] = 0 if terminated else values[i, there[0], there[1]]
-                cell = there
-                if terminated or truncated:
-                    break
-            chance *= 0.25 ** (LIMIT - len(steps))  # of the actions that come too late
-            returns[round(total, 6)] += chance
-            for place in steps:
-                weight[place] += chance / len(steps)
-        told: Counter[float] = Counter()
-        for outcome, probability in zip(found.outcome[i], found.probability[i], strict=True):
-            told[round(float(outcome), 6)] += float(probability)
-        assert told == pytest.approx({outcome: returns[outcome] for outcome in told})
-        assert sum(returns.values()) == pytest.approx(1)
-        np.testing.assert_allclose(found.weight[i], weight.ravel(), atol=1e-12)
-        seen = weight.ravel() > 0
-        for name, expected in (("reward", reward), ("value", value), ("next_value", after)):
-            entry = getattr(found, name)[i].numpy()
-            np.testing.assert_allclose(entry[seen], expected.ravel()[seen], atol=1e-9)
