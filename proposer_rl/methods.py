@@ -44,7 +44,7 @@ from proposer_rl.meta.replicas import ReplicasInWorkers, worker_env
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.recipes import file_content
-from proposer_rl.runs.checkpoint import CheckpointError, State, load_curriculum
+from proposer_rl.runs.checkpoint import CheckpointError, State, learnt_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, arguments, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space, Task
@@ -387,7 +387,7 @@ def _agent(components: Components, config: ProposerSettings, checkpoint: str | N
     if not checkpoint:
         return agent
     try:
-        learnt = _with_proposer(load_curriculum(Path(checkpoint)))
+        learnt = _with_proposer(learnt_curriculum(Path(checkpoint)))
         observed = [name for name in learnt["observed"] if name != "probes"]
         load_agent(agent, TensorDict(learnt["proposer"]))
     except CheckpointError as error:

@@ -47,7 +47,8 @@ class Recipe:
     def overrides(self) -> list[str]:
         """The same on the command line, but for what is one's own."""
         if self.target is not None:
-            return ["~task"] if self.group == "task" else []
+            # As most tasks call what is to be mastered; a headline that is given comes after it.
+            return ["~task", "schedule.headline=target_success"] if self.group == "task" else []
         group = "task" if self.group == "task" else "+method"
         given = [
             override(f"++{key}.{name}", value)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 import json
 import re
+from datetime import datetime
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -126,12 +128,10 @@ def test_a_run_in_a_maze_is_that_of_the_command_line(
 
 
 def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
-    def train(updates: int, folder: str) -> prl.Run:
+    def train(updates: int, folder: str, **annealed: Any) -> prl.Run:
         task = prl.tasks.from_gymnasium("CartPole-v1", **CARTPOLE)
-        settings = {
-            "solver": {"ppo": {"horizon": 20, "epochs": 1, "anneal_updates": None}},
-            "schedule": {"evaluate_every": 2},
-        }
+        ppo = {"horizon": 20, "epochs": 1, **annealed}
+        settings = {"solver": {"ppo": ppo}, "schedule": {"evaluate_every": 2}}
         return prl.train(
             task,
             prl.curricula.learning_progress(source="episodes"),
@@ -141,10 +141,47 @@ def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
             progress=False,
         )
 
-    train(2, "parts")
-    run = train(4, "parts")
+    steady = {"anneal_updates": None}
+    train(2, "parts", **steady)
+    run = train(4, "parts", **steady)
     assert list(run.metrics["updates"]) == [0, 2, 4]
-    assert_same_run(run.folder, train(4, "whole").folder)
+    assert_same_run(run.folder, train(4, "whole", **steady).folder)
+    train(1, "falling")
+    with pytest.raises(ValueError, match=r"schedule.updates=2: .* falls to zero in 1 updates"):
+        train(2, "falling")
+
+
+class Frozen(datetime):
+    """A clock that stands still."""
+
+    @classmethod
+    def now(cls, tz: Any = None) -> Any:
+        return cls(2026, 1, 1)
+
+
+def test_runs_of_one_second_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And where signs are printed that standard output does not have, they end well."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("proposer_rl.cli.compose.datetime", Frozen)
+    with pytest.raises(ValueError, match="updates=0"):
+        prl.train("maze", "target", updates=0, **SMOKE)
+    assert not Path("outputs").exists()
+    for encoding in ("ascii", "latin-1"):
+        out = TextIOWrapper(BytesIO(), encoding)
+        monkeypatch.setattr("sys.stdout", out)
+        prl.train("maze", "target", updates=1, **SMOKE)
+        assert out.errors == "strict"
+        watch(["outputs", "--once"])
+        assert out.errors == "replace"
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("proposer_rl.cli.compose.datetime", Frozen)
+        out.flush()
+        assert "target, seed 0" in out.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+    found = sorted(folder.name for folder in Path("outputs/target").iterdir())
+    assert found == ["2026-01-01_00-00-00_seed_0", "2026-01-01_00-00-00_seed_0_2"]
 
 
 def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,10 +189,7 @@ def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.Mon
     from own_curriculum import again
     from own_task import SledgeTask
 
-    sledges = {
-        "solver": {"batch_size": 4, "ppo": {"horizon": 8}},
-        "schedule": {"headline": "target_success"},
-    }
+    sledges = {"solver": {"batch_size": 4, "ppo": {"horizon": 8}}}
     task = prl.tasks.own(SledgeTask, levels=8)
     run = prl.train(task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False)
     assert "target_success" in run.metrics

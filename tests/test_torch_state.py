@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensorclass
@@ -15,6 +17,7 @@ import proposer_rl as prl
 from proposer_rl.models import callers_state, own_state
 from proposer_rl.tasks.point_masses.task import PointMassEnv
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from tests.tasks.gymnasium.odd import LIMIT, Line
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.teaching.test_teacher import FREE, SPACES
 
@@ -22,6 +25,10 @@ STATES: dict[str, Callable[[], Any]] = {
     "float64": lambda: torch.set_default_dtype(torch.float64),
     "no gradients": lambda: torch.set_grad_enabled(False),
     "a device": lambda: torch.set_default_device("meta"),
+}
+WITHIN: dict[str, Callable[[], Any]] = {
+    "inference": torch.inference_mode,
+    "with a device": lambda: torch.device("meta"),
 }
 FREES = [*((name, "ranges") for name in FREE), ("plr", "items"), ("plr", "a task")]
 
@@ -52,10 +59,12 @@ def restored() -> Iterator[None]:
 def users(state: str) -> Iterator[None]:
     """A state of the user's, which is as it was after what is done in it."""
     with restored():
-        if state == "inference":
-            with torch.inference_mode():
+        if state in WITHIN:
+            with WITHIN[state]():
+                set_ = now()
                 yield
-                assert torch.is_inference_mode_enabled()
+                assert now() == set_ != DEFAULT
+            assert now() == DEFAULT
             return
         STATES[state]()
         set_ = now()
@@ -63,7 +72,7 @@ def users(state: str) -> Iterator[None]:
         assert now() == set_ != DEFAULT
 
 
-@pytest.mark.parametrize("state", [*STATES, "inference"])
+@pytest.mark.parametrize("state", [*STATES, *WITHIN])
 def test_states_are_kept_apart(state: str) -> None:
     def fail() -> None:
         with own_state():
@@ -149,7 +158,7 @@ def test_functions_of_a_loop_run_in_its_state() -> None:
         assert len(seen) >= 2 and set(seen) == {now()}
 
 
-@pytest.mark.parametrize("state", [*STATES, "inference"])
+@pytest.mark.parametrize("state", [*STATES, *WITHIN])
 def test_environments_keep_their_specifications(state: str) -> None:
     def drawn() -> Any:
         generator = torch.Generator("cpu").manual_seed(0)
@@ -165,3 +174,51 @@ def test_environments_keep_their_specifications(state: str) -> None:
             PointMassEnv(masses),
         ):
             check_env_specs(env)
+
+
+class Setting(Line):
+    """An environment that sets torch's state as its module might, and says what it then is."""
+
+    sets: ClassVar[Callable[[], Any] | None] = None
+    seen_in_steps: ClassVar[list[Any]] = []
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        if Setting.sets is not None:
+            Setting.sets()
+
+    def step(self, action: Any) -> Any:
+        self.seen_in_steps.append(now())
+        return super().step(action)
+
+
+gym.register("Setting-v0", Setting, max_episode_steps=LIMIT)
+
+
+def test_runs_compute_the_same_whatever_an_environment_sets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = prl.tasks.from_gymnasium(
+        "Setting-v0",
+        parameters={"goal": {"values": [1.0, 3.0], "target": 3.0}},
+        success={"kind": "terminated"},
+        evaluation={"levels": 2},
+    )
+    settings = {"solver": {"batch_size": 2, "ppo": {"horizon": 12, "minibatches": 1, "epochs": 1}}}
+
+    def numbers(name: str) -> str:
+        how = {"settings": settings, "updates": 1, "progress": False, "folder": tmp_path / name}
+        run = prl.train(task, "domain_randomization", **how)
+        assert next(run.solver().parameters()).dtype == torch.float32
+        return str(run.metrics.drop(columns="seconds").to_csv())
+
+    expected = numbers("plain")
+    for state, sets in STATES.items():
+        with restored():
+            Setting.seen_in_steps.clear()
+            monkeypatch.setattr(Setting, "sets", staticmethod(sets))
+            assert numbers(state) == expected, state
+            assert set(Setting.seen_in_steps) == {now()} != {DEFAULT}
+            monkeypatch.setattr(Setting, "sets", None)
+    with users("float64"):
+        assert numbers("user") == expected

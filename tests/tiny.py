@@ -19,7 +19,7 @@ from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.maze_settings import (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import check_groups, explained
 from proposer_rl.cli.run import carry_out
 from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.runs.folder import storage
 from proposer_rl.runs.process import StopSignals
 
 
@@ -46,15 +48,32 @@ def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Pa
             del config["hydra"]
             for key, value in own.items():
                 config[key] = value
-        path = folder or Path("outputs") / str(config.method) / _moment(config.seed)
         check_groups(list(overrides))
-        with StopSignals() as signals:
+        with _folder(folder, config) as path, StopSignals() as signals:
             carry_out(read_config(config), path, signals, shown)
     return path
 
 
-def _moment(seed: Any) -> str:
-    return f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{seed}"
+@contextmanager
+def _folder(given: Path | None, config: DictConfig) -> Iterator[Path]:
+    """The run's folder: a new one that no other run has, of which a refused run leaves nothing."""
+    if given is not None:
+        yield given
+        return
+    parent = Path("outputs") / str(config.method)
+    first = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{config.seed}"
+    new = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+    for name in chain([first], (f"{first}_{number}" for number in count(2))):
+        with storage(path := parent / name), suppress(FileExistsError):
+            path.mkdir(parents=True)
+            break
+    try:
+        yield path
+    except BaseException:
+        for folder in (path, *new):
+            with suppress(OSError):  # where something has been written
+                folder.rmdir()
+        raise
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import ConfigError, one_line, settings_file
+from proposer_rl.cli.groups import unquoted
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
@@ -265,6 +266,8 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Every value that is no mapping or list, with its dotted key."""
     if isinstance(value, dict | list):
         for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            if isinstance(part, bool):
+                raise ConfigError(unquoted(name, part))
             yield from _leaves(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, value

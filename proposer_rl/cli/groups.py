@@ -13,7 +13,12 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    KeyValidationError,
+    OmegaConfBaseException,
+)
 
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.help import GROUPS, own_folders
@@ -95,6 +100,8 @@ def explained(error: Exception) -> str:
     cause = error.__cause__
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _no_such_key(cause)
+    if isinstance(cause, KeyValidationError):
+        return unquoted(cause.full_key or "a file", cause.key)
     if "DictConfig with ListConfig" in f"{error} {cause}":
         return _no_mapping(error)
     not_chosen = _NOT_CHOSEN.match(str(error))
@@ -108,6 +115,13 @@ def explained(error: Exception) -> str:
             "than letters, digits and /:-+.$%*@?|_ has quotes of its own: \"KEY='VALUE'\""
         )
     return one_line(error)
+
+
+def unquoted(place: str, read: object) -> str:
+    """Of a name that YAML takes for one of its constants."""
+    words = {True: "on, yes or true", False: "off, no or false", None: "null or ~"}
+    name = f"{words[read]} without quotes" if read in words else repr(read)
+    return f'{place}: {name} is no name here; a name has quotes, as in "on":'
 
 
 def _no_mapping(error: Exception) -> str:

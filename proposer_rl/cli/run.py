@@ -44,6 +44,8 @@ SUMMARY = "summary.json"
 FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
+FALLING = "solver.ppo.anneal_updates"
+
 
 class Shown(Protocol):
     """What people see of a run's folder; :mod:`proposer_rl.cli.shown` is it."""
@@ -214,6 +216,12 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
     differing = _different(before, now)
     if differing:
         key, (old, new) = next(iter(differing.items()))
+        if [*differing] == [FALLING] and new == config.schedule.updates:
+            raise ConfigError(
+                f"schedule.updates={new}: the learning rate of the run in {folder.path} falls to "
+                f"zero in {old} updates ({FALLING} follows schedule.updates), so that a longer one "
+                "is another run; give it a folder of its own"
+            )
         raise ConfigError(
             f"{key}={new!r:.80}: the run in {folder.path} was started with {old!r:.80}; "
             f"differing keys: {', '.join(differing)}"

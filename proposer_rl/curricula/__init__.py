@@ -35,7 +35,7 @@ from proposer_rl.curricula.first_order import (
     SampledFirstOrderCurriculum as SampledFirstOrderCurriculum,
 )
 from proposer_rl.curricula.gaussians import MixtureCurriculum as MixtureCurriculum
-from proposer_rl.curricula.modelled import Modelled as Modelled
+from proposer_rl.curricula.outcome_model import Modelled as Modelled
 from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
 from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
@@ -47,8 +47,8 @@ from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurricu
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
+from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
-from proposer_rl.curricula.selection import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.student import Student as Student
 from proposer_rl.curricula.student import TaskStudent as TaskStudent
 from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError

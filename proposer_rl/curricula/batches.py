@@ -56,7 +56,7 @@ class SomeBins:
         self._space = space
 
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
-        """Draw levels [count]."""
+        """Draws levels [count]."""
         which = torch.randint(len(self.bins), (1, count), generator=generator)
         return self._space.generate(self.bins[which], [generator])[0]
 
@@ -64,18 +64,21 @@ class SomeBins:
 def fresh_levels(
     distribution: Distribution, count: int, streams: Sequence[Streams], *purpose: str | int
 ) -> Levels:
-    """New levels [K, count], those of each Solver from its own stream."""
+    """Draws levels [K, count] of a distribution, those of each student from its own stream."""
     draws = [stream.generator(*purpose) for stream in streams]
     return torch.stack([distribution.sample(count, generator) for generator in draws])
 
 
 def levels_at(levels: Levels, index: Tensor) -> Levels:
-    """Levels [K, P] out of [K, N], by their places int64 [K, P]."""
+    """Returns the levels [K, P] that stand at places int64 [K, P] of levels [K, N]."""
     return levels[torch.arange(len(index)).unsqueeze(-1), index]
 
 
 def saved(value: Any) -> Any:
-    """What a state holds of an attribute: its own state, or a copy of numbers, tensors, texts."""
+    """Returns an attribute as a state holds it: its own state, or a copy of what it consists of.
+
+    Numbers, texts and tensors are copied, also in lists and dicts.
+    """
     if hasattr(value, "state_dict"):
         return value.state_dict()
     if isinstance(value, Mapping):
@@ -86,7 +89,10 @@ def saved(value: Any) -> Any:
 
 
 def restored(state: Any, present: Any) -> Any:
-    """The attribute that a state holds; an object with a state of its own stays and takes it."""
+    """Returns the attribute that a state holds.
+
+    An object with a state of its own is kept, and loads that.
+    """
     if not hasattr(present, "load_state_dict"):
         return saved(state)
     present.load_state_dict(state)
@@ -94,13 +100,16 @@ def restored(state: Any, present: Any) -> Any:
 
 
 def packed(entries: TensorDictBase) -> dict[str, Any]:
-    """A tensordict as a state holds it: a copy, in nested dicts."""
+    """Returns a copy of a tensordict in nested dicts, as a state holds it."""
     state: dict[str, Any] = entries.clone().to_dict(convert_tensors=False)
     return state
 
 
 def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
-    """What :func:`packed` made a state of, batch [K, m]; ``level`` is of that level's kind."""
+    """Returns the tensordict [K, m] that :func:`packed` put into a state.
+
+    Its entry ``level`` becomes levels of the same kind as ``like``.
+    """
     entries = TensorDict.from_dict(dict(state), batch_dims=2)
     if "level" in entries:
         entries["level"] = of_kind(like, state["level"])
@@ -108,12 +117,12 @@ def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
 
 
 def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Levels [K, m] of a kind from the nested dicts of their entries."""
+    """Returns levels [K, m] of the class of ``like``, from nested dicts of their entries."""
     return type(like).from_dict(state, batch_dims=2)
 
 
 def device_of(levels: Levels) -> torch.device:
-    """Where levels are, be they a tensordict or a tensor."""
+    """Returns the device of levels, which are a tensordict or a tensor."""
     if isinstance(levels, Tensor):
         return levels.device
     device: torch.device = next(iter(levels.values(True, True))).device
@@ -121,12 +130,12 @@ def device_of(levels: Levels) -> torch.device:
 
 
 def moved(levels: Levels, device: torch.device) -> Levels:
-    """Levels on a device: the same ones where they are there already."""
+    """Returns levels on a device, without a copy where they are there already."""
     return levels if device_of(levels) == device else levels.to(device)
 
 
 def level_keys(levels: Any) -> Tensor:
-    """A number for each level, equal for equal levels and else different: int64 [*B].
+    """Returns a number for each of levels [*B], the same for equal levels only: int64 [*B].
 
     Hashes of the bytes of all entries, eight at a time: two levels collide with a probability of
     about 2^-64. Each eight go through the finalizer of SplitMix64 (Steele et al. 2014).

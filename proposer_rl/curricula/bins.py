@@ -1,4 +1,4 @@
-"""What curricula share that draw from the bins of a space, and how good students are in each."""
+"""The base of curricula that draw from the bins of a space, and measurements of each bin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Space, refuse_single_bin
 
 Measure = Literal["success", "return"]
-MANY = 10_000  # levels of a scoring pass, beyond which its cost is told
+MANY = 10_000  # levels of a scoring pass, beyond which there is a warning
 
 
 class BinCurriculum(Curriculum):
@@ -48,23 +48,23 @@ class BinCurriculum(Curriculum):
 
     @abstractmethod
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Renew :attr:`scores` for batches of ``count`` levels."""
+        """Renews :attr:`scores` for batches of ``count`` levels."""
 
     @abstractmethod
     def shares(self) -> Tensor:
-        """Of the bins in the next batch, float [K, N]; they add up to one."""
+        """Returns the shares of the bins in the next batch, float [K, N], which add up to one."""
 
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
     ) -> dict[str, Tensor]:
-        """What is learnt from an outcome, [K, n] each, beside the levels' ``bins``."""
+        """Returns what is to be learnt from an outcome, tensors [K, n] by name."""
         return {}
 
     def learn(self, evidence: TensorDict) -> None:
-        """Take in the evidence of one batch, [K, m]."""
+        """Learns from the evidence of one batch, [K, m], which also has the levels' ``bins``."""
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n], drawn systematically from the shares."""
+        """Draws levels [K, n] systematically from the shares of the bins."""
         self._take_in()
         if self._proposed % self._every == 0:
             self.score(student, count, streams)
@@ -74,7 +74,7 @@ class BinCurriculum(Curriculum):
         return self._inbox.batch(self.space.generate(bins, levels), bins=bins)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Count the levels, and put what can be learnt from them aside."""
+        """Counts the levels, and keeps what can be learnt from them until the next proposal."""
         self._inbox.check(batch, outcome)
         evidence = self.evidence(student, batch, outcome)
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
@@ -82,7 +82,7 @@ class BinCurriculum(Curriculum):
             self._inbox.put(batch, bins=batch.notes["bins"], **evidence)
 
     def log(self) -> dict[str, Any]:
-        """Counts, and of each student the scores and how even its shares are."""
+        """Returns counts of levels by bin, the scores, and how even each student's shares are."""
         self._take_in()
         if not self.scores:
             return {}
@@ -101,17 +101,22 @@ class BinCurriculum(Curriculum):
 
 
 def counts_of_bins(bins: Tensor, space: Space) -> Tensor:
-    """How many levels there are of each of a space's bins, int64 [N], of bins of any shape."""
+    """Counts the levels of each of a space's N bins: int64 [N].
+
+    Args:
+        bins: of the levels, int64 of any shape.
+        space: that has the bins.
+    """
     return bins.flatten().bincount(minlength=space.size)
 
 
 def along_axes(values: Tensor, space: Space) -> list[Any]:
-    """Numbers of a space's bins [*B, N], nested along its axes."""
+    """Returns numbers [*B, N] of a space's bins as lists that are nested along its axes."""
     return values.unflatten(-1, [len(axis) for axis in space.axes.values()]).tolist()
 
 
 def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Mean value of the levels of each bin, and how many levels it had.
+    """Returns the mean value of the levels of each bin, and how many levels it had.
 
     Args:
         choices: bins of the levels, int64 [K, P].
@@ -131,8 +136,14 @@ def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, T
     return none.scatter_add(1, choices, values) / counts, counts
 
 
-def tell_cost(space: Space, each: int, name: str) -> None:
-    """Warn of many levels in a scoring pass, where each bin has so many of what has this name."""
+def warn_of_cost(space: Space, each: int, name: str) -> None:
+    """Warns where a scoring pass evaluates many levels.
+
+    Args:
+        space: that has the bins.
+        each: levels of each bin.
+        name: of the argument that sets this number.
+    """
     if space.size * each > MANY:
         warnings.warn(
             f"{space.size:,} bins with {each} {name} each: {space.size * each:,} levels are "
@@ -157,15 +168,15 @@ class Probes:
 
     def __init__(self, space: Space, count: int, measure: Measure) -> None:
         self._space, self._count, self.measure = space, count, measure
-        tell_cost(space, count, "probes")
+        warn_of_cost(space, count, "probes")
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 
     def performance(self, student: Student, streams: Sequence[Streams]) -> Tensor:
-        """Mean performance of K students in each bin: float32 [K, N], on the CPU.
+        """Measures the mean performance of K students in each bin: float32 [K, N], on the CPU.
 
         Raises:
-            NoSuccessError: if success is to be measured and the task tells none.
+            NoSuccessError: if success is to be measured and the task has none.
         """
         size = self._space.size
         if self._levels is None:
@@ -184,10 +195,10 @@ class Probes:
         return reached.float().cpu()
 
     def state_dict(self) -> dict[str, Any]:
-        """Which streams the levels were drawn from, so that they can be drawn again."""
+        """Returns the addresses of the streams that the levels are drawn from."""
         return {"drawn_from": [list(address) for address in self._drawn_from]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the levels of a state."""
+        """Puts back what :meth:`state_dict` returned; the levels are then drawn again."""
         self._levels = None
         self._drawn_from = [list(address) for address in state["drawn_from"]]

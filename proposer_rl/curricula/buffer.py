@@ -28,8 +28,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula import slots as rows
 from proposer_rl.curricula.batches import CPU, level_keys, moved
+from proposer_rl.curricula.slots import Floats, draw_row, insert_row
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
@@ -37,7 +37,7 @@ Prioritization = Literal["rank", "proportional", "softmax"]
 
 @settings
 class ReplayRule:
-    """How levels are drawn from a buffer.
+    """The rule by which levels are drawn from a buffer.
 
     Attributes:
         prioritization: what the score weights depend on. ``rank``: r^(-1/T) of the r-th best score;
@@ -54,9 +54,9 @@ class ReplayRule:
     staleness: Share = 0.3
 
 
-def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
-    """A buffer [copies, capacity] that is empty, for levels of the kind of the given one, []."""
-    shape = (copies, capacity)
+def empty_buffer(level: Any, students: int, capacity: int) -> TensorDict:
+    """Returns an empty buffer [students, capacity] for levels of the kind of the given one, []."""
+    shape = (students, capacity)
     numbers = ("touched", "clock", "key", "parent", "generation", "draws")
     return TensorDict(
         {
@@ -72,7 +72,7 @@ def empty_buffer(level: Any, copies: int, capacity: int) -> TensorDict:
 
 
 def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """Shares of the levels by their scores, adding up to 1 where there is any level.
+    """Returns the shares of the levels by their scores; they add up to 1 where there is any level.
 
     Args:
         score: float [*B, N].
@@ -94,7 +94,7 @@ def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
 
 
 def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
-    """Shares of the best score, the second best and so on: float64 [*B, N].
+    """Returns the shares of the best score, the second best and so on: float64 [*B, N].
 
     Args:
         falling: the scores, float64 [*B, N].
@@ -121,18 +121,18 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
 
 @lru_cache(8)
 def _by_rank(count: int, temperature: float) -> Tensor:
-    """r^(-1/T) of ranks r = 1 to so many, float64; not to be changed."""
+    """Returns r^(-1/T) of ranks r = 1 to ``count``, float64, which nobody may change."""
     return torch.arange(1, count + 1).double() ** (-1 / temperature)
 
 
 def staleness_weights(age: Tensor, filled: Tensor) -> Tensor:
-    """Shares in proportion to ages int64 [*B, N], all alike where all ages are 0: float64."""
+    """Returns shares in proportion to ages int64 [*B, N], equal ones if all ages are 0: float64."""
     weight = age.double().where(filled, 0.0)
     return _shares(weight.where(weight.sum(-1, keepdim=True) > 0, filled.double()))
 
 
 def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """The distribution that levels are drawn from: float64 [*B, N], zero for empty slots.
+    """Returns the probability of each slot to be drawn: float64 [*B, N], zero for empty slots.
 
     Args:
         score: float [*B, N].
@@ -151,33 +151,33 @@ def draw_slots(
     generators: Sequence[torch.Generator],
     wanted: Tensor | None = None,
 ) -> Tensor:
-    """Draw levels one after another: each draw advances the clock and makes its level fresh.
+    """Draws levels one after another: each draw advances the clock and makes its level fresh.
 
     Args:
-        buffer: with a level in some slot of every copy that is drawn from.
+        buffer: with a level in some slot of every student that is drawn for.
         count: number P of draws.
         rule: of the draws.
-        generators: one for each copy.
-        wanted: bool [K], of the copies that are drawn from; None for all.
+        generators: one for each student.
+        wanted: bool [K], of the students that are drawn for; None for all.
 
     Returns:
-        Slots int64 [K, P]; those of other copies are 0.
+        Slots int64 [K, P]; those of other students are 0.
     """
     entries = dict(buffer.items())
     by_score = score_weights(entries["score"], entries["filled"], rule).numpy()
     slots = torch.zeros(len(generators), count, dtype=torch.int64)
-    for copy in _copies(wanted, len(slots)):
-        noise = torch.rand(count, generator=generators[copy], dtype=torch.float64).numpy()
-        drawn = rows.draw(_row(entries, copy), by_score[copy], rule.staleness, noise)
-        slots[copy] = torch.from_numpy(drawn)
-        entries["draws"][copy].scatter_add_(0, slots[copy], torch.ones_like(slots[copy]))
+    for student in _chosen(wanted, len(slots)):
+        noise = torch.rand(count, generator=generators[student], dtype=torch.float64).numpy()
+        drawn = draw_row(_row(entries, student), by_score[student], rule.staleness, noise)
+        slots[student] = torch.from_numpy(drawn)
+        entries["draws"][student].scatter_add_(0, slots[student], torch.ones_like(slots[student]))
     return slots
 
 
 def insert(
     buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule, wanted: Tensor | None = None
 ) -> None:
-    """Insert levels that were scored, one after another, each in a place of its own.
+    """Inserts levels that were scored, one after another.
 
     A level that is there already gets its new score. Another one gets the next free slot; where
     there is none, that of the level that is least likely to be drawn, if its score is higher than
@@ -189,10 +189,10 @@ def insert(
             ``generation``; ``reached`` where they were trained on. Scores that are not finite are
             those of levels not to be kept.
         rule: of the draws.
-        wanted: bool [K], of the copies whose levels are inserted; None for all.
+        wanted: bool [K], of the students whose levels are inserted; None for all.
     """
 
-    def weigh(falling: rows.Floats) -> rows.Floats:
+    def weigh(falling: Floats) -> Floats:
         count = torch.tensor([len(falling)])
         return shares_by_rank(torch.from_numpy(falling), count, rule).numpy()
 
@@ -200,25 +200,25 @@ def insert(
     entries, fresh = dict(buffer.items()), dict(new.items())
     keys = level_keys(fresh["level"])
     none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
-    for copy in _copies(wanted, len(keys)):
-        score, best = _of_equals(keys[copy], fresh["score"][copy], fresh["best"][copy])
-        given = _row(entries, copy), keys[copy].numpy(), score.numpy(), rule.staleness, weigh
-        source, again = map(torch.from_numpy, rows.insert(*given, by_rank))
-        there = entries["best"][copy]
+    for student in _chosen(wanted, len(keys)):
+        score, best = _of_equals(keys[student], fresh["score"][student], fresh["best"][student])
+        given = _row(entries, student), keys[student].numpy(), score.numpy(), rule.staleness, weigh
+        source, again = map(torch.from_numpy, insert_row(*given, by_rank))
+        there = entries["best"][student]
         there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
         slots = (source >= 0).nonzero().flatten()
         which = source[slots]
-        told = {
+        kept = {
             "best": best,
-            "parent": fresh.get("parent", none)[copy],
-            "generation": fresh.get("generation", none)[copy],
-            "draws": none[copy],
-            "reached": fresh.get("reached", unknown)[copy],
+            "parent": fresh.get("parent", none)[student],
+            "generation": fresh.get("generation", none)[student],
+            "draws": none[student],
+            "reached": fresh.get("reached", unknown)[student],
         }
-        for name, entry in told.items():
-            there = entries[name][copy]
+        for name, entry in kept.items():
+            there = entries[name][student]
             there[slots] = entry[which].to(there)
-        entries["level"][copy, slots] = moved(fresh["level"][copy, which], CPU)
+        entries["level"][student, slots] = moved(fresh["level"][student, which], CPU)
 
 
 def rescore(
@@ -228,7 +228,7 @@ def rescore(
     best: Tensor,
     reached: Tensor | None = None,
 ) -> None:
-    """Take new scores of levels that were drawn.
+    """Replaces the scores of levels that were drawn by new ones.
 
     Args:
         buffer: [K, N].
@@ -245,26 +245,51 @@ def rescore(
     there.scatter_reduce_(1, slots, best.to(there), "amax")
 
 
+def lineage(buffer: TensorDictBase, most: int) -> Tensor:
+    """Returns the slots of the longest line of levels, each edited from the one before: int64 [m].
+
+    Args:
+        buffer: of one student, [N].
+        most: slots of the line, counted from its end, that are returned at most.
+    """
+    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
+    parents = [place.get(key) for key in buffer["parent"].tolist()]
+    longest: list[int] = []
+    for slot in range(len(parents)):
+        line, parent = [slot], parents[slot]
+        while parent is not None and parent not in line and len(line) < most:
+            line.append(parent)
+            parent = parents[parent]
+        longest = max(longest, line, key=len)
+    return torch.tensor(longest[::-1])
+
+
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
-    """What slots [*B, N] held, or the mean of what is new and finite in them, both [*B, P]."""
+    """Returns for each slot the mean of what is new and finite in it, or its old value: [*B, N].
+
+    Args:
+        old: values of all slots, [*B, N].
+        slots: int64 [*B, P].
+        new: values for these, float [*B, P].
+    """
     finite, none = new.isfinite(), torch.zeros_like(old, dtype=torch.float64)
     counts = none.scatter_add(-1, slots, finite.double())
     means = none.scatter_add(-1, slots, new.double().where(finite, 0.0)) / counts
     return means.to(old).where(counts > 0, old)
 
 
-def _copies(wanted: Tensor | None, copies: int) -> list[int]:
-    return list(range(copies)) if wanted is None else wanted.nonzero().flatten().tolist()
+def _chosen(wanted: Tensor | None, students: int) -> list[int]:
+    return list(range(students)) if wanted is None else wanted.nonzero().flatten().tolist()
 
 
-def _row(entries: Mapping[str, Any], copy: int) -> dict[str, Any]:
-    """The numbers of one student, as arrays that share a buffer's memory."""
+def _row(entries: Mapping[str, Any], student: int) -> dict[str, Any]:
+    """Returns the numbers of one student as arrays [N] that share the buffer's memory."""
     names = ("filled", "score", "key", "touched", "clock")
-    return {name: entries[name][copy].numpy() for name in names}
+    return {name: entries[name][student].numpy() for name in names}
 
 
 def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
-    """Numbers [M] as those of all equal levels: the mean of finite scores, the highest return."""
+    """Gives equal levels one score, the mean of the finite ones, and one highest return: [M]."""
     groups, group = key.unique(return_inverse=True)
     unknown = torch.full((len(groups),), torch.nan, dtype=torch.float64)
     mean = _mean_of_slots(unknown, group, score)

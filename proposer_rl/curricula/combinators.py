@@ -19,7 +19,7 @@ from proposer_rl.streams import Streams
 
 
 class Combinator(LearnedCurriculum):
-    """What all of them do alike: everything is passed on to the parts.
+    """The base of curricula that are made of others, to which it passes everything on.
 
     Args:
         parts: the curricula.
@@ -38,32 +38,32 @@ class Combinator(LearnedCurriculum):
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Improve the parts that train something; at most one of them may advance the student."""
+        """Improves the parts that train something; at most one of them may advance the student."""
         improvements = [part.improve(student, streams) for part in self._learned()]
         metrics = {k: value for each in improvements for k, value in each.metrics.items()}
         advances = [each.advance for each in improvements if each.advance is not None]
         return Improvement(metrics, advances[-1] if advances else None)
 
     def log(self) -> dict[str, Any]:
-        """What the parts have to tell; of what several tell, the last one's word."""
+        """Returns the logs of the parts in one; of entries that several have, the last one's."""
         return {key: value for part in self.parts for key, value in part.log().items()}
 
     def learnt(self) -> dict[str, Any]:
-        """What the last part that has learnt something has learnt."""
+        """Returns what the last part has learnt that has learnt something."""
         return next(filter(None, (part.learnt() for part in reversed(self.parts))), {})
 
     def state_dict(self) -> dict[str, Any]:
-        """Those of the parts, too."""
+        """Returns its own state and those of the parts."""
         return {**super().state_dict(), "parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put every part back."""
+        """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         for part, own in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(own)
 
     def close(self) -> None:
-        """Close every part."""
+        """Closes every part."""
         for part in self.parts:
             part.close()
 
@@ -111,7 +111,7 @@ class Filtered(Combinator):
         self._scorer, self._times, self._temperature = scorer, times, temperature
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """The levels that are kept, of a batch of the curriculum's."""
+        """Draws a larger batch from the curriculum, and returns the levels of it that are kept."""
         candidates = self.parts[0].propose(student, self._times * count, streams)
         scored = self._scorer(student, candidates.levels, streams, "choice")
         draws = [s.generator("choice") for s in streams]
@@ -120,14 +120,14 @@ class Filtered(Combinator):
         )
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Pass it on."""
+        """Passes the outcome on to the curriculum that is filtered."""
         self.parts[0].observe(student, batch, outcome)
 
 
 class Schedule(Combinator):
-    """One curriculum after another, such as a hand-designed one.
+    """Follows one curriculum after another, as hand-designed ones do.
 
-    Its clock are its own batches, so that it needs no count of the student's updates.
+    Its clock is the number of its own batches, so that it needs no count of the student's updates.
 
     Args:
         stages: curricula, in order.
@@ -151,7 +151,7 @@ class Schedule(Combinator):
         self._proposed = 0
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """What the present stage proposes."""
+        """Returns what the present stage proposes."""
         stage = self._stage
         batch = self.parts[stage].propose(student, count, streams)
         self._proposed += 1
@@ -160,13 +160,13 @@ class Schedule(Combinator):
         return Batch(batch.levels, TensorDict(notes, batch.notes.batch_size))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Pass it on to the stage that has proposed the levels."""
+        """Passes the outcome on to the stage that has proposed the levels."""
         if batch.count:
             stage = int(batch.notes["stage"][0, 0])
             self.parts[stage].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Improve the stage that the cycle begins with."""
+        """Improves the stage that the cycle begins with."""
         part = self.parts[self._stage]
         if isinstance(part, LearnedCurriculum):
             return part.improve(student, streams)
@@ -178,7 +178,7 @@ class Schedule(Combinator):
 
 
 class Mixed(Combinator):
-    """Batches of which every curriculum has its share.
+    """Makes batches of which every curriculum has its share.
 
     Args:
         curricula: of one kind of levels.
@@ -200,7 +200,7 @@ class Mixed(Combinator):
         self._ends = [sum(shares[: i + 1]) / sum(shares) for i in range(len(shares))]
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n], those of the first curriculum first."""
+        """Returns levels [K, n], those of the first curriculum first."""
         ends = [round(end * count) for end in self._ends]
         counts = [end - start for start, end in zip([0, *ends], ends, strict=False)]
         proposed = {
@@ -220,7 +220,7 @@ class Mixed(Combinator):
         return Batch(levels, TensorDict({"part": whose.expand(shape).clone(), **notes}, shape))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Give every curriculum what it has proposed."""
+        """Gives every curriculum the outcome of what it has proposed."""
         whose = batch.notes["part"][0] if batch.count else torch.zeros(0)
         for i in whose.unique().tolist():
             own = (whose == i).nonzero().flatten()
@@ -228,14 +228,14 @@ class Mixed(Combinator):
             self.parts[i].observe(student, part, outcome[:, own])
 
     def log(self) -> dict[str, Any]:
-        """What each has to tell, by its number."""
-        told: dict[str, Any] = {}
+        """Returns the log of each curriculum, whose entries begin with its number."""
+        record: dict[str, Any] = {}
         levels: dict[str, Any] = {}
         for i, part in enumerate(self.parts):
             log = part.log()
             levels |= {f"{i}: {caption}": some for caption, some in log.pop("levels", {}).items()}
-            told |= {f"{i}_{key}": value for key, value in log.items()}
-        return {**told, "levels": levels} if levels else told
+            record |= {f"{i}_{key}": value for key, value in log.items()}
+        return {**record, "levels": levels} if levels else record
 
 
 def _mixes(curriculum: Curriculum) -> bool:
@@ -246,7 +246,7 @@ def _mixes(curriculum: Curriculum) -> bool:
 def draw_without_replacement(
     logits: Tensor, count: int, generators: Sequence[torch.Generator]
 ) -> Tensor:
-    """Draw places one after another, in proportion to exp(logit) of those that are left.
+    """Draws places one after another, in proportion to exp(logit) of those that are left.
 
     The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
 

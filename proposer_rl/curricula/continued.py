@@ -12,7 +12,7 @@ when the last of them is over; levels that one of them did not come to are left 
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,7 +32,7 @@ GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
 """Needs of a curriculum that reads what a policy has seen off rollouts."""
 
 Played = tuple[Levels, TensorDictBase]
-"""Levels [K, m], and a rollout [K, m, T] of an episode on each."""
+"""Levels [K, m], and a rollout [K, m, T] with one episode on each."""
 
 Credit = tuple[Batch, TensorDict]
 """A batch or a part of one, and its outcome."""
@@ -56,19 +56,19 @@ class ContinuedLevels:
         self._curriculum, self._student, self._learner = curriculum, student, learner
         self._episodes = learner.collector.episodes
         self._episodes.next_levels = self._next_levels
-        copies, count = learner.env.batch_size
+        students, count = learner.env.batch_size
         self._ledger = Ledger({"episode": object})
-        self._waiting: list[deque[int]] = [deque() for _ in range(copies)]  # ids of each student
-        self._levels = like[:1].expand(copies, count).clone()  # that are played, or set
-        self._playing = [[-1] * count for _ in range(copies)]
+        self._at = [0] * students  # the next id of each; what is from there on waits
+        self._levels = like[:1].expand(students, count).clone()  # that are played, or set
+        self._playing = [[-1] * count for _ in range(students)]
         self._over: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._most = count  # episodes of a student that ended in an update
-        self._steps = torch.zeros(copies, count, dtype=torch.int64)  # of the present episodes
+        self._steps = torch.zeros(students, count, dtype=torch.int64)  # of the present episodes
         self._history: TensorDictBase | None = None  # [K, P, H], which ends with the last update
         self._shown: Played | None = None
 
     def update(self, streams: Sequence[Streams]) -> tuple[Update, list[Credit]]:
-        """One update; the actions and the levels are drawn from streams of its own, K of them.
+        """Makes one update, whose actions and levels are drawn from K streams of its own.
 
         Returns:
             The update, and what is to be observed now.
@@ -88,36 +88,41 @@ class ContinuedLevels:
 
     def _propose(self, streams: Sequence[Streams]) -> None:
         count = self._steps.shape[1]
-        wanted = count + self._most - min(map(len, self._waiting))
+        wanted = count + self._most - (self._ledger.next - max(self._at))
         batch = self._curriculum.propose(self._student, max(wanted, 1), streams)
-        block = self._ledger.add(batch)
-        for copy, waiting in enumerate(self._waiting):
-            while len(waiting) > count:
-                self._ledger.drop_one(waiting.popleft(), copy)
-            waiting.extend(range(block.start, block.end))
+        for student, at in enumerate(self._at):
+            self._at[student] = max(at, self._ledger.next - count)
+            for id in range(at, self._at[student]):
+                self._ledger.drop_one(id, student)
+        self._ledger.add(batch)
 
     def _next_levels(self, begins: Tensor) -> Levels:
-        """What is played from now on where episodes begin, bool [K, P]."""
+        """Returns the levels [K, P] that are played from now on, new ones where episodes begin.
+
+        Args:
+            begins: where they do, bool [K, P].
+        """
         if self._episodes.fresh:
             self._forget()
-        for copy, env in begins.nonzero().tolist():
-            self._over[copy, env].append(self._playing[copy][env])
-            if self._waiting[copy]:
-                id = self._playing[copy][env] = self._waiting[copy].popleft()
-                self._levels[copy, env] = self._ledger.hand_out(id, copy)
+        for student, env in begins.nonzero().tolist():
+            self._over[student, env].append(self._playing[student][env])
+            if self._at[student] < self._ledger.next:
+                id = self._playing[student][env] = self._at[student]
+                self._at[student] += 1
+                self._levels[student, env] = self._ledger.hand_out(id, student)
         if self._episodes.fresh:
             self._over.clear()  # what had been played before has no end
         return self._levels
 
     def _forget(self) -> None:
-        """Give up the episodes that have been broken off."""
-        for copy, row in enumerate(self._playing):
+        """Drops the episodes that have been broken off."""
+        for student, row in enumerate(self._playing):
             for id in row:
-                self._ledger.drop_one(id, copy)
+                self._ledger.drop_one(id, student)
         self._history, self._steps = None, torch.zeros_like(self._steps)
 
     def _cut(self, rollout: TensorDictBase) -> None:
-        """Take the episodes that have ended in a rollout [K, P, T] out of what was played."""
+        """Notes the episodes that ended in a rollout [K, P, T], and keeps what has not ended."""
         kept = rollout.exclude("advantage", "value_target")
         if not GRADIENTS & {*self._curriculum.needs}:
             seen = self._learner.agent.step_keys
@@ -126,32 +131,32 @@ class ContinuedLevels:
         before, length = history.shape[2] - rollout.shape[2], history.shape[2]
         begun = before - self._steps
         ends = rollout["next", "done"].squeeze(-1).nonzero()
-        for copy, env, step in ends.tolist():
-            id = self._over[copy, env].pop(0)
+        for student, env, step in ends.tolist():
+            id = self._over[student, env].pop(0)
             end = before + step + 1
-            episode = history[copy, env, int(begun[copy, env]) : end]
-            begun[copy, env] = end
-            if self._ledger.is_out(id, copy):  # further episodes on a level do not count
-                self._ledger.tell_one(id, {"episode": episode.clone()}, copy)
+            episode = history[student, env, int(begun[student, env]) : end]
+            begun[student, env] = end
+            if self._ledger.is_out(id, student):  # further episodes on a level do not count
+                self._ledger.tell_one(id, {"episode": episode.clone()}, student)
         self._most = int(ends[:, 0].bincount(minlength=1).max())
         self._steps = length - begun
         self._history = history[:, :, length - int(self._steps.max()) :].clone()
 
     @property
     def shown(self) -> Played:
-        """The levels that were observed last, and the episodes on them [K, m, T].
+        """Returns the levels that were observed last, and the episodes on them [K, m, T].
 
-        Before anything was observed, the levels that are played, without a step (T = 0).
+        Before anything was observed these are the levels that are played, without a step (T = 0).
         """
         assert self._history is not None  # after an update
         return self._shown or (self._levels, self._history[:, :, :0])
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a resumed run needs, the actions of episodes that are not over included."""
+        """Returns all that a resumed run needs, with the actions of episodes that are not over."""
         memory = self._learner.collector.memory
         discounted = self._learner.statistics.discounted
         return {
-            "waiting": [list(waiting) for waiting in self._waiting],
+            "at": list(self._at),
             "levels": packed(self._levels),
             "playing": [list(row) for row in self._playing],
             "most": self._most,
@@ -164,13 +169,13 @@ class ContinuedLevels:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it: episodes that are not over are played again up to where they were.
+        """Puts back a state, and plays episodes that are not over again up to where they were.
 
         Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
         """
         device = self._learner.env.device
         self._most = state["most"]
-        self._waiting = [deque(waiting) for waiting in state["waiting"]]
+        self._at = list(state["at"])
         self._levels = _of_kind(self._levels, state["levels"])
         self._playing = [list(row) for row in state["playing"]]
         self._steps = state["steps"].clone()
@@ -193,14 +198,14 @@ class ContinuedLevels:
 
 
 def _of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Levels as others are, and where they are."""
+    """Returns levels of the class and on the device of others, from nested dicts."""
     return moved(of_kind(like, state), device_of(like))
 
 
 def outcome_of_episodes(episodes: Sequence[Sequence[TensorDictBase]]) -> TensorDict:
-    """What came of levels [K, m] from the one episode [T] on each of them.
+    """Returns the outcome of levels [K, m] by the one episode [T] that was played on each.
 
-    They are filled up with zeros to one rollout [K, m, T], whose ``is_step`` says what is played.
+    Episodes are filled up with zeros to one rollout [K, m, T], whose ``is_step`` marks real steps.
     """
     longest = max(len(episode) for row in episodes for episode in row)
 

@@ -69,14 +69,14 @@ class Batch:
 
     @property
     def count(self) -> int:
-        """Levels n of each student."""
+        """The number n of levels of each student."""
         return int(self.notes.batch_size[1])
 
     def __getitem__(self, index: Any) -> Batch:
         return Batch(self.levels[index], self.notes[index])
 
     def keep(self, index: Tensor) -> Batch:
-        """The batch as it were if only these levels had been proposed.
+        """Returns the batch as if only these levels had been proposed.
 
         Args:
             index: places of the levels that are kept, in their new order, int64 [K, m].
@@ -87,7 +87,7 @@ class Batch:
 
 
 def outcome_of(rollout: TensorDictBase) -> TensorDict:
-    """What came of training on levels, from TorchRL's rollout [K, n, T] or [n, T] on them.
+    """Returns the outcome of levels, from TorchRL's rollout [K, n, T] or [n, T] on them.
 
     Every outcome is a tensordict [K, n] with
 
@@ -99,7 +99,7 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
       ``is_step`` bool [K, n, T] where episodes are filled up to one length;
     - ``score`` float, where the loop itself says how much there is to learn on a level.
 
-    Curricula without a use for an entry do not ask for it; ``return`` must be there.
+    Only ``return`` must be there; curricula name others that they cannot do without (``reads``).
     """
     done = rollout["next", "done"].squeeze(-1)
     episodes = done.sum(-1)
@@ -134,7 +134,7 @@ class Curriculum:
     remembers: ClassVar[tuple[str, ...]] = ()
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels for the students to train on next.
+        """Returns levels for the students to train on next.
 
         Args:
             student: as it is.
@@ -144,7 +144,7 @@ class Curriculum:
         raise TypeError(f"{type(self).__name__} must define propose(student, count, streams)")
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Take notice of what came of a batch or a part of one.
+        """Learns from the outcome of a batch or of a part of one.
 
         Args:
             student: after it has trained on the levels, or while it does.
@@ -156,34 +156,34 @@ class Curriculum:
         """
 
     def log(self) -> dict[str, Any]:
-        """What there is to tell since the last call, ready for JSON; empty if there is nothing.
+        """Returns what happened since the last call, ready for JSON; empty if nothing did.
 
-        ``levels`` in it are levels [m] by their captions. It is called after every cycle.
+        Its entry ``levels`` has levels [m] by their captions. It is called after every cycle.
         """
         return {}
 
     def learnt(self) -> dict[str, Any]:
-        """What runs on other students can begin with, part of the state; empty if there is none."""
+        """Returns the part of the state that runs on other students can begin with, or nothing."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a resumed run needs: nested dicts of tensors, numbers and strings."""
+        """Returns all that a resumed run needs, in nested dicts of tensors, numbers and strings."""
         kind: Any = type(self)
         _warn_of_nothing(kind)
         return {name.strip("_"): saved(getattr(self, name)) for name in self.remembers}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put back what :meth:`state_dict` returned."""
+        """Puts back what :meth:`state_dict` returned."""
         for name in self.remembers:
             setattr(self, name, restored(state[name.strip("_")], getattr(self, name)))
 
     def close(self) -> None:
-        """Let go of all that is held outside of this process."""
+        """Releases what is held outside of this process."""
 
 
 @dataclass
 class Advance:
-    """Updates that the student has got from a curriculum itself, instead of the cycle's.
+    """Updates of the student that a curriculum made itself, in place of the cycle's.
 
     Attributes:
         updates: how many.
@@ -198,7 +198,7 @@ class Advance:
 
 @dataclass
 class Improvement:
-    """What a curriculum did before a cycle.
+    """The result of what a curriculum did before a cycle.
 
     Attributes:
         metrics: as :meth:`Curriculum.log` gives them.
@@ -219,9 +219,9 @@ class LearnedCurriculum(Curriculum):
     trains_replicas: bool = False
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Prepare for the next cycle, whose first proposal has not been made.
+        """Prepares for the next cycle, whose first proposal has not been made.
 
-        After whatever it raises may come :meth:`Curriculum.load_state_dict`, and a repeated call.
+        If it raises, :meth:`Curriculum.load_state_dict` and another call may follow.
 
         Args:
             student: as it is before the cycle.
@@ -231,7 +231,7 @@ class LearnedCurriculum(Curriculum):
 
 
 class Inbox:
-    """Evidence on levels, in the order in which they were proposed, however it comes in.
+    """Evidence on levels, which comes in any order and is given back in the order of proposal.
 
     It numbers batches and the places of their levels in the notes (``number``, ``place``, and the
     ``size`` n of the batch, each int64 [K, n]), keeps what curricula reduce an outcome to, and
@@ -248,32 +248,32 @@ class Inbox:
         self._parts: list[TensorDict] = []  # [K, m]
 
     def batch(self, levels: Levels, **notes: Tensor) -> Batch:
-        """A new batch [K, n], with the next number and these notes [K, n]."""
-        copies, count = levels.shape[:2]
-        number = torch.full((copies, count), self._next)
+        """Makes a batch of levels [K, n], with the next number and these notes [K, n]."""
+        students, count = levels.shape[:2]
+        number = torch.full((students, count), self._next)
         self._next += 1
         every = {**notes, "number": number, **_places(torch.ones_like(number, dtype=torch.bool))}
-        return Batch(levels, TensorDict(every, (copies, count)))
+        return Batch(levels, TensorDict(every, (students, count)))
 
     def check(self, batch: Batch, outcome: TensorDictBase) -> None:
-        """Check an outcome before anything is made of it; this waits for the device.
+        """Checks an outcome before anything is made of it, which waits for the device.
 
         Raises:
             ValueError: if it has another shape than the batch, a number in it is not finite, or the
                 batch is none of this curriculum's, or some of it was observed before and has not
                 been taken yet.
         """
-        notes, told = dict(batch.notes.items()), dict(outcome.items())
+        notes, came = dict(batch.notes.items()), dict(outcome.items())
         shape = list(batch.notes.batch_size)
         if list(outcome.batch_size) != shape:
             raise ValueError(
                 f"the outcome has shape {list(outcome.batch_size)}, the batch {shape}: there must "
                 "be one entry for each level"
             )
-        if "return" not in told:
-            raise ValueError(f"the outcome has no return, only {sorted(map(str, told))}")
-        for name in {"return", "success", "score"} & told.keys():
-            if not bool(told[name].isfinite().all()):
+        if "return" not in came:
+            raise ValueError(f"the outcome has no return, only {sorted(map(str, came))}")
+        for name in {"return", "success", "score"} & came.keys():
+            if not bool(came[name].isfinite().all()):
                 raise ValueError(f"the outcome's {name} is not finite on every level")
         if not {"number", "place", "size"} <= notes.keys():
             raise ValueError(f"the batch is of another curriculum: its notes are {[*notes]}")
@@ -291,14 +291,14 @@ class Inbox:
             raise ValueError(f"levels of batch {number} have been observed before")
 
     def put(self, batch: Batch, **evidence: Any) -> None:
-        """Put evidence [K, n] on a batch, or a part of one, aside."""
+        """Keeps evidence [K, n] on a batch, or on a part of one."""
         if batch.count:
             where = batch.notes.select("number", "place", "size")
             part = TensorDict({**where, **evidence}, batch.notes.batch_size, device="cpu")
             self._parts.append(part)
 
     def take(self, whole: bool = False) -> list[TensorDict]:
-        """The evidence that has come in: a tensordict [K, m] for each batch, in their order.
+        """Returns the evidence that has come in, a tensordict [K, m] for each batch in their order.
 
         Args:
             whole: whether parts stay until their batch is complete, and later batches with them.
@@ -321,18 +321,18 @@ class Inbox:
         return taken
 
     def state_dict(self) -> dict[str, Any]:
-        """The next number, and what has not been taken."""
+        """Returns the next number, and the evidence that has not been taken."""
         return {"next": self._next, "parts": [packed(part) for part in self._parts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
+        """Puts back what :meth:`state_dict` returned."""
         self._next = int(state["next"])
         self._parts = [unpacked(part, self._like) for part in state["parts"]]
 
 
 @functools.cache
 def _warn_of_nothing(kind: type[Curriculum]) -> None:
-    """Warn of a class that observes, and does not say what is to be saved of that."""
+    """Warns, once, of a class that observes and does not say what of that is to be saved."""
     said = kind.state_dict is not Curriculum.state_dict or any(
         "remembers" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
     )
@@ -350,7 +350,7 @@ def _places(own: Tensor) -> dict[str, Tensor]:
 
 
 def _renumber(notes: TensorDictBase, own: Tensor) -> None:
-    """Count the places of all numbered notes [K, n] anew, also of those within.
+    """Counts the places of all numbered notes [K, n] anew, also of nested ones.
 
     Args:
         notes: of a curriculum, and in them of those that it is made of; of a mixture these are

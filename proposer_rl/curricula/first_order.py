@@ -16,7 +16,7 @@ from proposer_rl.curricula.bins import (
     Probes,
     along_axes,
     means_of_bins,
-    tell_cost,
+    warn_of_cost,
 )
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.student import Student
@@ -67,7 +67,7 @@ class FirstOrderCurriculum(_AlignedBins):
         smoothing: share of the old score in the average.
         target_levels: fresh levels E of the target that the direction is taken from.
         candidates: levels C of each bin.
-        step: of the differences that tell the alignments, in learning rates.
+        step: of the differences that give the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
     """
@@ -89,7 +89,7 @@ class FirstOrderCurriculum(_AlignedBins):
         measure: TargetMeasure = "log_success",
     ) -> None:
         super().__init__(space, every, temperature, smoothing)
-        tell_cost(space, candidates, "candidates")
+        warn_of_cost(space, candidates, "candidates")
         self._target, self._target_levels = target, target_levels
         self._candidates, self._step, self._measure = candidates, step, measure
 
@@ -241,7 +241,7 @@ def alignments(evidence: TensorDict) -> Tensor:
     Where training standardises advantages over a batch, theirs are standardised over these levels.
 
     Args:
-        evidence: as :meth:`SampledFirstOrderCurriculum.evidence` returns it, [K, m].
+        evidence: what :meth:`SampledFirstOrderCurriculum.evidence` returns, [K, m].
     """
     aligned: Tensor = evidence["slope"]
     if "drift" not in evidence.keys():

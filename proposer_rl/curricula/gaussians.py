@@ -20,7 +20,7 @@ from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_single_bin
 
-LEAST_STORED = 6  # earlier episodes, below which there is no progress to tell
+LEAST_STORED = 6  # earlier episodes, below which progress is 0
 CHUNK = 2**16  # earlier episodes that are compared at once
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
@@ -34,7 +34,7 @@ class MixtureCurriculum(Curriculum):
     drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
     fitted to the points and the progress of the last ``refit``, from which all but a part of the
     draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
-    :func:`fit` and :func:`draw`).
+    :func:`fit_mixture` and :func:`draw_points`).
 
     Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.
     Bins and not points are compared: between two points with a border of bins in between, the
@@ -101,14 +101,14 @@ class MixtureCurriculum(Curriculum):
         self._warmup, self._exploration, self._rounded = warmup, exploration, rounded
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
-        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit
+        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit_mixture
         self._fitted = 0  # episodes at the last fit
         self._inbox = Inbox()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n] of the bins nearest to the points drawn."""
+        """Draws points, and returns levels [K, n] of the bins nearest to them."""
         self._take_in()
         self._fit(streams)
         drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
@@ -124,7 +124,7 @@ class MixtureCurriculum(Curriculum):
         return self._inbox.batch(levels, **notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Put tasks and returns aside for the histories."""
+        """Keeps tasks and returns, which the next proposal adds to the histories."""
         self._inbox.check(batch, outcome)
         notes = batch.notes
         self._counts += counts_of_bins(notes["bins"], self.space)
@@ -132,7 +132,7 @@ class MixtureCurriculum(Curriculum):
         self._inbox.put(batch, points=notes["points"], bins=notes["bins"], returns=returns)
 
     def log(self) -> dict[str, Any]:
-        """Counts, the mixtures, and how often a draw was clipped."""
+        """Returns counts of levels by bin, the mixtures, and how often a draw was clipped."""
         self._take_in()
         if not self._history:
             return {}
@@ -148,7 +148,7 @@ class MixtureCurriculum(Curriculum):
         }
 
     def _take_in(self) -> None:
-        """Add tasks, returns and progress to the histories."""
+        """Adds tasks, returns and progress to the histories."""
         for evidence in self._inbox.take():
             points, returns = evidence["points"], evidence["returns"]
             tasks = self.space.coordinates.double()[evidence["bins"]] if self._rounded else points
@@ -163,7 +163,7 @@ class MixtureCurriculum(Curriculum):
             }
 
     def _fit(self, streams: Sequence[Streams]) -> None:
-        """Fit new mixtures if it is time."""
+        """Fits new mixtures if it is time."""
         episodes = self._history["returns"].shape[1] if self._history else 0
         due = episodes // self._refit > self._fitted // self._refit
         if episodes < self._warmup or not due:
@@ -171,27 +171,27 @@ class MixtureCurriculum(Curriculum):
         last = {name: entry[:, -self._refit :] for name, entry in self._history.items()}
         seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [K, refit, D + 1]
         self._mixtures = [
-            fit(own, self._components, s.generator("mixture"))
+            fit_mixture(own, self._components, s.generator("mixture"))
             for own, s in zip(seen, streams, strict=True)
         ]
         self._fitted = episodes
 
     def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
-        """A batch of points for one student, float64 [n, D]."""
+        """Draws a batch of points for one student, float64 [n, D]."""
         size = self.space.coordinates.shape[1]
         uniform = 2 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 1
         if not self._mixtures:
             return uniform
         explored = torch.rand(count, generator=generator) < self._exploration
-        drawn = draw(*self._mixtures[student], count, generator)
+        drawn = draw_points(*self._mixtures[student], count, generator)
         kept = drawn.clamp(-1, 1)
         clipped = (kept != drawn).any(-1) & ~explored
         self._drawn = self._drawn + torch.stack([(~explored).sum(), clipped.sum()])
         return torch.where(explored.unsqueeze(-1), uniform, kept)
 
 
-def fit(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The mixture of 2 to ``most`` Gaussians with the least AIC.
+def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the least AIC.
 
     Full covariances, expectation maximisation from one start by k-means
     (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
@@ -224,13 +224,15 @@ def fit(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, 
     return torch.from_numpy(best.means_), torch.from_numpy(best.covariances_)
 
 
-def draw(means: Tensor, covariances: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Points of the mixture's Gaussians, each drawn in proportion to its mean's progress.
+def draw_points(
+    means: Tensor, covariances: Tensor, count: int, generator: torch.Generator
+) -> Tensor:
+    """Draws points from a mixture's Gaussians, each in proportion to its mean's progress.
 
     Where no Gaussian has progress, all are alike.
 
     Args:
-        means: of the Gaussians, as :func:`fit` gives them.
+        means: of the Gaussians, as :func:`fit_mixture` gives them.
         covariances: likewise.
         count: number P of draws.
         generator: of the CPU.
@@ -248,7 +250,7 @@ def draw(means: Tensor, covariances: Tensor, count: int, generator: torch.Genera
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:
-    """The place nearest to each point, the last of equally near ones.
+    """Finds the place nearest to each point, the last of equally near ones.
 
     Args:
         points: float [n, D].
@@ -276,7 +278,7 @@ def nearest(points: Tensor, places: Tensor) -> Tensor:
 def absolute_progress(
     tasks: Tensor, returns: Tensor, new_tasks: Tensor, new_returns: Tensor
 ) -> Tensor:
-    """|r - r'| of new episodes, r' the return on the nearest of earlier tasks; else 0.
+    """Returns |r - r'| of new episodes, with r' the return on the nearest of earlier tasks.
 
     Portelas et al. 2019 (arXiv 1910.07224), equation of the absolute learning progress. As in their
     code, it is 0 as long as no more than five are stored.

@@ -1,4 +1,4 @@
-"""One record of which levels are where: by rising id, each waiting, out, told or over."""
+"""One record of which levels are where: by rising id, each waiting, out, returned or over."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from proposer_rl.task import Levels
 
 Ids = NDArray[np.int64]
 
-WAITING, OUT, TOLD, OVER = range(4)
+WAITING, OUT, RETURNED, OVER = range(4)
 """Proposed; handed out; with a result that has not been observed; observed or dropped."""
 STATES = ("has not been handed out", "", "has been told before", "is over")
 
@@ -73,11 +73,11 @@ class Ledger:
     Attributes:
         next: the id of the next level.
         blocks: those in which something is not over.
-        told: whether there is a result that :meth:`take` has not given.
+        returned: whether there is a result that :meth:`take` has not given.
     """
 
     def __init__(self, kinds: Mapping[str, type]) -> None:
-        self.next, self.told = 0, False
+        self.next, self.returned = 0, False
         self.blocks: list[Block] = []
         self._kinds = dict(kinds)
 
@@ -146,8 +146,8 @@ class Ledger:
         for block, which, place in parts:
             for name, result in results.items():
                 block.results[name][:, place] = result[:, which]
-            block.state[:, place] = TOLD
-        self.told = True
+            block.state[:, place] = RETURNED
+        self.returned = True
 
     def tell_one(self, id: int, results: Mapping[str, Any], student: int = 0) -> None:
         """Notes the results of one level of one student.
@@ -162,8 +162,8 @@ class Ledger:
         assert block is not None
         for name, result in results.items():
             block.results[name][student, place] = result
-        block.state[student, place] = TOLD
-        self.told = True
+        block.state[student, place] = RETURNED
+        self.returned = True
 
     def drop(self, parts: list[Found]) -> None:
         """Notes that nothing more comes of ids that were found."""
@@ -187,7 +187,7 @@ class Ledger:
             block.state[block.state == OUT] = OVER
 
     def take(self, settled: bool = False) -> Iterator[tuple[Batch, dict[str, NDArray[Any]]]]:
-        """Yields what has been told since the last time, block by block, and forgets what is over.
+        """Yields the results since the last time, block by block, and forgets what is over.
 
         Args:
             settled: whether a block is taken only when none of its levels waits. Its batch is then
@@ -197,7 +197,7 @@ class Ledger:
         Yields:
             A part of a batch [K, m], and its results [K, m] by name.
         """
-        for block in self.blocks if self.told or settled else ():
+        for block in self.blocks if self.returned or settled else ():
             state = block.state
             if settled and (state == WAITING).any():
                 continue
@@ -205,7 +205,7 @@ class Ledger:
                 block.places = np.flatnonzero((state != OVER).all(0))
                 kept = torch.from_numpy(block.places).expand(len(state), -1)
                 block.batch = block.batch.keep(kept)
-            ready = np.flatnonzero((state == TOLD).all(0))
+            ready = np.flatnonzero((state == RETURNED).all(0))
             if not len(ready):
                 continue
             part = ready if block.places is None else block.places.searchsorted(ready)
@@ -216,7 +216,7 @@ class Ledger:
             for name, kind in self._kinds.items():
                 if kind is object:
                     block.results[name][:, ready] = None
-        self.told = False
+        self.returned = False
         self.blocks = [b for b in self.blocks if not _is_over(b)]
 
     def _refuse(self, id: int, state: int) -> NoReturn:
@@ -228,7 +228,7 @@ class Ledger:
         """Returns all of it, with the levels that are not over."""
         return {
             "next": self.next,
-            "told": self.told,
+            "returned": self.returned,
             "blocks": [
                 {
                     "start": block.start,
@@ -267,7 +267,7 @@ class Ledger:
                 for name, result in kept["results"].items()
             }
             self.blocks.append(block)
-        self.next, self.told = state["next"], state["told"]
+        self.next, self.returned = state["next"], state["returned"]
 
 
 def _is_over(block: Block) -> bool:

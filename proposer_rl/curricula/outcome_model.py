@@ -29,14 +29,26 @@ deviation 1 by their weights,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDict
+from annotated_types import Ge
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.combinators import Combinator
+from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, Inbox
+from proposer_rl.curricula.student import ABILITIES, Student
+from proposer_rl.settings import Positive, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
+
 Labels = Literal["success", "above_worst"]
+Features = Callable[[Levels], Tensor]
+"""What a model knows of levels [K, n] by themselves: float [K, n, F], each about -1 to 1."""
 
 KEPT = 4  # half-lives, after which a batch is forgotten
 STEPS = 50  # of Newton's method, at most
@@ -44,11 +56,17 @@ HALVINGS = 8  # of a step, at most, until it makes the loss no larger
 CLOSE = 1e-10  # coefficients that change no more than this are found
 EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
 
+ANSWERED = ("performance", "exact_performance")
+FIRST = 128  # levels that came back first, by which it is judged what the labels say
+ALIKE = 0.95  # share of them with one label, beyond which that is nearly nothing
+WRONG = 0.1  # share of them with another success than their label, beyond which it should be read
+PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
+
 
 def logistic_ridge(
     features: Tensor, labels: Tensor, weights: Tensor, ridge: float
 ) -> tuple[Tensor, Tensor]:
-    """Fit K logistic regressions by Newton's method; all coefficients are penalised.
+    """Fits K logistic regressions by Newton's method; all coefficients are penalised.
 
     Args:
         features: float64 [K, m, F].
@@ -62,7 +80,7 @@ def logistic_ridge(
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
 
     def at(beta: Tensor) -> tuple[Tensor, Tensor]:
-        """Log odds [K, m], and the loss [K]."""
+        """Returns log odds [K, m], and the loss [K]."""
         z = _times(features, beta)
         misfit = torch.nn.functional.softplus(z) - labels * z
         return z, (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
@@ -89,7 +107,7 @@ def logistic_ridge(
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Fit K linear regressions to values, float64 [K, m]; else as :func:`logistic_ridge`.
+    """Fits K linear regressions to values float64 [K, m], with the rest as in logistic_ridge.
 
     Returns:
         Coefficients, float64 [K, F], all of which are penalised.
@@ -100,10 +118,10 @@ def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float
 
 
 class OutcomeModel:
-    """What K students would reach on levels, by what came of the last batches.
+    """Predicts what K students would reach on levels, from the outcomes of the last batches.
 
     Args:
-        labels: what the probability is of: ``"success"``, as outcomes tell it; or
+        labels: what the probability is of: ``"success"``, as outcomes have it; or
             ``"above_worst"``, a return above the lowest that there ever was. Where failures all
             have the same return, the two are one. Where every step is rewarded, nearly every
             episode is above the worst: no level is silent, and each teaches something.
@@ -118,14 +136,14 @@ class OutcomeModel:
         self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
-        # One that is not needed is not always told.
+        # Outcomes do not always have an entry that nobody needs.
         self.reads = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
 
     def add(self, features: Tensor, outcome: Mapping[str, Tensor], *, as_old: bool = False) -> None:
-        """Take in a batch.
+        """Adds a batch to the data.
 
         Args:
             features: float64 [K, m, F]; a constant one is a further intercept.
@@ -141,7 +159,7 @@ class OutcomeModel:
         self._fitted = None
 
     def predict(self, features: Tensor) -> TensorDict:
-        """What to expect on levels with features float64 [K, n, F]: a tensordict [K, n].
+        """Predicts the outcome of levels with features float64 [K, n, F]: a tensordict [K, n].
 
         ``success`` and ``return``, each float64. Before there is any row they are 0.5 and 0
         everywhere.
@@ -163,18 +181,18 @@ class OutcomeModel:
         )
 
     def labels(self, outcome: Mapping[str, Tensor]) -> Tensor:
-        """What an outcome [K, m] is to the model, in [0, 1]: float64 [K, m]."""
+        """Returns the labels in [0, 1] that the model takes from an outcome: float64 [K, m]."""
         if self._labels == "success":
             return outcome["success"]
         worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
         return (outcome["return"] > worst + EQUAL * (1 + worst.abs())).double()
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows, and the worst return."""
+        """Returns the data, and the worst return."""
         return {"batches": [dict(batch) for batch in self._batches], "worst": self._worst}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
+        """Puts back what :meth:`state_dict` returned."""
         self._batches = [dict(batch) for batch in state["batches"]]
         self._worst, self._fitted = state["worst"], None
 
@@ -205,8 +223,155 @@ class OutcomeModel:
         )
 
 
+class Modelled(Combinator):
+    """A curriculum that asks a model of outcomes instead of the student how well it does.
+
+    Whatever the curriculum asks as ``performance`` or ``exact_performance``, by a scoring pass or a
+    filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
+    to what came of the levels that the student was trained on. That costs no frames, no
+    evaluations and no oracle.
+
+    Args:
+        curriculum: any.
+        features: of levels, such as ``task.features`` or a space's alone, see
+            :func:`~proposer_rl.task.space_features`.
+        labels, ridge, half_life: see the model.
+    """
+
+    remembers = ("_model", "_inbox", "_seen", "_has_taken")
+
+    @checked
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        features: Features,
+        *,
+        labels: Labels = "above_worst",
+        ridge: Positive = 0.3,
+        half_life: Annotated[float, Ge(1)] = 12.0,
+    ) -> None:
+        super().__init__([curriculum])
+        self.needs = tuple(need for need in self.needs if need not in ANSWERED)
+        if labels == "success" and "success" not in self.reads:
+            self.reads = (*self.reads, "success")
+        self._features, self._labels = features, labels
+        self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
+        self._inbox = Inbox()
+        self._has_taken = False  # whether anything since the last proposal, as logs make it
+        self._seen: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
+        self._first: list[Tensor] | None = []  # that came back, [2, K, n]; None once judged
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Returns what the curriculum proposes, with a student whose performance is predicted."""
+        self._take_in()
+        self._has_taken = False
+        batch = self.parts[0].propose(_answering(student, self._predict), count, streams)
+        phi = self._phi(batch.levels)
+        predicted = self._model.predict(phi)["success"]
+        return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Keeps the outcome for the model, and passes it on to the curriculum.
+
+        Raises:
+            ValueError: if the outcome has no success and success is what is labelled.
+        """
+        self._inbox.check(batch, outcome)
+        if self._labels == "success" and "success" not in outcome.keys():
+            raise ValueError("labels=success: the outcome has no success; above_worst needs none")
+        reached = {name: outcome[name].double() for name in self._model.reads}
+        self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
+        self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
+        if self._first is not None and self._labels == "above_worst":
+            self._judge(outcome)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` returned; labels are not judged again."""
+        super().load_state_dict(state)
+        self._first = None
+
+    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+        """Improves the curriculum, with a student whose performance the model predicts."""
+        return super().improve(_answering(student, self._predict), streams)
+
+    def log(self) -> dict[str, Any]:
+        """Returns also how right the model was about levels before it saw their outcomes.
+
+        ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``,
+        that of one number for all; ``reliability``, for each tenth of the probabilities how many
+        were predicted there, their mean, and the mean of what it was; of each student.
+        """
+        self._take_in()
+        log = super().log()
+        if not self._seen:
+            return log
+        predicted, label = (
+            torch.cat([seen[name] for seen in self._seen], 1) for name in ("predicted", "label")
+        )
+        self._seen = []
+        part = (predicted * PARTS).long().clamp(max=PARTS - 1)
+        sums = [
+            torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
+            for values in (torch.ones_like(label), predicted, label)
+        ]
+        means = [(total / sums[0].clamp(min=1)).tolist() for total in sums[1:]]
+        constant = (label - label.mean(1, keepdim=True)).square().mean(1)
+        return log | {
+            "brier": (predicted - label).square().mean(1).tolist(),
+            "brier_constant": constant.tolist(),
+            "reliability": {
+                "levels": sums[0].long().tolist(),
+                "predicted": means[0],
+                "reached": means[1],
+            },
+        }
+
+    def _judge(self, outcome: TensorDictBase) -> None:
+        """Warns where the first outcomes show that the labels say little."""
+        returns = outcome["return"].double().cpu()
+        success = outcome.get("success", torch.full_like(returns, torch.nan)).double().cpu()
+        self._first = [*(self._first or []), torch.stack([returns, success])]
+        first = torch.cat(self._first, -1)  # [2, K, m]
+        if first.shape[-1] < FIRST:
+            return
+        self._first = None
+        label = OutcomeModel(labels="above_worst").labels({"return": first[0]})
+        wrong = (first[1] - label).abs().nanmean()  # NaN where there is none
+        found = f"labels=above_worst: {float(label.mean()):.0%} of the first returns are that"
+        if wrong > WRONG:
+            warnings.warn(
+                f"{found}, and not the success that was told, which labels=success reads",
+                stacklevel=2,
+            )
+        elif wrong.isnan() and label.mean() > ALIKE:
+            warnings.warn(
+                f"{found}, so that the labels say nearly nothing; give labels=success, and tell it",
+                stacklevel=2,
+            )
+
+    def _take_in(self) -> None:
+        """Adds the outcomes since the last proposal to the model's data as one batch."""
+        if not (taken := self._inbox.take()):
+            return
+        evidence: Any = torch.cat(taken, 1)
+        label = self._model.labels(evidence)
+        self._seen.append({"predicted": evidence["predicted"], "label": label})
+        self._model.add(evidence["features"], evidence, as_old=self._has_taken)
+        self._has_taken = True
+
+    def _predict(self, levels: Levels) -> TensorDict:
+        return self._model.predict(self._phi(levels)).to(device_of(levels))
+
+    def _phi(self, levels: Levels) -> Tensor:
+        phi = self._features(levels).double().cpu()
+        wrong = (~phi.isfinite()).sum()
+        if wrong:
+            raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
+        return phi
+
+
 class _Fitted(NamedTuple):
-    """Regressions on features and age, and the mean and deviation of returns [K, 1]."""
+    """The coefficients of fitted regressions, and the mean and deviation of returns [K, 1]."""
 
     beta: Tensor
     covariance: Tensor
@@ -217,3 +382,18 @@ class _Fitted(NamedTuple):
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _answering(student: Student, predict: Callable[[Levels], TensorDict]) -> Student:
+    """Returns a student whose performance a model predicts, and that does all else itself."""
+    own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
+    answering = Student(
+        gamma=student.gamma,
+        lmbda=student.lmbda,
+        batch_size=student.batch_size,
+        **{name: getattr(student, name) for name in own},
+        performance=lambda levels, generator: predict(levels),
+        exact_performance=predict,
+    )
+    answering.spend = student.spend  # type: ignore[method-assign]
+    return answering

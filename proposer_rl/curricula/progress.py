@@ -72,7 +72,7 @@ class LearningProgressCurriculum(BinCurriculum):
         self._episodes: list[Tensor] = []
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Move the averages by the performance on the probes, or in the episodes since."""
+        """Moves the averages by the performance on the probes, or in the episodes since."""
         seen = torch.full((len(streams), self.space.size), torch.nan)  # where nothing was
         if self._source == "exact":
             seen = self._probes.performance(student, streams)
@@ -98,10 +98,10 @@ class LearningProgressCurriculum(BinCurriculum):
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
     ) -> dict[str, Tensor]:
-        """What the episodes reached, where they are what progress is read from.
+        """Returns what the episodes reached, if progress is measured by them.
 
         Raises:
-            ValueError: if the outcome tells no success and success is the measure.
+            ValueError: if the outcome has no success and success is the measure.
         """
         measure = self._probes.measure
         if self._source == "exact":
@@ -111,19 +111,19 @@ class LearningProgressCurriculum(BinCurriculum):
         return {"reached": outcome[measure].float().cpu()}
 
     def learn(self, evidence: TensorDict) -> None:
-        """Add it to what is known of the bins."""
+        """Adds what episodes reached to the sums of their bins."""
         means, counts = means_of_bins(evidence["bins"], evidence["reached"], self.space.size)
         totals = [(means * counts).nan_to_num(0.0), counts]
         before = self._episodes or [torch.zeros_like(total) for total in totals]
         self._episodes = [one + other for one, other in zip(before, totals, strict=True)]
 
     def shares(self) -> Tensor:
-        """Of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [K, N]."""
         return progress_shares(self.scores["score"], self._exploration)
 
 
 def stretched(success: Tensor, q: float = Q) -> Tensor:
-    """Success p as p (1 - q) / (p + q (1 - 2 p)): small probabilities count for more.
+    """Returns p (1 - q) / (p + q (1 - 2 p)) of success p, so that small ones count for more.
 
     Kanitscheider et al. 2021 (arXiv 2106.14876), with q = 0.1: a success of q is stretched to one
     half, 0 and 1 stay.
@@ -140,7 +140,7 @@ def stretched(success: Tensor, q: float = Q) -> Tensor:
 
 
 def progress_shares(progress: Tensor, exploration: float) -> Tensor:
-    """Shares [K, N] in proportion to progress [K, N], a part of them uniform.
+    """Returns shares [K, N] in proportion to progress [K, N], a part of them uniform.
 
     Args:
         progress: not negative.

@@ -16,8 +16,8 @@ One loop with options, which is what the methods differ in:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from annotated_types import Interval
@@ -41,18 +41,23 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
+    lineage,
     replay_weights,
     rescore,
 )
-from proposer_rl.curricula.children import Edit, Parents, easiness, lineage, parents_among
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.scores import Scored, Scorer, unseen
+from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
+Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
+"""Levels [K, n] after so many small random edits each, student k's from generator k."""
+Parents = Literal["batch", "easy"]
+
+EASY = 4  # parents of a batch of edits, where they are not all of the batch
 SHOWN = 6  # levels of each kind that a reader is shown
 
 
@@ -155,32 +160,32 @@ class ReplayCurriculum(Curriculum):
         self._came_back = {"levels": 0, "replayed": 0}
         self.check(len(seeds))
 
-    def check(self, copies: int) -> None:
-        """Refuse several students, if each would decide by itself how many new levels to score.
+    def check(self, students: int) -> None:
+        """Refuses several students, if each would decide by itself how many new levels to score.
 
         Raises:
             ValueError: if so.
         """
-        if copies > 1 and not (self._train_on_new or self._synchronous):
+        if students > 1 and not (self._train_on_new or self._synchronous):
             raise ValueError(
-                f"{copies} Solvers: each would decide by itself how many new levels to score; set "
-                "synchronous=true, or give one run for each"
+                f"{students} Solvers: each would decide by itself how many new levels to score; "
+                "set synchronous=true, or give one run for each"
             )
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Levels [K, n], replayed or new.
+        """Returns levels [K, n], replayed or new.
 
         Raises:
             ValueError: as :meth:`check`.
         """
-        copies = len(streams)
-        self.check(copies)
+        students = len(streams)
+        self.check(students)
         if not len(self.buffer):
-            self.buffer = empty_buffer(self._template, copies, self._capacity)
+            self.buffer = empty_buffer(self._template, students, self._capacity)
         self._take_in()
         self._finish(student, streams)
         replayed = self._explore(student, count, streams)
-        each, slots = replayed.unsqueeze(-1), torch.zeros(copies, count, dtype=torch.int64)
+        each, slots = replayed.unsqueeze(-1), torch.zeros(students, count, dtype=torch.int64)
         new = None if bool(replayed.all()) else self._fresh(count, streams, "new")
         levels = new
         if bool(replayed.any()):
@@ -196,14 +201,14 @@ class ReplayCurriculum(Curriculum):
         return self._inbox.batch(
             moved(levels, self._device),
             slot=slots,
-            replayed=each.expand(copies, count),
+            replayed=each.expand(students, count),
             key=known["key"],
             best=known["best"].where(each, -torch.inf),
             before=self._expected(known["reached"].where(each, -torch.inf)),
         )
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Score what was trained on, where its own episodes do."""
+        """Scores the levels by the episodes on them, where these are what scores are made of."""
         self._inbox.check(batch, outcome)
         notes = dict(batch.notes.items())
         evidence = {"level": moved(batch.levels, CPU)}
@@ -219,7 +224,7 @@ class ReplayCurriculum(Curriculum):
         self._inbox.put(batch, **evidence)
 
     def log(self) -> dict[str, Any]:
-        """How much was replayed, and what the buffers are like."""
+        """Returns how much was replayed, and statistics of the buffers."""
         self._take_in()
         buffer, filled = self.buffer, self.buffer["filled"]
         if not len(buffer) or not bool(filled.any()):
@@ -227,7 +232,7 @@ class ReplayCurriculum(Curriculum):
         age = buffer["clock"] - buffer["touched"]
         shares = replay_weights(buffer["score"], age, filled, self._rule)
         count = filled.sum(-1)
-        told = {
+        record = {
             "replayed": self._came_back["replayed"] / max(self._came_back["levels"], 1),
             "filled": count.tolist(),
             "effective_levels": (1 / shares.square().sum(-1)).tolist(),
@@ -236,12 +241,12 @@ class ReplayCurriculum(Curriculum):
             "levels": self._shown(),
         }
         if len(self._last):
-            told["distinct_levels"] = [len(own.unique()) for own in level_keys(self._last)]
+            record["distinct_levels"] = [len(own.unique()) for own in level_keys(self._last)]
         self._came_back = {"levels": 0, "replayed": 0}
-        return told
+        return record
 
     def state_dict(self) -> dict[str, Any]:
-        """The buffers, too, and what is known of the levels that were trained on."""
+        """Returns also the buffers, and what is known of the levels that were trained on."""
         return super().state_dict() | {
             "buffer": packed(self.buffer),
             "last": packed(self._last),
@@ -249,14 +254,14 @@ class ReplayCurriculum(Curriculum):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with them."""
+        """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self.buffer = unpacked(state["buffer"], self._template)
         self._last = of_kind(self._template, state["last"])
         self._due = [unpacked(evidence, self._template) for evidence in state["due"]]
 
     def _take_in(self) -> None:
-        """Take in what episodes on levels have shown, and note what remains to be done."""
+        """Takes what episodes have shown into the buffers, and notes what remains to be done."""
         for evidence in self._inbox.take(whole=self._easy):
             self._last = evidence["level"]
             if self.scorer.from_episodes:
@@ -265,7 +270,7 @@ class ReplayCurriculum(Curriculum):
                 self._due.append(evidence)
 
     def _finish(self, student: Student, streams: Sequence[Streams]) -> None:
-        """Do what is due for the levels that were trained on: exact scores, and children."""
+        """Scores exactly the levels that were trained on, and makes and scores their children."""
         due, self._due = self._due, []
         for i, evidence in enumerate(due):
             which = (i,) if i else ()
@@ -285,7 +290,7 @@ class ReplayCurriculum(Curriculum):
     def _children(
         self, evidence: TensorDictBase, draws: Sequence[torch.Generator]
     ) -> tuple[Levels, dict[str, Tensor]]:
-        """Children [K, n] of levels that were trained on, and where they come from."""
+        """Returns children [K, n] of levels that were trained on, and where they come from."""
         assert self._edit is not None  # or there are no edits
         some = parents_among(evidence)
         parents, slots = levels_at(evidence["level"], some), evidence["slot"].gather(1, some)
@@ -294,7 +299,7 @@ class ReplayCurriculum(Curriculum):
         return self._edit(parents, self._edits, draws), origin
 
     def _explore(self, student: Student, count: int, streams: Sequence[Streams]) -> Tensor:
-        """Score new levels as long as it takes; whether the next batch is replayed, bool [K]."""
+        """Scores new levels as long as it takes; returns whose next batch is replayed, bool [K]."""
         batches = 0
         while True:
             draws = [s.generator("replay", batches) for s in streams]
@@ -321,7 +326,7 @@ class ReplayCurriculum(Curriculum):
         wanted: Tensor | None = None,
         **more: Tensor,
     ) -> None:
-        """Keep the better ones of new levels [K, n]; ``wanted`` as of :func:`insert`."""
+        """Inserts new levels [K, n] into the buffers, for the ``wanted`` students."""
         new = TensorDict({"level": levels, **scored._asdict(), **more}, levels.shape[:2])
         insert(self.buffer, new, self._rule, wanted)
         self._scored += new.shape[1]
@@ -334,18 +339,18 @@ class ReplayCurriculum(Curriculum):
         *purpose: str | int,
         reached: Tensor | None = None,
     ) -> Scored:
-        """Score levels [K, n] that nobody trains on; ``reached`` as of :meth:`_expected`."""
+        """Scores levels [K, n] that nobody trains on; ``reached`` as in :meth:`_expected`."""
         before = self._expected(unseen(levels.shape[:2]) if reached is None else reached)
         return self.scorer(student, moved(levels, self._device), streams, *purpose, before=before)
 
     def _expected(self, reached: Tensor) -> Tensor:
-        """Returns [K, n] on levels when they were trained on last, or the mean over the buffer."""
+        """Returns what was ``reached`` [K, n], or if unknown the mean over the buffer."""
         known = self.buffer["reached"]
         mean = known.where(known.isfinite(), torch.nan).nanmean(-1, keepdim=True)
         return reached.where(reached.isfinite(), mean.nan_to_num(-torch.inf))
 
     def _score_all(self, student: Student, streams: Sequence[Streams]) -> None:
-        """Renew all scores."""
+        """Renews all scores."""
         filled, place = self.buffer["filled"], torch.arange(self._capacity)
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
@@ -354,7 +359,7 @@ class ReplayCurriculum(Curriculum):
         rescore(self.buffer, slots, *scored)
 
     def _take(self, evidence: TensorDictBase, scored: Scored) -> None:
-        """Take the scores of levels that were trained on: new ones go into the buffer."""
+        """Takes the scores of levels that were trained on; new levels go into the buffer."""
         replayed, slots = evidence["replayed"][:, 0], evidence["slot"]
         reached = evidence.get("reached", unseen(slots.shape))
         if bool(replayed.any()):
@@ -375,9 +380,9 @@ class ReplayCurriculum(Curriculum):
             self._add(evidence["level"], scored, ~replayed, reached=reached)
 
     def _credit(self, score: Tensor, slots: Tensor, replayed: Tensor) -> None:
-        """Credit the levels trained on before with how far the scores [K, m] in these slots fell.
+        """Credits the levels trained on before with how far the scores [K, m] in these slots fell.
 
-        Only those of students whose levels were ``replayed``, bool [K].
+        Only students whose levels were ``replayed``, bool [K], get it.
         """
         fell = (score - self.buffer["score"].gather(1, slots)).mean(1, keepdim=True)
         now = {"slot": slots, "key": self.buffer["key"].gather(1, slots)}
@@ -398,11 +403,11 @@ class ReplayCurriculum(Curriculum):
         }
 
     def _fresh(self, count: int, streams: Sequence[Streams], *purpose: str | int) -> Levels:
-        """New levels [K, count] on the CPU."""
+        """Draws new levels [K, count] on the CPU."""
         return moved(fresh_levels(self._new_levels, count, streams, *purpose), CPU)
 
     def _shown(self) -> dict[str, Levels]:
-        """Levels of the first student's buffer, to be looked at."""
+        """Returns levels of the first student's buffer for reports, by their captions."""
         buffer = self.buffer[0][self.buffer["filled"][0]]
         shown = {
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
@@ -411,3 +416,30 @@ class ReplayCurriculum(Curriculum):
         if self._edits:
             shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
         return {caption: buffer["level"][which] for caption, which in shown.items()}
+
+
+def parents_among(evidence: TensorDictBase) -> Tensor:
+    """Returns the places of the parents of n children among n levels: int64 [K, n].
+
+    Every level that was trained on is one; or, where evidence [K, n] has the entry ``easy``, the
+    few levels with most of it.
+    """
+    count = evidence.shape[1]
+    if "easy" not in evidence.keys():
+        return torch.arange(count).expand(evidence.shape)
+    easiest = evidence["easy"].topk(min(EASY, count), -1).indices
+    return easiest.repeat_interleave(-(-count // EASY), -1)[:, :count]
+
+
+def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
+    """Returns mean absolute advantage minus mean return, highest for "easy" parents: [K, n].
+
+    The authors' code (dcd) takes the levels with the lowest return minus value loss.
+    """
+    if "rollout" not in outcome.keys():
+        raise ValueError("parents=easy: the outcome has no rollout")
+    rollout = outcome["rollout"]
+    ended = episodes(rollout)
+    loss = Scorer("l1_value_loss", "episodes")
+    lost = loss.of_rollouts(student, [rollout], unseen(ended.ended.shape)).score
+    return lost - (ended.total / ended.ended.clamp(1)).cpu()

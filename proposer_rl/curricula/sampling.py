@@ -1,18 +1,27 @@
-"""Independent draws from a fixed distribution: the target, or domain randomization."""
+"""Curricula that sample new levels: as they come, or the best of many (SFL)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from proposer_rl.curricula.batches import fresh_levels
+import torch
+from tensordict import TensorDict
+
+from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, of_kind, packed
 from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
+from proposer_rl.learning import DivergedError
+from proposer_rl.settings import ArgumentError, Count, Share, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution
+from proposer_rl.task import Distribution, Levels
+
+SHOWN = 6  # levels that a reader is shown
 
 
 class SamplingCurriculum(Curriculum):
-    """Fresh levels of one distribution in every batch, whatever came of the last one.
+    """Draws every batch from one fixed distribution: the target, or domain randomization.
 
     Args:
         distribution: to draw from.
@@ -22,6 +31,101 @@ class SamplingCurriculum(Curriculum):
         self._distribution = distribution
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws of the distribution, each student's from its own streams."""
+        """Draws levels [K, n], each student's from its own streams."""
         levels = fresh_levels(self._distribution, count, streams, "levels")
         return Batch(levels)
+
+
+class SelectionCurriculum(Curriculum):
+    """Scores many new levels every few batches, and proposes the best of them and new ones.
+
+    SFL (Rutherford et al. 2024, "No Regrets", arXiv 2408.15099, algorithm 1), with learnability as
+    the score. The levels that are kept are drawn uniformly and with replacement; nothing is scored
+    while the student trains.
+
+    Args:
+        space: where levels come from.
+        scorer: of them.
+        candidates: levels M that are scored for each student.
+        keep: of them.
+        every: batches between two such selections.
+        new: share of a batch that is drawn anew instead, rounded.
+
+    Raises:
+        ArgumentError: if more are to be kept than are scored.
+    """
+
+    remembers = ("scores", "_proposed")
+
+    @checked
+    def __init__(
+        self,
+        space: Distribution,
+        scorer: Scorer,
+        *,
+        candidates: Count = 2048,
+        keep: Count = 256,
+        every: Count = 10,
+        new: Share = 0.5,
+    ) -> None:
+        if keep > candidates:
+            raise ArgumentError(f"keep={keep}: must be at most candidates={candidates}")
+        self.needs, self.reads = scorer.needs, scorer.plays_for
+        self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
+        self._new_levels, self.scorer = space, scorer
+        self._template = space.sample(1, torch.Generator())[0]
+        self._proposed = 0
+        self.kept: Levels = self._template.expand(0, keep)  # [K, keep], by falling score
+        self.scores = torch.zeros(0)  # float64 [K, keep]
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Returns levels [K, n]: some of those kept, then new ones.
+
+        Raises:
+            DivergedError: if fewer of the candidates have a score than are kept.
+        """
+        if self._proposed % self._every == 0:
+            self._select(student, streams)
+        self._proposed += 1
+        fresh = round(self._new * count)
+        draws = [s.generator("choices") for s in streams]
+        which = [torch.randint(self._keep, (count - fresh,), generator=g) for g in draws]
+        levels = levels_at(self.kept, torch.stack(which)).to(device_of(self._template))
+        if fresh:
+            new = fresh_levels(self._new_levels, fresh, streams, "levels")
+            levels = torch.cat([levels, new], 1)
+        return Batch(levels, TensorDict({}, (len(streams), count)))
+
+    def _select(self, student: Student, streams: Sequence[Streams]) -> None:
+        """Scores new candidates, and keeps the best of them."""
+        levels = fresh_levels(self._new_levels, self._candidates, streams, "candidates")
+        scored = self.scorer(student, levels, streams)
+        known = int(scored.score.isfinite().sum(-1).min())
+        if known < self._keep:
+            raise DivergedError(
+                f"on {known} of {self._candidates} candidates did an episode end within a rollout, "
+                f"so that fewer than {self._keep} have a score; longer rollouts (the horizon) may"
+            )
+        best = scored.score.sort(dim=-1, descending=True, stable=True)
+        self.scores = best.values[:, : self._keep]
+        self.kept = levels_at(levels.cpu(), best.indices[:, : self._keep])
+
+    def log(self) -> dict[str, Any]:
+        """Returns the scores of what is kept, and the first student's best levels."""
+        if not len(self.kept):
+            return {}
+        return {
+            "highest_score": self.scores[:, 0].tolist(),
+            "lowest_kept_score": self.scores[:, -1].tolist(),
+            "mean_score": self.scores.mean(1).tolist(),
+            "levels": {"highest scores": self.kept[0, :SHOWN]},
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns also the levels that are kept."""
+        return super().state_dict() | {"kept": packed(self.kept)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` returned."""
+        super().load_state_dict(state)
+        self.kept = of_kind(self._template, state["kept"])

@@ -27,8 +27,10 @@ Weigh = Callable[[Floats], Floats]
 ONE_BY_ONE = 128
 
 
-def draw(numbers: Numbers, by_score: Floats, staleness: float, noise: Floats) -> NDArray[np.int64]:
-    """Draw slots one after another: each draw advances the clock and makes its level fresh.
+def draw_row(
+    numbers: Numbers, by_score: Floats, staleness: float, noise: Floats
+) -> NDArray[np.int64]:
+    """Draws slots one after another; each draw advances the clock and makes its level fresh.
 
     Args:
         numbers: of a row with a level.
@@ -81,7 +83,7 @@ class Ranks:
         self.shares[self._slots] = self._table
 
     def change(self, slot: int, score: float) -> None:
-        """Give a slot another score."""
+        """Gives a slot another score, and renews the shares."""
         old = self._place(slot, self._score[slot])
         new = self._place(slot, score)
         new -= new > old  # its own place does not count
@@ -101,16 +103,16 @@ class Ranks:
         self._uniform = uniform
 
     def _place(self, slot: int, score: float) -> int:
-        """How many slots are before one with this score."""
+        """Returns how many slots are before one with this score."""
         first = int(self._falling.searchsorted(-score, "left"))
         last = int(self._falling.searchsorted(-score, "right"))
         return first + int(self._slots[first:last].searchsorted(slot))
 
 
-def insert(
+def insert_row(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
 ) -> tuple[Places, Places]:
-    """Insert levels one after another into the slots of a row, or many of them at once.
+    """Inserts levels into the slots of a row, one after another or many of them at once.
 
     Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
 
@@ -120,7 +122,7 @@ def insert(
         scores: of them; one that is not finite is not kept.
         staleness: share of the draws that go by age.
         weigh: shares by rank of scores that fall.
-        by_rank: as of :class:`Ranks`.
+        by_rank: see :class:`Ranks`.
 
     Returns:
         Which new level has gone into each slot, int64 [N], -1 for none; and slots and levels of
@@ -163,7 +165,7 @@ def insert(
 def _insert_at_once(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh
 ) -> tuple[Places, Places]:
-    """Insert many levels, the best first."""
+    """Inserts many levels at once, the best first."""
     filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
     clock, source = int(numbers["clock"][0]), np.full(len(filled), -1)
     numbers["clock"][:] = clock + len(keys)
@@ -194,5 +196,5 @@ def _insert_at_once(
 
 
 def _shares(by_score: Floats, age: Places, staleness: float) -> Floats:
-    """What slots are drawn by, where there is a level in each."""
+    """Returns the shares that slots are drawn by, where there is a level in each: [N]."""
     return by_score * (1 - staleness) + age * (staleness / max(int(age.sum()), 1))

@@ -1,8 +1,8 @@
-"""What a curriculum may ask of the students that it proposes to.
+"""The functions that a curriculum may ask of the students that it proposes to.
 
 Most curricula ask for nothing; others name what they need (:attr:`Curriculum.needs`), so that a
 loop of any kind gives that alone, and a student that lacks something is refused before a run
-begins. :class:`TaskStudent` is ours and gives all that its task allows.
+begins. :class:`TaskStudent` is that of this library, which can do all that its task allows.
 """
 
 from __future__ import annotations
@@ -82,15 +82,15 @@ class Student:
     Expectations, or estimates from episodes.
     """
     exact_performance: Callable[[Levels], TensorDictBase]
-    """The same where it is exact, so that nothing is drawn."""
+    """``performance`` where it is exact, so that nothing is drawn."""
     probe: Callable[[Levels], Tensor]
-    """What each would do on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
+    """Each student's behaviour on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
     optimal_return: Callable[[Levels], Tensor]
     """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
     gradient_norms: Callable[[Levels], Tensor]
     """Squared length of the gradient of the return on each level, float [K, n]."""
     policy_gradient_norms: Callable[[TensorDictBase], Tensor]
-    """The same of the policy gradient of a rollout [K, n, T], float [K, n]."""
+    """Squared length of the policy gradient of each level of a rollout [K, n, T], float [K, n]."""
     target_direction: Callable[[Levels, str], tuple[Tensor, Direction]]
     """Performance on levels [K, E] of the target, float [K], and what raises it fastest.
 
@@ -109,7 +109,7 @@ class Student:
     what parts of a batch give adds up.
     """
     sampled_alignment: Callable[[Direction, TensorDictBase], TensorDict]
-    """What the alignment of levels is made of, by a rollout [K, n, T] on them.
+    """The parts of the alignment of levels, from a rollout [K, n, T] on them.
 
     ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi, with
     advantages A_t that are not standardised. Where the students' training standardises them over a
@@ -119,7 +119,7 @@ class Student:
     snapshot: Callable[[], TensorDict]
     """All that training changes of the students, batch [K]."""
     restore: Callable[[TensorDictBase], None]
-    """Become what a snapshot [K] holds."""
+    """Puts back what a snapshot [K] holds."""
 
     def __init__(
         self,
@@ -137,12 +137,12 @@ class Student:
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
-        """Count what each student, or another for it, was played and evaluated."""
+        """Counts frames and evaluations that were spent on each student's account."""
         self.frames += frames
         self.evaluations += evaluations
 
     def lacks(self, name: str) -> str | None:
-        """Why it cannot do what the function of that name does; None if it can."""
+        """Returns why the student lacks the function of that name; None if it has it."""
         if name in vars(self) or hasattr(type(self), name):
             return None
         _, *given = inspect.signature(getattr(TaskStudent, f"_{name}")).parameters
@@ -159,7 +159,7 @@ ABILITIES = tuple(Student.__annotations__)
 
 
 def require(student: Student, needs: Iterable[str], who: str) -> None:
-    """Refuse a student that lacks a method which somebody needs who is named by ``who``.
+    """Refuses a student that lacks a function which ``who`` needs.
 
     Raises:
         UnfitStudentError: naming the first that is missing, and why.
@@ -174,7 +174,7 @@ class TaskStudent(Student):
     """Students of a task that train by PPO, which can do all that the task allows.
 
     Args:
-        task: which tells how they do.
+        task: that evaluates them.
         learner: of K of them.
     """
 
@@ -189,7 +189,7 @@ class TaskStudent(Student):
         self._task, self._learner = task, learner
 
     def lacks(self, name: str) -> str | None:
-        """Why its task does not allow it; None if it does."""
+        """Returns why the task does not allow the function of that name; None if it does."""
         kinds: dict[str, tuple[type, str]] = {
             "optimal_return": (OptimalTask, "optimal_return(levels)"),
             **dict.fromkeys(
@@ -272,7 +272,7 @@ class TaskStudent(Student):
         return TensorDict(parts, slopes.shape[:2])
 
     def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
-        """Train on levels [K, n], with an update for each ``batch_size`` of them.
+        """Trains on levels [K, n], with an update for each ``batch_size`` of them.
 
         Raises:
             DivergedError: if a number is not finite.
@@ -293,7 +293,7 @@ class TaskStudent(Student):
         return self._task.spectators(self._learner)
 
     def _filled_up(self, levels: Levels) -> Levels:
-        """As many levels as the environment takes: the last one over again."""
+        """Repeats the last of levels [K, n], so that there are as many as the environment takes."""
         size, count = self._learner.env.batch_size[1:].numel(), levels.shape[1]
         if count == size:
             return levels
@@ -303,10 +303,10 @@ class TaskStudent(Student):
 
 
 def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
-    """Generalised advantages A_t by a student's critic, not standardised: float64 [K, n, T].
+    """Returns generalised advantages A_t, not standardised: float64 [K, n, T].
 
     Args:
-        student: whose discount and trace decay count.
+        student: whose discount and decay of traces are used.
         rollout: with ``state_value``, [K, n, T].
         lmbda: in place of the student's decay; 0 for the error of one step.
     """

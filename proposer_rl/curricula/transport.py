@@ -86,7 +86,7 @@ class TransportCurriculum(BinCurriculum):
         self._costs = squared_distances(space)
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Move the distributions, each by its own student's performance on the probes."""
+        """Moves the distributions, each by its own student's performance on the probes."""
         performance = self._probes.performance(student, streams)
         allowed = mastered(performance, self._delta)
         even = torch.full(performance.shape, 1 / performance.shape[-1], dtype=torch.float64)
@@ -107,23 +107,23 @@ class TransportCurriculum(BinCurriculum):
         }
 
     def shares(self) -> Tensor:
-        """Of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [K, N]."""
         share = self.scores["share"]
         ahead = torch.from_numpy(self._target) * (self.scores["performance"] < self._delta)
         part = self._exploration * ahead.sum(-1, keepdim=True)
         return (1 - part) * share + part / share.shape[-1]
 
     def log(self) -> dict[str, Any]:
-        """Besides, how many bins are allowed, and how far off the target is, in W2."""
-        told = super().log()
-        if told:
-            told["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
-            told["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
-        return told
+        """Returns also how many bins are allowed, and the distance W2 to the target."""
+        record = super().log()
+        if record:
+            record["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
+            record["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
+        return record
 
 
 def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
-    """A distribution over the bins of a space, float64 [N], of shares in any unit.
+    """Returns shares of the bins of a space scaled so that they add up to one: float64 [N].
 
     Raises:
         ArgumentError: if there is not one share for each bin.
@@ -136,7 +136,7 @@ def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
 
 
 def squared_distances(space: Space) -> Tensor:
-    """Between the bins of a space, by their coordinates: float64 [N, N].
+    """Returns the squared distances between the bins of a space: float64 [N, N].
 
     Raises:
         ArgumentError: if there are too many bins.
@@ -151,12 +151,17 @@ def squared_distances(space: Space) -> Tensor:
 
 
 def mastered(performance: Tensor, delta: float) -> Tensor:
-    """Bins of at least this performance, of float [K, N]; where there is none, the best ones."""
+    """Returns which bins are mastered, bool [K, N]: where none is, those of the best performance.
+
+    Args:
+        performance: of each student in each bin, float [K, N].
+        delta: least performance of a mastered bin.
+    """
     return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)
 
 
 def interim_target(target: Tensor, costs: Tensor, allowed: Tensor) -> Tensor:
-    """The distribution on allowed bins that is nearest to the target, in 2-Wasserstein distance.
+    """Returns the distribution on allowed bins nearest to the target, in 2-Wasserstein distance.
 
     Each bin of the target gives its share to the nearest allowed ones, to several in equal parts.
 
@@ -186,7 +191,7 @@ def interim_target(target: Tensor, costs: Tensor, allowed: Tensor) -> Tensor:
 def step_towards(
     target: Floats, now: Floats, costs: Floats, allowed: Mask, reach: float
 ) -> tuple[Floats, float]:
-    """The distribution nearest to the target among those near the present one, on allowed bins.
+    """Returns the distribution on allowed bins, near the present one, that is nearest the target.
 
     The minimum of W2(p, target) over distributions p with W2(p, now) <= reach and p = 0 where not
     allowed (Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
@@ -227,7 +232,7 @@ def step_towards(
     from scipy.optimize import linprog
 
     def sums(shape: tuple[int, int], over: int) -> sparse.coo_array:
-        """What maps a matrix of that shape, row by row, to its sums over an axis."""
+        """Returns the map from a matrix of that shape, row by row, to its sums over an axis."""
         kept, summed = sparse.eye_array(shape[1 - over]), np.ones((1, shape[over]))
         return sparse.kron(summed, kept) if over == 0 else sparse.kron(kept, summed)
 

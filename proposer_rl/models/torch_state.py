@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -20,8 +21,17 @@ class _State(NamedTuple):
 
 
 OWN = _State(torch.float32, True, False, torch.device("cpu"))
-# What the callers' state is while the library computes: one entry; None outside.
-_CALLERS: ContextVar[list[_State] | None] = ContextVar("_CALLERS", default=None)
+
+
+@dataclass
+class _Callers:
+    """The callers' state while the library computes, and whether `with torch.device` is in it."""
+
+    state: _State
+    within: bool = False
+
+
+_CALLERS: ContextVar[_Callers | None] = ContextVar("_CALLERS", default=None)
 
 
 def _now() -> _State:
@@ -49,14 +59,16 @@ def own_state() -> Iterator[None]:
         (torch.float64, None)
     """
     before, outer = _now(), _CALLERS.get()
-    theirs = outer or [before]
-    token = _CALLERS.set(theirs)
+    callers = outer or _Callers(before)
+    token = _CALLERS.set(callers)
     try:
-        with _switched(before, OWN):
+        _set(before._replace(device=OWN.device))
+        callers.within = callers.within or torch.empty(0).device != OWN.device
+        with _entered(OWN, callers.within):
             yield
     finally:
         _CALLERS.reset(token)
-        _set(before if outer else theirs[0])
+        _set(before if outer else callers.state)
 
 
 @contextmanager
@@ -65,28 +77,26 @@ def callers_state() -> Iterator[None]:
 
     What that changes there is theirs the next time, too. Elsewhere nothing is changed.
     """
-    theirs = _CALLERS.get()
-    if theirs is None:
+    callers = _CALLERS.get()
+    if callers is None:
         yield
         return
     before = _now()
     try:
-        with _switched(before, theirs[0]):
+        with _entered(callers.state, callers.within):
             try:
                 yield
             finally:
-                theirs[0] = _now()
+                callers.state = _now()
     finally:
         _set(before)
 
 
 @contextmanager
-def _switched(before: _State, state: _State) -> Iterator[None]:
-    """Torch in another state; afterwards gradients and inference mode are as before."""
-    device = nullcontext() if before.device == state.device else state.device
-    with torch.inference_mode(state.inference), device:
-        torch.set_grad_enabled(state.gradients)
-        torch.set_default_dtype(state.dtype)
+def _entered(state: _State, within: bool) -> Iterator[None]:
+    """Torch in a state; afterwards gradients, inference mode and a device within are as before."""
+    with torch.inference_mode(state.inference), state.device if within else nullcontext():
+        _set(state)
         yield
 
 

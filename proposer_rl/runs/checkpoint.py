@@ -156,16 +156,12 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
     return step, state
 
 
-def load_curriculum(path: Path) -> State:
-    """Reads the state of a run's curriculum.
-
-    Args:
-        path: a checkpoint, or a run's folder, of which the newest checkpoint counts, or without
-            any what the curriculum has left to other runs.
+def learnt_curriculum(path: Path) -> State:
+    """Reads the curriculum's part of a checkpoint, of a run's newest one, or of what it left.
 
     Raises:
-        CheckpointError: if there is none, or as :func:`load_checkpoint`.
-        KeyError: if the checkpoint is none of a run.
+        CheckpointError: if there is none, or it cannot be used.
+        StorageError: if it cannot be read.
     """
     if not path.exists():
         raise CheckpointError("there is no such file or folder")

@@ -15,7 +15,7 @@ OF_GYMNASIUM = "gymnasium"  # the file of any environment of Gymnasium; a folder
 
 
 def from_gymnasium(env_id: str, **settings: Any) -> Recipe:
-    """Any environment of Gymnasium, some of whose numbers make a level.
+    """Returns a task of any environment of Gymnasium, some of whose numbers make a level.
 
     Args:
         env_id: such as ``"CartPole-v1"``; ``"module:name"`` imports the module first.
@@ -29,7 +29,7 @@ def from_gymnasium(env_id: str, **settings: Any) -> Recipe:
 
 
 def own(make: Callable[..., Any], **settings: Any) -> Recipe:
-    """A task of one's own: see :func:`proposer_rl.recipes.own_recipe`."""
+    """Returns a task of one's own: see :func:`proposer_rl.recipes.own_recipe`."""
     return own_recipe("task", make, **settings)
 
 

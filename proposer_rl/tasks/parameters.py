@@ -34,16 +34,16 @@ class Bins:
 
     @property
     def middles(self) -> list[Number]:
-        """The value that stands for each part."""
+        """Returns the value that stands for each part."""
         return ((self.low + self.high) / 2).tolist() if self.wide else self.low.tolist()
 
     @property
     def wide(self) -> bool:
-        """Whether the parts are more than single values."""
+        """Returns whether the parts are more than single values."""
         return bool((self.high > self.low).any())
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
-        """A value of each of the parts int64 [P]: [P]."""
+        """Draws a value of each of the parts int64 [P]: [P]."""
         low, high = self.low[index], self.high[index]
         if not self.wide:
             return low
@@ -53,14 +53,14 @@ class Bins:
         return low + (share * (high - low + 1)).long()
 
     def at(self, share: Tensor) -> Tensor:
-        """The values at these shares of the whole range, float64 [*B] from 0 to 1: [*B]."""
+        """Returns the values at shares of the whole range, float64 [*B] from 0 to 1: [*B]."""
         if self.wide and self.low.is_floating_point():
             return self.low[0].lerp(self.high[-1], share)
         values = torch.arange(int(self.low[0]), int(self.high[-1]) + 1) if self.wide else self.low
         return values[(share * len(values)).long().clamp(max=len(values) - 1)]
 
     def moved(self, old: Tensor, noise: Tensor) -> Tensor:
-        """Values [n] moved by a tenth of the range times noise, float64 [n]: [n], within it.
+        """Moves values [n] by a tenth of the range times noise, float64 [n]: [n], within it.
 
         Whole numbers and single values move by one at least.
         """
@@ -74,9 +74,9 @@ class Bins:
         return (old + _one_at_least(noise, float(high - low))).clamp(low, high)
 
     def scaled(self, values: Tensor) -> Tensor:
-        """Where values float64 [*B] lie: the first part's middle at -1, the last one's at 1.
+        """Returns where values float64 [*B] lie, -1 and 1 being the first and last middle: [*B].
 
-        Of a single part its ends, and a single value at 0.
+        If there is one part alone, -1 and 1 are its ends; a single value lies at 0.
         """
         ends = (self.low + self.high).double() / 2
         if len(ends) == 1:
@@ -85,7 +85,7 @@ class Bins:
         return 2 * (values - first) / reach - 1 if reach > 0 else 0 * values
 
     def below(self, ends: Tensor) -> Tensor:
-        """The probability of a value of at most each of some ends, float64 [n]."""
+        """Returns the probability of a value of at most each of some ends, float64 [n]."""
         low, high = self.low.double(), self.high.double()
         if self.wide and not self.low.is_floating_point():  # a whole number is an interval of one
             low, high = low - 0.5, high + 0.5
@@ -94,7 +94,7 @@ class Bins:
         return torch.where(high > low, inside, (beyond >= 0).double()).mean(-1)
 
     def shares(self, of: Bins) -> Tensor:
-        """Which of these parts values of other parts lie in, float64 [n].
+        """Returns the shares of other parts' values that lie in each of these, float64 [n].
 
         What lies beyond the first or the last part, or between single values, counts for the
         nearest part.
@@ -122,12 +122,12 @@ class Law(Bins):
     name: str
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
-        """Values [P]; what would lie beyond the ends lies there."""
+        """Draws values [P]; what would lie beyond the ends lies there."""
         share = torch.rand(len(index), generator=generator, dtype=torch.float64)
         return self.quantile(share).clamp(self.low, self.high)
 
     def below(self, ends: Tensor) -> Tensor:
-        """The probability of a value of at most each of some ends, float64 [n]."""
+        """Returns the probability of a value of at most each of some ends, float64 [n]."""
         return self.cumulative(ends)
 
     def __str__(self) -> str:
@@ -135,7 +135,7 @@ class Law(Bins):
 
 
 def points(values: Sequence[Number], key: str = "values") -> Bins:
-    """Bins that are single values; whole numbers, if all of them are.
+    """Returns bins that are single values; whole numbers, if all of them are.
 
     Raises:
         ValueError: naming the key, if they do not rise, or are beyond float32 or int64.
@@ -151,7 +151,7 @@ def points(values: Sequence[Number], key: str = "values") -> Bins:
 
 
 def intervals(low: float, high: float, count: int = 1) -> Bins:
-    """Equal parts of a range, within which values are uniform.
+    """Returns equal parts of a range, within which values are uniform.
 
     Raises:
         ValueError: if the range is none, or goes beyond float32.
@@ -204,31 +204,31 @@ class ParameterSpace:
 
     @property
     def coordinates(self) -> Tensor:
-        """Of each bin, from -1 to 1 along every axis (0 along one of a single bin): [N, D]."""
+        """Returns where bins lie, [N, D]: -1 to 1 along each axis, 0 on one of a single bin."""
         lines = [part.scaled((part.low + part.high).double() / 2) for part in self.bins.values()]
         if not lines:
             return torch.zeros(1, 0)
         return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
 
     def locate(self, levels: TensorDictBase) -> Tensor:
-        """Where levels [*B] lie, as :attr:`coordinates`: float32 [*B, D] on the CPU.
+        """Returns where levels [*B] lie, as :attr:`coordinates`: float32 [*B, D] on the CPU.
 
-        Along the only bin of an axis from -1 to 1.
+        Along an axis of one bin that goes from -1 to 1.
         """
         lines = [part.scaled(levels[name].cpu().double()) for name, part in self.bins.items()]
         return torch.stack(lines, -1).float() if lines else torch.zeros(*levels.batch_size, 0)
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
-        """Levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""
+        """Draws levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""
         copies = [self._draw(own, g) for own, g in zip(choices, generators, strict=True)]
         return torch.stack(copies)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """Levels [count], uniformly from the bins."""
+        """Draws levels [count], uniformly from the bins."""
         return self._draw(torch.randint(self.size, (count,), generator=generator), generator)
 
     def shares(self, other: ParameterSpace) -> Tensor:
-        """Which of these bins the levels of another distribution lie in, float [N]."""
+        """Returns the shares of another distribution's levels in each of these bins, float [N]."""
         shares = torch.ones(1, dtype=torch.float64)
         for name, bins in other.bins.items():
             shares = torch.outer(shares, self.bins[name].shares(bins)).flatten()
@@ -244,7 +244,7 @@ class ParameterSpace:
         return TensorDict({**level, **seeds}, choices.shape, device=self._device)
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
-        """Levels [K, P] at points of the box [-1, 1]^D that the whole ranges span.
+        """Returns levels [K, P] at points of the box [-1, 1]^D that the whole ranges span.
 
         A parameter of single values has the one whose share of the range the point lies in.
 
@@ -261,7 +261,7 @@ class ParameterSpace:
     def edit(
         self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]
     ) -> TensorDict:
-        """Levels [K, n] after so many steps along one parameter each.
+        """Returns levels [K, n] after so many steps along one parameter each.
 
         A number moves by a tenth of its range in the standard deviation, and stays within; a whole
         number, or one of single values, moves by one at least.
@@ -288,6 +288,6 @@ class ParameterSpace:
 
 
 def _one_at_least(noise: Tensor, reach: float) -> Tensor:
-    """Whole steps, int64 [n]: a tenth of a reach times noise, and one at least."""
+    """Returns whole steps, int64 [n]: a tenth of a reach times noise, and one at least."""
     steps = (noise * max(STEP * reach, 1)).round()
     return steps.where(steps != 0, noise.sign()).long()

@@ -1,18 +1,23 @@
-"""The settings of parameters that make levels: the range of each, and what of it is the target."""
+"""What parameters of levels may be, and what of it is the target, as files and Python say it.
+
+A parameter is a continuous range, whole numbers, or choices; :func:`read_line` and
+:class:`LineSettings` make bins of it, :func:`read_part` of a part of it, such as the target.
+"""
 
 # Annotations are objects here, not texts: settings of other modules inherit the fields.
 import re
 import warnings
 from collections.abc import Mapping
-from functools import partial
-from typing import Annotated, Any
+from dataclasses import dataclass
+from numbers import Real
+from typing import Annotated, Any, Literal
 
-import scipy  # which loads its statistics, a second of work, where they are asked for
+import scipy  # whose functions are loaded where they are asked for
 import torch
 from annotated_types import Ge, Le, Len
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError, Positive, arguments, settings
+from proposer_rl.settings import ArgumentError, Positive, arguments, plain, settings, shown
 from proposer_rl.tasks.parameters import (
     MOST_BINS,
     SEED,
@@ -30,29 +35,24 @@ RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 
 
 @settings
-class RangeSettings:
-    """A number that differs between levels.
+class LineSettings:
+    """What values a parameter has.
 
     Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
-    parts, within which it is drawn uniformly; without ``bins`` in one.
+    parts, within which it is drawn uniformly.
 
     Attributes:
-        values: rising; whole numbers, if all are.
+        values: rising numbers, whole if all are; or texts, in any order.
         low, high, bins: of a range.
-        target: what is to be mastered: a number; of ``values`` one or several, equally likely; of a
-            range also [from, to]. Or a mapping: rising ``values``, with their ``weights``, which
-            need not add up to one; or a ``distribution`` of :mod:`scipy.stats` by its name, with
-            its arguments.
     """
 
-    values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
+    values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
     low: float | None = None
     high: float | None = None
     bins: Annotated[int, Ge(1), Le(MOST_BINS)] | None = None
-    target: Number | Annotated[list[Number], Len(1)] | dict[str, Any]
 
-    def space_bins(self) -> Bins:
-        """The bins of the parameter.
+    def space_bins(self, count: int = 1) -> Bins:
+        """Returns the bins, of a range as many as are given where it does not say how many.
 
         Raises:
             ValueError: if it has neither values nor a range, both, or they do not rise.
@@ -61,78 +61,196 @@ class RangeSettings:
         if self.values is not None:
             if (low, high, bins) != (None, None, None):
                 raise ValueError("either values, or low, high and bins")
-            return points(self.values)
+            return choice_bins(self.values)
         if low is None or high is None:
             raise ValueError("needs values, or low, high and perhaps bins")
-        return intervals(low, high, bins or 1)
+        return intervals(low, high, bins or count)
+
+
+@settings
+class RangeSettings(LineSettings):
+    """A number that differs between levels, and what of it is to be mastered.
+
+    Attributes:
+        target: a number; of ``values`` one or several, equally likely; of a range also [from, to].
+            Or a mapping: ``values`` with their ``weights``, which need not add up to one, or a
+            normal distribution that is cut off at the range's ends, as ``distribution: norm`` with
+            ``loc`` and ``scale``.
+    """
+
+    values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
+    target: Number | Annotated[list[Number], Len(1)] | dict[str, Any]
 
     def target_bins(self) -> Bins:
-        """What of the parameter the Solver is to master.
+        """Returns what of the parameter the Solver is to master.
 
         Raises:
-            ValueError: if it is no part of a line, nor a distribution on it.
+            ValueError: if it is no part of the parameter, nor a distribution on it.
         """
-        if isinstance(self.target, dict):
-            return self._law(**self.target)
-        target = self.target if isinstance(self.target, list) else [self.target]
-        if self.values is not None or len(target) == 1:
-            return self._points(target, "target")
-        if len(target) > 2 or not target[0] < target[1]:
-            raise ValueError(f"target={target} must be a number or [from, to]")
-        return intervals(target[0], target[1])
-
-    def _points(self, values: list[Number], key: str) -> Bins:
-        """Single values, of the type of the space's."""
-        kind, single = self.space_bins().low.dtype, points(values, key).low
-        if kind == torch.int64 and single.dtype != kind:
-            raise ValueError(f"{key}={values} must be whole, as values={self.values} are")
-        if self.values is not None and set(values) - set(self.values):
-            raise ValueError(f"{key}={values}: must be among values={self.values}")
-        return Bins(single.to(kind), single.to(kind))
-
-    def _law(self, distribution: str | None = None, **given: Any) -> Law:
-        if distribution is None:
-            try:
-                read = arguments(weighted_points, given, ("line",))
-            except ArgumentError as error:
-                raise ValueError(f"target.{error}") from error
-            line = self._points(read["values"], "target.values").low
-            return weighted_points(line, **read)
-        if self.values is not None:
-            raise ValueError("target.distribution: of a range only; give weights of values")
-        space = self.space_bins()
-        return _named(distribution, given, space.low[:1], space.high[-1:])
+        line = self.space_bins()
+        return read_part("target", target_in_file(self.target, line), line)
 
 
-def weighted_points(
-    line: Tensor, values: Annotated[list[Number], Len(1)], weights: list[Positive]
-) -> Law:
-    """Single values, also as a tensor [n], that are more or less likely.
+@dataclass(frozen=True)
+class Labelled(Bins):
+    """The places of texts, or whatever else is chosen from, in their list, which has no order."""
+
+    labels: list[Any]
+
+    def moved(self, old: Tensor, noise: Tensor) -> Tensor:
+        """Returns another place for each of [n], drawn by its noise, float64 [n]."""
+        count = len(self.low)
+        further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
+        return (old + further) % count
+
+
+def choice_bins(values: list[Any]) -> Bins:
+    """Returns a bin for each of some rising numbers, or of whatever else there is to choose from.
 
     Raises:
-        ValueError: if there is not a weight for each.
+        ValueError: for numbers that do not rise, or are too large.
     """
-    if len(weights) != len(line):
-        raise ValueError(f"target.weights={weights}: must be one for each of {len(line)} values")
-    summed = torch.tensor(weights, dtype=torch.float64).cumsum(0)
+    if all(map(is_real, values)):
+        return points(values)
+    places = torch.arange(len(values))
+    return Labelled(places, places, values)
+
+
+def read_line(key: str, given: Any, count: int = 1) -> Bins:
+    """Returns the bins of what Python says of a parameter.
+
+    Args:
+        key: of the parameter, for errors.
+        given: ``(low, high)`` for a continuous range; ``range(a, b)`` for whole numbers; a list or
+            an array of choices; or a mapping with the entries of :class:`LineSettings`.
+        count: equal parts of a range.
+
+    Raises:
+        ArgumentError: if it is nothing of that.
+    """
+    given = python_values(given)
+    try:
+        if isinstance(given, Mapping):
+            return LineSettings(**given).space_bins(count)
+        if isinstance(given, range):
+            points(sorted({given.start, given.stop}))  # refuses what int64 cannot hold
+        if isinstance(given, range) and given.step == 1 and len(given) > count:
+            edges = torch.linspace(given.start, given.stop, count + 1, dtype=torch.float64)
+            low = edges[:-1].ceil().long()
+            return Bins(low, torch.cat([low[1:], torch.tensor([given.stop])]) - 1)
+        if isinstance(given, tuple) and len(given) == 2 and all(map(is_real, given)):
+            return intervals(float(given[0]), float(given[1]), count)
+        if isinstance(given, list | range) and len(given):
+            return choice_bins(list(given))
+    except ArgumentError as error:  # of an entry
+        raise ArgumentError(f"{key}.{error}") from error
+    except (ValueError, OverflowError) as error:
+        raise ArgumentError(f"{key}={shown(given)}: {error}") from error
+    raise ArgumentError(f"{key}={shown(given)}: must be (low, high), a range or a list")
+
+
+def read_part(key: str, given: Any, line: Bins) -> Bins:
+    """Returns a part of a parameter's line, of the type of its values.
+
+    Args:
+        key: of the part, for errors.
+        given: a value, or several that are equally likely, of choices some of these; of a range
+            also a part of it as in :func:`read_line`. Or a mapping with the arguments of
+            :func:`weighted_law` or :func:`normal_law`.
+        line: the parameter's.
+
+    Raises:
+        ArgumentError: if it is none.
+    """
+    given = python_values(given)
+    if isinstance(given, Mapping):
+        law = normal_law if "distribution" in given else weighted_law
+        try:
+            return law(line, **arguments(law, given, ("line",)))
+        except ArgumentError as error:
+            raise ArgumentError(f"{key}.{error}") from error
+    if isinstance(line, Labelled):
+        chosen = given if isinstance(given, list) else [given]
+        if any(value not in line.labels or chosen.count(value) > 1 for value in chosen):
+            raise ArgumentError(f"{key}={given!r}: must be among {line.labels}, each once")
+        return points(sorted(map(line.labels.index, chosen)))
+    many = [given] if is_real(given) else given
+    if isinstance(many, list) and not all(map(is_real, many)):
+        raise ArgumentError(f"{key}={shown(given)}: must be a number, (from, to) or a list of them")
+    part = read_line(key, many)
+    if not line.low.is_floating_point() and part.low.is_floating_point():
+        raise ArgumentError(f"{key}={given}: must be whole, as the range is")
+    part = Bins(part.low.to(line.low), part.high.to(line.high))
+    if not line.wide and (part.wide or not torch.isin(part.low, line.low).all()):
+        raise ArgumentError(f"{key}={given}: must be among {line.low.tolist()}")
+    return part
+
+
+def target_in_file(target: Any, line: Bins) -> Any:
+    """Returns a target as Python has it: files have no tuples, and their ``[from, to]`` is one.
+
+    Raises:
+        ArgumentError: for another list in a range, which could be read in two ways.
+    """
+    if not line.wide or not isinstance(target, list) or len(target) == 1:
+        return target
+    if len(target) > 2:
+        raise ArgumentError(f"target={target}: must be a number or [from, to]")
+    return tuple(target)
+
+
+def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list[Positive]) -> Law:
+    """Returns single values of a line that are more or less likely.
+
+    Raises:
+        ArgumentError: if there is not a weight for each, or one is no value of the line.
+    """
+    if len(weights) != len(values):
+        raise ArgumentError(f"weights={weights}: must be one for each of {len(values)} values")
+    parts = [read_part("values", [one], line).low for one in values]
+    if not isinstance(line, Labelled):
+        read_part("values", values, line)  # they rise
+    single, order = torch.cat(parts).sort()
+    summed = torch.tensor(weights, dtype=torch.float64)[order].cumsum(0)
     reached = summed / summed[-1]
 
     def quantile(shares: Tensor) -> Tensor:
-        return line[torch.searchsorted(reached, shares, right=True)]
+        return single[torch.searchsorted(reached, shares, right=True)]
 
     def cumulative(ends: Tensor) -> Tensor:
         known = torch.cat([torch.zeros(1, dtype=torch.float64), reached])
-        return known[torch.searchsorted(line.double(), ends.double(), right=True)]
+        return known[torch.searchsorted(single.double(), ends.double(), right=True)]
 
-    pairs = zip(values, weights, strict=True)
-    name = " or ".join(f"{value:g} (weight {weight:g})" for value, weight in pairs)
-    return Law(line[:1], line[-1:], quantile, cumulative, name)
+    names = [f"{one:g}" if is_real(one) else str(one) for one in values]
+    name = " or ".join(f"{n} (weight {w:g})" for n, w in zip(names, weights, strict=True))
+    return Law(single[:1], single[-1:], quantile, cumulative, name)
+
+
+def normal_law(
+    line: Bins, distribution: Literal["norm"], loc: float = 0.0, scale: Positive = 1.0
+) -> Law:
+    """Returns a normal distribution on a continuous range, cut off at its ends.
+
+    Raises:
+        ArgumentError: of choices or whole numbers.
+    """
+    if not line.wide or not line.low.is_floating_point():
+        raise ArgumentError("distribution=norm: of a continuous range only; weigh values instead")
+
+    def quantile(shares: Tensor) -> Tensor:
+        return torch.as_tensor(scipy.special.ndtri(shares.numpy()) * scale + loc)
+
+    def cumulative(ends: Tensor) -> Tensor:
+        return torch.as_tensor(scipy.special.ndtr((ends.numpy() - loc) / scale))
+
+    name = f"norm(loc={loc:g}, scale={scale:g})"
+    return Law(line.low[:1], line.high[-1:], quantile, cumulative, name)
 
 
 def spaces(
     parameters: Mapping[str, RangeSettings], **seeds: Any
 ) -> tuple[ParameterSpace, ParameterSpace]:
-    """The space of some parameters by name, and their target.
+    """Returns the space of some parameters by name, and their target.
 
     Args:
         parameters: by name.
@@ -154,38 +272,27 @@ def spaces(
         if _inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
             warnings.warn(
                 f"parameters.{name}: most of the target, {target[name]}, lies outside of "
-                f"low={given.low:g} to high={given.high:g}: is that meant?",
+                f"low={given.low:g} to high={given.high:g}, which training levels come from",
                 stacklevel=2,
             )
     return ParameterSpace(bins, **seeds), ParameterSpace(target, **seeds)
 
 
 def _inside(target: Bins, space: Bins) -> float:
-    """How much of a target lies within the ends of a space."""
+    """Returns how much of a target lies within the ends of a space."""
     low, high = space.low[:1].double(), space.high[-1:].double()
     below = torch.nextafter(low, low - 1)
     return float(target.below(high) - target.below(below))
 
 
-def _named(name: str, given: Mapping[str, Any], low: Tensor, high: Tensor) -> Law:
-    """A continuous distribution of scipy's within a range."""
-    kind = getattr(scipy.stats, str(name), None)
-    if not isinstance(kind, scipy.stats.rv_continuous):
-        raise ValueError(
-            f"target.distribution={name}: must be a continuous distribution of scipy.stats, such "
-            "as norm, uniform or loguniform"
-        )
-    try:
-        frozen = kind(**given)
-        fits = bool(frozen.median() == frozen.median())
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"target: {name} of scipy.stats: {error}") from error
-    text = f"{name}({', '.join(f'{key}={value}' for key, value in given.items())})"
-    if not fits:
-        raise ValueError(f"target: {text} is no distribution: see scipy.stats.{name}")
+def python_values(given: Any) -> Any:
+    """Returns what is said of a parameter as Python's own; objects to choose from stay."""
+    if isinstance(given, list | tuple):
+        own = [plain(value) if getattr(value, "ndim", None) == 0 else value for value in given]
+        return tuple(own) if isinstance(given, tuple) else own
+    return given if isinstance(given, range) else plain(given)
 
-    def of(function: Any, numbers: Tensor) -> Tensor:
-        return torch.as_tensor(function(numbers.numpy()), dtype=torch.float64)
 
-    quantile, cumulative = partial(of, frozen.ppf), partial(of, frozen.cdf)
-    return Law(low, high, quantile, cumulative, text)
+def is_real(value: Any) -> bool:
+    """Returns whether a value is a number, which a truth value is not."""
+    return isinstance(value, Real) and not isinstance(value, bool)

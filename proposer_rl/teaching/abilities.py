@@ -1,4 +1,4 @@
-"""What a loop's own functions can do for a curriculum, and a plain actor and critic."""
+"""Students of loops: made of the loop's own functions, or of an actor and a critic."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ def adapted(
     given: Callable[[Any], Any],
     device: torch.device | None = None,
 ) -> Any:
-    """A function of levels [n] as one of levels [1, n], with the argument checked.
+    """Returns a function of levels [1, n] that calls a loop's own function of levels [n].
 
     Args:
         name: of the function; see :class:`~proposer_rl.curricula.Student`.
-        function: of a loop, with levels as that gets them.
-        given: from levels to these.
-        device: where that gets them; None for where they are.
+        function: of a loop, called with levels as the loop gets them.
+        given: makes these of levels.
+        device: on which it gets them; None to leave them where they are.
+
+    Raises:
+        ArgumentError: if it is no function.
     """
     if name not in OF_LEVELS:
         return function
@@ -71,7 +74,7 @@ class ActorStudent(Student):
         given: from levels inside to levels as the functions in ``can`` take them; that of the
             space. Only for these.
         gamma, lmbda: discount, and decay of the traces of generalised advantages.
-        can: further functions, as of :class:`~proposer_rl.curricula.Student`; such as ``play``,
+        can: further functions, see :class:`~proposer_rl.curricula.Student`; such as ``play``,
             where ``play(levels, generator)`` gives a rollout [n, T] of the actor on levels [n].
     """
 
@@ -124,13 +127,13 @@ class ActorStudent(Student):
         return advantages(self, rollout).float()
 
     def _gained(self, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
-        """Means over the steps of A_t log pi(a_t | s_t), [1, n]."""
+        """Returns the means over the steps of A_t log pi(a_t | s_t), [1, n]."""
         log_prob = self._actor.get_dist(rollout.copy()).log_prob(rollout["action"])
         log_prob = log_prob.reshape(*rollout.batch_size, -1).sum(-1)
         return over_steps(advantage * log_prob, rollout)
 
     def _scale(self, parameter: Tensor) -> Tensor:
-        """What Adam divides a gradient by; 1 where there is no second moment."""
+        """Returns what Adam divides a gradient by; 1 where there is no second moment."""
         state = self._optimizer.state.get(parameter, {})
         if "exp_avg_sq" not in state:
             return torch.ones_like(parameter)

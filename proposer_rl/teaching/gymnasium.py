@@ -11,8 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, entries, number, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -21,7 +21,7 @@ SUCCESS = ("success", "is_success")  # entries of an info that mean it
 
 
 class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that asks for a level at every reset, and tells at the end of the episode.
+    """An environment that asks a teacher for a level at every reset, and reports every episode.
 
     ``info`` has the ``level`` and its ticket ``level_id`` after a reset and after the last step.
     Wrappers that end episodes, as ``TimeLimit``, belong inside: an episode that a reset cuts off
@@ -73,7 +73,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode on the next level."""
+        """Begins an episode on the next level."""
         self._drop()
         self._ticket, self._level = self._teacher.ask()
         self._return, self._steps = 0.0, 0
@@ -97,7 +97,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, self._marked(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """A step; the last one of an episode is told."""
+        """Makes a step; after the last one of an episode the teacher gets return and success."""
         try:
             answer = stepped(self.env.step(action))
         except UnfitEnvironmentError as error:
@@ -117,7 +117,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _end(self) -> None:
-        """Tell what came of the episode."""
+        """Reports the episode to the teacher."""
         self._note(self._success())
         needed = isinstance(self._rule, str) or "success" in self._teacher.reads
         if self._succeeded is None and needed:
@@ -130,7 +130,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._ticket = None
 
     def _drop(self) -> None:
-        """Leave the episode, if there is one."""
+        """Drops the episode that is played, if there is one."""
         if self._ticket is None:
             return
         if self._steps and self._reset_truncates:
@@ -148,7 +148,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._teacher.drop(self._ticket)
 
     def _set(self, how: Mapping[str, str]) -> None:
-        """Set attributes that the environment has to all values of the level."""
+        """Sets attributes of the environment to the values of the level."""
         names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
         for name, path in how.items():
             if name not in names:
@@ -156,7 +156,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                     f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
                 )
             try:
-                write(self.env.unwrapped, path, _plain(self._level[name]))
+                write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
             except AttributeRefusedError as error:
                 raise ArgumentError(f"set.{name}={path!r}: {error}") from error
         left_out = [name for name in names if name not in (*how, SEED)]
@@ -172,7 +172,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {**info, "level": self._level, "level_id": self._ticket}
 
     def _success(self) -> Any:
-        """What the last step says of success; None where it says nothing."""
+        """Returns what the last step says of success; None where it says nothing."""
         rule = self._rule
         if callable(rule):
             return rule(self._last)
@@ -183,13 +183,13 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if success is None:
             return
         try:
-            now = number(success, f"success={self._rule!r}: what came of an episode")
+            now = as_number(success, f"success={self._rule!r}: what came of an episode")
         except UnfitEnvironmentError as error:
             raise ArgumentError(str(error)) from error
         self._succeeded = max(now, self._succeeded or 0.0) if self._once else now
 
 
 def _plain(value: Any) -> Any:
-    """A number as Python has it; environments take no tensors."""
+    """Returns a number as Python's own, since environments take no tensors."""
     one = isinstance(value, np.generic) or (isinstance(value, Tensor) and value.numel() == 1)
     return value.item() if one else value

@@ -1,4 +1,4 @@
-"""One teacher, many processes: a thread beside it answers the clients that these have."""
+"""A teacher for other processes, whose clients are answered by threads of its own process."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import torch
 
 
 class TeacherClient:
-    """A teacher as another process has it; made by :meth:`Teacher.client`, and sent there.
+    """Stands for a teacher in another process; :meth:`Teacher.client` makes it, to be sent there.
 
-    In which order processes come is for them to say, so that runs with several of them do not
-    repeat each other.
+    The order in which several processes ask is not fixed, so that such runs do not repeat each
+    other.
     """
 
     def __init__(self, address: Any, key: bytes, students: int, reads: tuple[str, ...]) -> None:
@@ -28,15 +28,15 @@ class TeacherClient:
         self._lock = Lock()
 
     def ask(self, n: int | None = None) -> tuple[Any, Any]:
-        """As :meth:`Teacher.ask`."""
+        """Returns the next levels and their tickets, see :meth:`Teacher.ask`."""
         return self._call("ask", n)
 
     def tell(self, ids: Any, return_: Any, success: Any = None, **more: Any) -> None:
-        """As :meth:`Teacher.tell`."""
+        """Reports the results of levels, see :meth:`Teacher.tell`."""
         self._call("tell", ids, return_, success, **more)
 
     def drop(self, ids: Any = None) -> None:
-        """As :meth:`Teacher.drop`."""
+        """Gives up levels, see :meth:`Teacher.drop`."""
         self._call("drop", ids)
 
     def __reduce__(self) -> Any:
@@ -69,13 +69,13 @@ class TeacherServer:
         Thread(target=self._accept, daemon=True).start()
 
     def client(self) -> TeacherClient:
-        """Another client."""
+        """Returns a new client."""
         teacher = self._teacher
         return TeacherClient(self._listener.address, self._key, teacher.students, teacher.reads)
 
     def _accept(self) -> None:
         while True:
-            with suppress(EOFError, OSError):  # whoever knocks may be gone, or not know the key
+            with suppress(EOFError, OSError):  # the client has left, or has another key
                 connection = self._listener.accept()
                 Thread(target=self._answer, args=(connection,), daemon=True).start()
 
@@ -94,7 +94,7 @@ class TeacherServer:
 
 
 def _check_precision() -> None:
-    """Refuse to change torch's default precision, which is not a thread's own, beside a loop."""
+    """Refuses to answer under another default dtype, which all threads of a process share."""
     if (dtype := torch.get_default_dtype()) != torch.float32:
         raise RuntimeError(
             f"torch's default dtype is {dtype}: a teacher answers clients from a thread beside "

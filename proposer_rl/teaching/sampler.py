@@ -28,22 +28,22 @@ FEW = 32  # items of which it is too early to say that most are missing
 
 @dataclass
 class Epoch:
-    """Items that were drawn, and how many were given of them, with repetitions."""
+    """The items drawn in an epoch, and how many were given to the loop, with repetitions."""
 
     drawn: list[int] = field(default_factory=list)
     place: int = 0
 
 
 class TeacherSampler(Sampler[int]):
-    """Items that a teacher proposes, for any loader; whoever scores them tells by item.
+    """Samples items that a teacher proposes, for any loader; results are reported by item.
 
     Each item is out until ``repeat`` answers to it have come back, in any order and over any number
-    of calls; the means of these are what the teacher is told.
+    of calls; the teacher gets their means.
 
     In a launch of several ranks every rank makes the same teacher and the same sampler, draws from
-    it in step with the others, and tells what came of its own part: :meth:`tell` and :meth:`drop`
-    gather what all ranks say, where ``torch.distributed`` is initialized, so that all teachers stay
-    the same.
+    it in step with the others, and reports the results of its own part. :meth:`tell` and
+    :meth:`drop` gather those of all ranks, where ``torch.distributed`` is initialized, so that all
+    teachers stay the same.
 
     Importing TorchRL makes processes spawn: a script whose loader has workers needs its
     ``if __name__ == "__main__":``.
@@ -98,14 +98,14 @@ class TeacherSampler(Sampler[int]):
             self._epoch = Epoch()
 
     def rewind(self) -> None:
-        """Give the items of this epoch again from its first one, before any new ones.
+        """Gives the items of this epoch again from its first one, before any new ones.
 
         For loops that skip what they have had, as with accelerate's ``skip_first_batches``.
         """
         self._epoch.place, self._goes_on = 0, True
 
     def tell(self, items: Sequence[int], success: Any, return_: Any = None) -> None:
-        """What came of items; counts for each when its last answer is there.
+        """Reports results of items; each counts when its last answer is there.
 
         Args:
             items: as they were drawn, with their repetitions, in any order, [n].
@@ -119,10 +119,10 @@ class TeacherSampler(Sampler[int]):
         self._count(lambda: _answers(items, success, return_))
 
     def drop(self, items: Sequence[int] | None = None) -> None:
-        """Nothing will come of items.
+        """Gives up items of which no results will come.
 
         Args:
-            items: as of :meth:`tell`; None for all that are out, where a resumed loop begins an
+            items: see :meth:`tell`; None for all that are out, where a resumed loop begins an
                 epoch anew.
         """
         if items is None:
@@ -134,7 +134,7 @@ class TeacherSampler(Sampler[int]):
             self._count(lambda: [(item, None) for item in _whole(items)])
 
     def state_dict(self) -> dict[str, Any]:
-        """What is out, and the place in the epoch; the teacher has a state of its own."""
+        """Returns what is out, and the place in the epoch; the teacher has a state of its own."""
         return {
             "groups": [self._repeat, self._group, self._rounds],
             "out": {item: list(tickets) for item, tickets in self._out.items() if tickets},
@@ -144,7 +144,7 @@ class TeacherSampler(Sampler[int]):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with it: the next epoch is the rest of the one that was begun.
+        """Puts back a state; the next epoch is the rest of the one that was begun.
 
         Raises:
             ArgumentError: if it is of other groups.
@@ -172,11 +172,11 @@ class TeacherSampler(Sampler[int]):
         return int(item)
 
     def _count(self, read: Callable[[], list[tuple[int, Answer]]]) -> None:
-        """Tell the teacher of the items whose last answers these are."""
+        """Counts answers, and gives the teacher the results of items whose last answer came."""
         came: dict[int, list[Answer]] = {}
         for item, answer in _everywhere(read, self._trace):
             came.setdefault(item, list(self._came.get(item, ()))).append(answer)
-        told: list[tuple[int, float, float, int]] = []
+        whole: list[tuple[int, float, float, int]] = []
         dropped: list[int] = []
         over: list[tuple[int, int]] = []  # items, and how many of their tickets
         for item, answers in came.items():
@@ -189,12 +189,12 @@ class TeacherSampler(Sampler[int]):
                 group, answers[:] = answers[: self._repeat], answers[self._repeat :]
                 if results := [answer for answer in group if answer]:
                     success, return_ = (sum(n) / len(n) for n in zip(*results, strict=True))
-                    told.append((ticket, return_, success, len(results)))
+                    whole.append((ticket, return_, success, len(results)))
                 else:
                     dropped.append(ticket)
             over.append((item, full))
-        if told:
-            ids, returns, successes, episodes = zip(*told, strict=True)
+        if whole:
+            ids, returns, successes, episodes = zip(*whole, strict=True)
             self._teacher.tell([*ids], returns, successes, episodes=episodes)
         self._teacher.drop(dropped)
         for item, full in over:
@@ -205,7 +205,7 @@ class TeacherSampler(Sampler[int]):
         self._look()
 
     def _look(self) -> None:
-        """Warn, once, if most items never come back; those in flight are no more as time passes."""
+        """Warns, once, if results of most items never come, when few can still be on their way."""
         if not self._check:
             self._check = max(4 * self._asked, FEW)
         if self._asked < self._check:
@@ -222,29 +222,29 @@ class TeacherSampler(Sampler[int]):
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
-    """What all ranks read, in their order; one that cannot is refused by all."""
+    """Returns what all ranks read, rank by rank; what one refuses is refused by all."""
     try:
         mine, error = read(), ""
     except ArgumentError as refused:
         mine, error = [], str(refused)
-    told = [(trace, error, mine)]
+    said = [(trace, error, mine)]
     if distributed.is_available() and distributed.is_initialized():
-        told *= distributed.get_world_size()
-    if len(told) > 1:
-        distributed.all_gather_object(told, told[0])
-    if len({trace for trace, _, _ in told}) > 1:
+        said *= distributed.get_world_size()
+    if len(said) > 1:
+        distributed.all_gather_object(said, said[0])
+    if len({trace for trace, _, _ in said}) > 1:
         raise ArgumentError(
             "teacher: has drawn other items on other ranks; each needs the same seed and state, "
             "and must draw in step"
         )
-    for _, error, _ in told:
+    for _, error, _ in said:
         if error:
             raise ArgumentError(error)
-    return [answer for _, _, answers in told for answer in answers]
+    return [answer for _, _, answers in said for answer in answers]
 
 
 def _answers(items: Any, success: Any, return_: Any) -> list[tuple[int, Answer]]:
-    """The answers to items [n], each with its item."""
+    """Returns the answers to items [n], each with its item."""
     numbers, shares = _whole(items), _numbers("success", success)
     returns = shares if return_ is None else _numbers("return_", return_)
     for name, values in (("success", shares), ("return_", returns)):
@@ -272,7 +272,7 @@ def _numbers(name: str, values: Any) -> list[float | None]:
 
 
 def _plain(line: str, values: Any, kind: Callable[[Any], T]) -> list[T]:
-    """Numbers [n] as Python's, brought from a device all at once; refused with a line."""
+    """Converts values [n] one by one, brought from a device all at once."""
     try:
         return [*map(kind, values.tolist() if hasattr(values, "tolist") else values)]
     except (TypeError, ValueError) as error:

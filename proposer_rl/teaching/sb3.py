@@ -1,4 +1,4 @@
-"""Stable-Baselines3: what a teacher has to tell, in the learner's own log."""
+"""The teacher's log in the learner's own, for Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from proposer_rl.teaching.teacher import Teacher
 class TeacherCallback(BaseCallback):
     """Records the curriculum's log after each rollout, as ``teacher/NAME``.
 
-    Of what it has of each student or bin the mean is recorded.
+    Where an entry has a number for each student or bin, the mean is recorded.
 
     Args:
         teacher: of the environments that the learner trains in.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +19,8 @@ from torch import Tensor
 from proposer_rl.models import callers_state, own_state
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
-from proposer_rl.tasks.parameters import SEED, Bins, ParameterSpace, intervals, points
+from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
+from proposer_rl.tasks.ranges import python_values, read_line, read_part, target_in_file
 
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 class LevelSpace:
-    """What curricula take for a task: here one that has levels alone.
+    """A task of levels alone, as curricula take one.
 
     Attributes:
         distributions: by name, for hand-designed curricula; ``all`` is the space itself.
@@ -38,12 +38,12 @@ class LevelSpace:
 
     @property
     def space(self) -> LevelSpace:
-        """What levels are chosen from."""
+        """Returns what levels are chosen from."""
         return self
 
     @property
     def target(self) -> Distribution:
-        """What is to be mastered.
+        """Returns what is to be mastered.
 
         Raises:
             ArgumentError: if nothing was said of it.
@@ -54,19 +54,19 @@ class LevelSpace:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What states are compared by: nested dicts of numbers and texts, for JSON."""
+        """Returns what states are compared by: nested dicts of numbers and texts, for JSON."""
         return {"kind": type(self).__qualname__}
 
     def features(self, levels: Levels) -> Tensor:
-        """What a model of outcomes knows of levels: float [*B, F]."""
+        """Returns what a model of outcomes knows of levels: float [*B, F]."""
         return space_features(self, levels)
 
     def given(self, levels: Levels) -> Any:
-        """Levels [*B] as a loop gets them."""
+        """Returns levels [*B] as a loop gets them."""
         return levels
 
     def rows(self, levels: Levels) -> list[Any]:
-        """Levels [n] one by one, as a loop gets them that plays episode by episode."""
+        """Returns levels [n] one by one, for a loop that plays episode by episode."""
         return list(self.given(levels).unbind(0))
 
 
@@ -79,11 +79,15 @@ class Parameters(LevelSpace, ParameterSpace):
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
             for whole numbers, a list or an array for choices among rising numbers, or among texts.
-            YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of which is warned.
+            Or what task files have: ``{"low", "high", "bins", "target"}`` or ``{"values",
+            "target"}``. YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of
+            which is warned, but as the target of such a mapping a range.
         bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
             twenty parameters or more, 1.
-        target: what is to be mastered, for some of the parameters, by name: a value or a part of
-            the range, as in ``ranges``; the others have all of theirs. None for no target.
+        target: what is to be mastered, for some of the parameters, by name: values, or a part of
+            the range as in ``ranges``; ``{"values", "weights"}``, or ``{"distribution": "norm",
+            "loc", "scale"}``. It goes before the targets in ``ranges``; parameters without one
+            have all of theirs. None for no target.
         named: further distributions like ``target``, by name, for hand-designed curricula.
         seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
 
@@ -113,7 +117,6 @@ class Parameters(LevelSpace, ParameterSpace):
         _check_names("ranges", ranges, ranges)
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
-        ranges = {name: _own(values) for name, values in ranges.items()}
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict.fromkeys(ranges, 8)
@@ -122,10 +125,14 @@ class Parameters(LevelSpace, ParameterSpace):
             counts |= {name: whole(f"bins.{name}", count, 1) for name, count in bins.items()}
         else:
             counts = dict.fromkeys(ranges, whole("bins", bins, 1))
-        self.labels = {name: _labels(values) for name, values in ranges.items()}
+        ranges = {name: python_values(given) for name, given in ranges.items()}
+        in_file = {  # as task files have it, within the range
+            name: given.pop("target")
+            for name, given in ranges.items()
+            if isinstance(given, dict) and "target" in given
+        }
         parts = {
-            name: _bins(f"ranges.{name}", values, counts[name], self.labels[name])
-            for name, values in ranges.items()
+            name: read_line(f"ranges.{name}", given, counts[name]) for name, given in ranges.items()
         }
         try:
             super().__init__(parts, seeded)
@@ -134,24 +141,29 @@ class Parameters(LevelSpace, ParameterSpace):
                 f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
                 "bins=1, which suffices for curricula that need none"
             ) from error
+        self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
+        if in_file:
+            _check_names("target", target or {}, parts)
+            read = {name: target_in_file(one, parts[name]) for name, one in in_file.items()}
+            target = {**read, **(target or {})}
         said = _distributions(target, named)
         self._parts = {name: self._part(name, part) for name, part in said.items()}
         further = {name: ParameterSpace(part, seeded) for name, part in self._parts.items()}
         for key, part in {"ranges": ranges, **said}.items():
             for name, values in part.items():
                 if key == "ranges" or parts[name].wide:
-                    _warn_of_two(f"{key}.{name}", _own(values))
+                    _warn_of_two(f"{key}.{name}", python_values(values))
         self.distributions = {"all": self, **further}
 
     @property
     def target_shares(self) -> Tensor:
-        """The target as shares of the bins, float [N]."""
+        """Returns the shares of the target in each bin, float [N]."""
         target: Any = self.target
         return self.shares(target)
 
     @property
     def description(self) -> dict[str, Any]:
-        """Its parameters, their bins, and the target and what else was named."""
+        """Returns the parameters, their bins, and the target and what else was named."""
         named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
         target = {"target": named.pop("target")} if "target" in named else {}
         counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
@@ -165,7 +177,7 @@ class Parameters(LevelSpace, ParameterSpace):
         }
 
     def _said(self, parts: Mapping[str, Bins]) -> dict[str, str]:
-        """Each parameter's values as a text."""
+        """Returns each parameter's values as a text."""
         found = {}
         for name, part in parts.items():
             labels, values = self.labels[name], part.low.tolist()
@@ -174,11 +186,12 @@ class Parameters(LevelSpace, ParameterSpace):
             ends = part.low[0].item(), part.high[-1].item()
             low, high = (str(end).removesuffix(".0") for end in ends)
             whole = "" if part.low.is_floating_point() else ", whole"
-            found[name] = f"{low} to {high}{whole}" if part.wide else str(values)
+            said = f"{low} to {high}{whole}" if part.wide else str(values)
+            found[name] = str(part) if isinstance(part, Law) else said
         return found
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
-        """Levels [n] as dicts of numbers and texts."""
+        """Returns levels [n] as dicts of numbers and texts."""
         columns = {str(name): entry.tolist() for name, entry in levels.items()}
         for name, labels in self.labels.items():
             if labels is not None:
@@ -186,37 +199,18 @@ class Parameters(LevelSpace, ParameterSpace):
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
-        """The bins of a part of the space: one for each parameter or value."""
+        """Returns the bins of a part of the space, by parameter."""
         _check_names(key, ranges, self.bins)
         parts = dict(self.bins)
-        for name, values in ranges.items():
-            whole, labels = self.bins[name], self.labels[name]
-            where, values = f"{key}.{name}", _own(values)
-            if labels is not None:
-                chosen = values if isinstance(values, list) else [values]
-                if any(value not in labels or chosen.count(value) > 1 for value in chosen):
-                    raise ArgumentError(f"{where}={values!r}: must be among {labels}, each once")
-                parts[name] = points(sorted(labels.index(value) for value in chosen))
-                continue
-            values = [values] if _is_number(values) else values
-            part = _bins(where, values, 1, None)
-            low, high = whole.low[0], whole.high[-1]
+        for name, given in ranges.items():
+            where, line = f"{key}.{name}", self.bins[name]
+            parts[name] = part = read_part(where, given, line)
+            low, high = line.low[0], line.high[-1]
             if part.low[0] < low or part.high[-1] > high:
-                raise ArgumentError(f"{where}={values}: must lie within {low:g} to {high:g}")
-            if not whole.low.is_floating_point() and part.low.is_floating_point():
-                raise ArgumentError(f"{where}={values}: must be whole, as the range is")
-            parts[name] = Bins(part.low.to(whole.low), part.high.to(whole.high))
+                raise ArgumentError(
+                    f"{where}={shown(plain(given))}: must lie within {low:g} to {high:g}"
+                )
         return parts
-
-
-class _Texts(Bins):
-    """The places of texts in their list, which has no order."""
-
-    def moved(self, old: Tensor, noise: Tensor) -> Tensor:
-        """Another place, so many further on."""
-        count = len(self.low)
-        further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
-        return (old + further) % count
 
 
 class Items(LevelSpace):
@@ -247,7 +241,7 @@ class Items(LevelSpace):
         count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
-        lines = torch.arange(count).unsqueeze(-1) if features is None else _table(features)
+        lines = torch.arange(count).unsqueeze(-1) if features is None else _feature_table(features)
         if lines.ndim != 2 or len(lines) != count or not lines.float().isfinite().all():
             raise ArgumentError(
                 f"features={list(lines.shape)}: must have a row of finite numbers for each item"
@@ -256,20 +250,20 @@ class Items(LevelSpace):
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
         for name, given in _distributions(target, named).items():
-            places = _places(name, given, count)
+            places = _item_places(name, given, count)
             parts[name] = _SomeItems(torch.tensor(places))
         self._parts = parts
         self.distributions = {"all": self, **parts}
 
     @property
     def target_shares(self) -> Tensor:
-        """The target as shares of the items, float [N]."""
+        """Returns the shares of the target in each item, float [N]."""
         places: Any = self.target
         return places.places.bincount(minlength=self.size) / len(places.places)
 
     @property
     def description(self) -> dict[str, Any]:
-        """How many, a hash of their features, and the places of the target."""
+        """Returns how many there are, a hash of their features, and the places of the target."""
         known = self.coordinates.contiguous().numpy().tobytes()
         places = {name: one.places.tolist() for name, one in self._parts.items()}
         return {
@@ -280,23 +274,23 @@ class Items(LevelSpace):
         }
 
     def locate(self, levels: TensorDictBase) -> Tensor:
-        """Where items lie, float32 [*B, D]."""
+        """Returns where items lie, float32 [*B, D]."""
         return self.coordinates[levels["item"]]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
-        """The items themselves."""
+        """Returns the items themselves."""
         return TensorDict({"item": choices}, choices.shape)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """Items drawn uniformly."""
+        """Draws items uniformly."""
         return self.generate(torch.randint(self.size, (count,), generator=generator), [])
 
     def given(self, levels: TensorDictBase) -> Tensor:
-        """Places, int64 [*B]."""
+        """Returns places, int64 [*B]."""
         return levels["item"]
 
     def rows(self, levels: TensorDictBase) -> list[int]:
-        """Places as Python's numbers."""
+        """Returns places as Python's numbers."""
         places: list[int] = levels["item"].tolist()
         return places
 
@@ -340,16 +334,16 @@ class LevelGenerator(LevelSpace):
             self.edit = self._edits(edit)
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        """Levels [count]."""
+        """Draws levels [count]."""
         return self.distributions["all"].sample(count, generator)
 
     def given(self, levels: Levels) -> Any:
-        """Levels as the function gives them."""
+        """Returns levels as the function gives them."""
         return levels[DRAWN] if DRAWN in levels.keys() else levels
 
     @property
     def axes(self) -> Any:
-        """There are none.
+        """Refuses, as there are no bins.
 
         Raises:
             ArgumentError: always.
@@ -382,7 +376,7 @@ class _Drawn:
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:
-    """Levels [count] that a function gives, as curricula take them."""
+    """Returns levels [count] that a function gives, as curricula take them."""
     if isinstance(levels, np.ndarray) and levels.dtype.kind in "biuf":
         levels = torch.from_numpy(levels.copy())
     if not isinstance(levels, Tensor) and not is_tensor_collection(levels):
@@ -395,8 +389,8 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
     return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
 
 
-def _table(features: Any) -> Tensor:
-    """Numbers [N, D], whatever they are given as."""
+def _feature_table(features: Any) -> Tensor:
+    """Returns numbers [N, D], whatever they are given as."""
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
     try:
         table = torch.as_tensor(np.array(features) if array else features)
@@ -405,8 +399,8 @@ def _table(features: Any) -> Tensor:
     return table if table.is_floating_point() else table.long()  # small integers would overflow
 
 
-def _places(name: str, given: Any, count: int) -> list[int]:
-    """Places of items, or a single one."""
+def _item_places(name: str, given: Any, count: int) -> list[int]:
+    """Returns places of items, also of a single one, as a list."""
     places = plain(given)
     places = [*places] if isinstance(places, Iterable) else [places]
     if not places or not all(type(one) is int and 0 <= one < count for one in places):
@@ -415,20 +409,12 @@ def _places(name: str, given: Any, count: int) -> list[int]:
 
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
-    """What is said of distributions beside the space itself, by their names."""
+    """Returns what is said of distributions beside the space itself, by their names."""
     return {**({} if target is None else {"target": target}), **(named or {})}
 
 
-def _own(values: Any) -> Any:
-    """A range or values of one as Python's own; what a list has besides numbers and texts stays."""
-    if isinstance(values, list | tuple):
-        own = [plain(value) if getattr(value, "ndim", None) == 0 else value for value in values]
-        return tuple(own) if isinstance(values, tuple) else own
-    return values if isinstance(values, range) else plain(values)
-
-
 def _warn_of_two(key: str, values: Any) -> None:
-    """Say how a list is read that a file may have in place of a tuple."""
+    """Warns of how a list is read that a file may have in place of a tuple."""
     if isinstance(values, list) and len(values) == 2 and any(isinstance(v, float) for v in values):
         low, high = values
         warnings.warn(
@@ -436,38 +422,6 @@ def _warn_of_two(key: str, values: Any) -> None:
             f"range from {low} to {high} is a tuple, ({low}, {high})",
             stacklevel=4,
         )
-
-
-def _labels(values: Any) -> list[Any] | None:
-    """The values of a list some of which are not numbers; None for any other."""
-    if isinstance(values, list) and any(not _is_number(value) for value in values):
-        return values
-    return None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _bins(key: str, values: Any, count: int, labels: list[Any] | None) -> Bins:
-    """The bins of a range."""
-    if labels is not None:
-        places = torch.arange(len(labels))
-        return _Texts(places, places)
-    try:
-        if isinstance(values, range):
-            points(sorted({values.start, values.stop}))  # refuses what int64 cannot hold
-        if isinstance(values, range) and values.step == 1 and len(values) > count:
-            edges = torch.linspace(values.start, values.stop, count + 1, dtype=torch.float64)
-            low = edges[:-1].ceil().long()
-            return Bins(low, torch.cat([low[1:], torch.tensor([values.stop])]) - 1)
-        if isinstance(values, tuple) and len(values) == 2 and all(map(_is_number, values)):
-            return intervals(float(values[0]), float(values[1]), count)
-        if isinstance(values, list | range) and len(values) and all(map(_is_number, values)):
-            return points(list(values))
-    except (ValueError, OverflowError) as error:
-        raise ArgumentError(f"{key}={shown(values)}: {error}") from error
-    raise ArgumentError(f"{key}={shown(values)}: must be (low, high), a range or a list")
 
 
 def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:

@@ -29,10 +29,10 @@ class MadeLevels(Parameters):
             or a tensordict.
         features: ``features(levels)`` gives what a model of outcomes knows of levels [*B], float
             [*B, F], each about -1 to 1; None for the parameters alone.
-        bins, target, named: as of :class:`Parameters`.
+        bins, target, named: see :class:`Parameters`.
 
     Raises:
-        ArgumentError: as :class:`Parameters`; if levels are no such thing, or not as many as asked.
+        ArgumentError: see :class:`Parameters`; if ``make`` does not give as many levels as asked.
 
     Example:
         >>> def rows(values, generator):
@@ -59,7 +59,7 @@ class MadeLevels(Parameters):
         self.distributions = {"all": self, **parts}
 
     def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
-        """Levels [n] of the values of the parameters [n], beside these."""
+        """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
         kept = values.select(*self.bins)
         levels = self._make(kept.clone(), generator)
         if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (len(kept),):
@@ -68,21 +68,21 @@ class MadeLevels(Parameters):
         return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
 
     def features(self, levels: Levels) -> Tensor:
-        """What a model of outcomes knows of levels: float [*B, F]."""
+        """Returns the features of levels for a model of outcomes: float [*B, F]."""
         if self._features is None:
             return super().features(levels)
         return self._features(self.given(levels))
 
     def given(self, levels: TensorDictBase) -> Any:
-        """Levels [*B] as the function made them."""
+        """Returns levels [*B] as the function made them."""
         return levels[DRAWN]
 
     def rows(self, levels: TensorDictBase) -> list[Any]:
-        """Levels [n] one by one."""
+        """Returns levels [n] one by one."""
         return LevelSpace.rows(self, levels)
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
-        """Levels [K, P] at points of the box that the ranges span."""
+        """Makes levels [K, P] at points of the box that the ranges span."""
         values = zip(super().at(points, generators), generators, strict=True)
         return torch.stack([self.made(own, g) for own, g in values])
 
@@ -94,7 +94,7 @@ class MadeLevels(Parameters):
 
 
 class _Made(ParameterSpace):
-    """A part of a space of made levels."""
+    """A named distribution of a space of made levels."""
 
     def __init__(self, bins: Any, whole: MadeLevels) -> None:
         super().__init__(bins, seeded=False)

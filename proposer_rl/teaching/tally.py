@@ -1,4 +1,4 @@
-"""What a teacher's log says of every curriculum: levels that went out, and what came back."""
+"""Counts for a teacher's log, whatever the curriculum: levels handed out, results returned."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from proposer_rl.tasks.parameters import Bins, ParameterSpace
 from proposer_rl.teaching.spaces import Items
 
 MOST_PARTS = 64  # of a data set, whose items are counted in
-MOST_BINS = 4096  # of a space that only tells coordinates, among which the nearest is searched
+MOST_BINS = 4096  # of a space that only has coordinates, among which the nearest is searched
 
 
 class Tally:
-    """Counts of one teacher since the last time they were read.
+    """The counts of one teacher since they were last read.
 
     Args:
         space: of the levels, or a task.
@@ -29,14 +29,14 @@ class Tally:
         self._clear()
 
     def count(self, levels: Levels) -> None:
-        """Count levels [K, n] that went out."""
+        """Counts levels [K, n] that were handed out."""
         self._proposed += levels.shape[1]
         for name, bins in _bins(self._space, levels).items() if self._texts else ():
             self._drawn[name] += bins.flatten().bincount(minlength=len(self._texts[name]))
 
-    def told(self, tickets: int, returns: Any, success: Any = None) -> None:
-        """Count what came of so many tickets: numbers or arrays of them."""
-        self._told += tickets
+    def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
+        """Counts the results of tickets, numbers or arrays."""
+        self._returned += tickets
         for name, values in (("return", returns), ("success", success)):
             if values is not None:
                 total, number = self._sums.get(name, (0.0, 0))
@@ -45,11 +45,11 @@ class Tally:
                 self._sums[name] = total + added, number + more
 
     def dropped(self, tickets: int) -> None:
-        """Count tickets that nothing comes of."""
+        """Counts tickets that were given up."""
         self._dropped += tickets
 
     def read(self, out: int) -> dict[str, Any]:
-        """What was counted, for JSON; counts begin anew.
+        """Returns what was counted, for JSON; counts begin anew.
 
         Args:
             out: levels that are out now.
@@ -57,7 +57,7 @@ class Tally:
         means = {name: total / number for name, (total, number) in self._sums.items()}
         found = {
             "proposed": self._proposed,
-            "told": self._told,
+            "told": self._returned,
             "dropped": self._dropped,
             "out": out,
             "mean_return": means.get("return"),
@@ -71,7 +71,7 @@ class Tally:
         return found
 
     def _clear(self) -> None:
-        self._proposed = self._told = self._dropped = 0
+        self._proposed = self._returned = self._dropped = 0
         self._sums: dict[str, tuple[float, int]] = {}
         self._drawn = {
             name: torch.zeros(len(texts), dtype=torch.int64) for name, texts in self._texts.items()
@@ -79,7 +79,7 @@ class Tally:
 
 
 def _bins(space: Any, levels: Levels) -> dict[str, Tensor]:
-    """The bin of each of levels [*B] along each axis, int64 [*B]."""
+    """Returns the bin of each of levels [*B] along each axis, by its name: int64 [*B]."""
     if isinstance(space, ParameterSpace):
         return {
             name: torch.bucketize(levels[name].cpu().double(), (part.high[:-1] + part.low[1:]) / 2)
@@ -95,7 +95,7 @@ def _bins(space: Any, levels: Levels) -> dict[str, Tensor]:
 
 
 def _bin_texts(space: Any) -> dict[str, list[str]]:
-    """What each bin of each axis is called; empty where there are no bins."""
+    """Returns the names of the bins of each axis; nothing where there are no bins."""
     if isinstance(space, ParameterSpace):
         labels = getattr(space, "labels", {})
         return {
@@ -113,7 +113,7 @@ def _bin_texts(space: Any) -> dict[str, list[str]]:
 
 
 def _distinct(part: Bins) -> list[str]:
-    """Texts of bins, in as many digits as tell them apart."""
+    """Returns names of bins in as many digits as tell them apart."""
     ends = [*zip(part.low.tolist(), part.high.tolist(), strict=True)]
     for digits in (4, 17):
         texts = [

@@ -1,4 +1,4 @@
-"""A curriculum for a loop of one's own: levels out, results in."""
+"""The teacher: a curriculum in any loop, which takes levels and brings results."""
 
 from __future__ import annotations
 
@@ -23,18 +23,26 @@ from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
 from proposer_rl.models import callers_state, own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
+from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
-from proposer_rl.tasks.parameters import LARGEST
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
-from proposer_rl.teaching.segments import LEVEL_ID, ended
+from proposer_rl.teaching.results import (
+    COUNTS,
+    LEVEL_ID,
+    RESULTS,
+    argument,
+    as_array,
+    as_ids,
+    as_number,
+    as_outcome,
+    ended,
+)
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tally import Tally
-from proposer_rl.teaching.tickets import COUNTS, RESULTS, as_array, as_outcome, check_values
 
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
@@ -52,7 +60,7 @@ class Teacher:
         ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
         teacher.tell(ticket, return_=r, success=ok)
 
-    What was told is taken in when the curriculum proposes next, at every ``block`` tickets. Replay
+    The curriculum observes results when it proposes next, at every ``block`` tickets. Replay
     draws blocks of more than 128 levels at once, which costs a fraction of one after another.
     Whatever is refused counts nothing, and leaves the teacher as it was.
 
@@ -109,7 +117,7 @@ class Teacher:
         **can: Any,
     ) -> None:
         self.space, self.device, self.block = space, torch.device(device), block
-        self._seeds = [whole("seed", seed) + copy for copy in range(students)]
+        self._seeds = [whole("seed", seed) + number for number in range(students)]
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
@@ -140,11 +148,11 @@ class Teacher:
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """What must be told beside the return: ``success``, ``rollout``."""
+        """Names of what results must have beside the return: ``success``, ``rollout``."""
         return self.curriculum.reads
 
     def propose(self, n: SupportsIndex) -> Any:
-        """Levels [n] ([K, n] of several students) to be observed together."""
+        """Returns levels [n] ([K, n] of several students) to be observed together."""
         with self._here():
             block = self._next(whole("n", n, 1))
             block.state[:] = OUT
@@ -153,7 +161,7 @@ class Teacher:
             return self._levels(block)
 
     def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
-        """The next level and its ticket.
+        """Hands out the next level and its ticket.
 
         Args:
             n: None for one level, as Python's numbers where the space has such; else so many.
@@ -192,7 +200,7 @@ class Teacher:
         episodes: Any = None,
         steps: Any = None,
     ) -> None:
-        """What came of levels.
+        """Takes the results of levels.
 
         Args:
             ids: a ticket, or tickets [n] in any order.
@@ -210,23 +218,23 @@ class Teacher:
                 or not finite, another shape.
         """
         given = (return_, success, score, episodes, steps)
-        told = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
+        results = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
         with self._here():
             if "rollout" in self.reads:
                 raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
             if success is None:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):
-                numbers = {name: _number(name, value) for name, value in told.items()}
-                self._check_score(told)
+                numbers = {name: as_number(name, value) for name, value in results.items()}
+                self._check_score(results)
                 self._ledger.tell_one(ids, numbers)
-                self._scored = "score" in told
-                self._tally.told(1, numbers["return"], numbers.get("success"))
+                self._scored = "score" in results
+                self._tally.returned(1, numbers["return"], numbers.get("success"))
             else:
-                self._tell(self._ids(ids), told)
+                self._tell(as_ids(ids), results)
 
     def drop(self, ids: Any = None) -> None:
-        """Nothing will come of these levels: episodes that were cut off.
+        """Gives up levels of which no results will come, as of episodes that were cut off.
 
         Args:
             ids: the tickets, of which some may be over; None for all that are out, as where a
@@ -238,14 +246,14 @@ class Teacher:
                 self._ledger.drop_all()
                 self._whole.clear()
             else:
-                tickets = self._ids(ids)
+                tickets = as_ids(ids)
                 going = self._ledger.states(tickets) != OVER
                 self._ledger.drop(self._ledger.find(tickets[going]))
             self._tally.dropped(before - self._ledger.out)
 
     @own_state()
     def observe(self, outcome: Any, ids: Any = None) -> None:
-        """What came of the levels that were proposed, or of those of some tickets.
+        """Takes the outcome of the levels that were proposed, or of those of some tickets.
 
         Args:
             outcome: by name, ``return`` and where there is such a thing ``success``, [n]; as
@@ -256,43 +264,43 @@ class Teacher:
             ids: the tickets; None for the levels of :meth:`propose`, if one batch is out.
 
         Raises:
-            ArgumentError: as :meth:`tell`; if several batches are out, or a rollout does not say
+            ArgumentError: see :meth:`tell`; if several batches are out, or a rollout does not say
                 which levels it is of.
         """
         with self._here():
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
                 if kept is not None:  # of episodes that were not cut off since
-                    states = self._ledger.states(self._ids(kept[LEVEL_ID].reshape(-1)))
+                    states = self._ledger.states(as_ids(kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
                     self._observe_rollout(tickets, whole)
                 self._kept = left
                 return
-            tickets = self._proposed() if ids is None else self._ids(ids)
+            tickets = self._proposed() if ids is None else as_ids(ids)
             if "rollout" in outcome.keys():
                 self._observe_rollout(tickets, outcome["rollout"])
             else:
                 if "rollout" in self.reads:
                     raise ArgumentError("outcome: has no rollout, which this curriculum reads")
                 self._require_success("success" in outcome.keys(), "put it into the outcome")
-                told = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
-                if "return" not in told:
+                results = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
+                if "return" not in results:
                     raise ArgumentError(f"outcome={sorted(outcome.keys())}: has no return")
-                self._tell(tickets, told)
+                self._tell(tickets, results)
             if ids is None:
                 self._whole.clear()
 
     @own_state()
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
-        """What happened since the last call, and what else the curriculum tells.
+        """Returns what happened since the last call, and the curriculum's own log.
 
         For every curriculum: how many levels were ``proposed``, ``told`` and ``dropped``, and are
-        ``out`` now; ``mean_return`` and ``mean_success`` of what was told, None where nothing was;
+        ``out`` now; ``mean_return`` and ``mean_success`` of the results, None without any;
         and ``drawn``, how many of the proposed levels there were in each bin of each parameter.
-        The curriculum's own entries are in the table of the methods. In them is not what was told
-        since the last proposal, so that logs change no curriculum.
+        The curriculum's own entries leave out results since the last proposal, so that logs change
+        no curriculum.
 
         Args:
             file: JSON Lines to which it is added as a line, without levels, for ``bin/report``.
@@ -302,16 +310,16 @@ class Teacher:
         """
         with self._here():
             self._count()
-            told = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
+            record = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
             if file is not None:
-                kept = {name: value for name, value in told.items() if name != "levels"}
+                kept = {name: value for name, value in record.items() if name != "levels"}
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
                     lines.write(json.dumps(kept) + "\n")
-            return told
+            return record
 
     @own_state()
     def state_dict(self) -> dict[str, Any]:
-        """All that a resumed loop needs, tickets that are out included."""
+        """Returns all that a resumed loop needs, with the tickets that are out."""
         with self._here():
             kept = self._kept
             return {
@@ -331,7 +339,7 @@ class Teacher:
 
     @own_state()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on, bit by bit, with what :meth:`state_dict` returned, on whichever device it is.
+        """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
         Raises:
             ArgumentError: if it is of another space, curriculum, setting of it or number of
@@ -365,19 +373,19 @@ class Teacher:
 
     @cached_property
     def _like(self) -> Levels:
-        """A level of the kind."""
+        """One level of the space."""
         source: Any = self.space.space
         return source.sample(1, torch.Generator())[0]
 
     @cached_property
     def _of(self) -> dict[str, Any]:
-        """What its state is of."""
+        """The space and the curriculum that a state belongs to."""
         return {"space": of_levels(self.space, self._like), "curriculum": self._made_of}
 
     def client(self) -> TeacherClient:
-        """This teacher for another process, such as a worker of a collector.
+        """Returns a client of this teacher for another process, such as a collector's worker.
 
-        It asks and tells as the teacher does, and can be sent there.
+        It has ``ask``, ``tell`` and ``drop``, and can be sent there.
         """
         with self._here():
             self._server = self._server or TeacherServer(self)
@@ -407,7 +415,7 @@ class Teacher:
         return ticket, self._rows[ticket - block.start]
 
     def _current(self, left: int) -> Block:
-        """The block that the next of some tickets is of; a new one where the last is used up."""
+        """Returns the block of the next of ``left`` tickets, a new one if the last is used up."""
         block = self._block
         if block is None or (left and self._at == block.end):
             block = self._next(max(self.block, left))
@@ -415,13 +423,13 @@ class Teacher:
         return block
 
     def _use(self, block: Block | None, at: int) -> None:
-        """Hand out tickets of a block from one on."""
+        """Begins to hand out the tickets of a block, from ``at`` on."""
         self._count()
         self._block, self._at, self._counted = block, at, at
         self._rows, self._moved = [], None
 
     def _count(self) -> None:
-        """Count for the log what of the block was handed out."""
+        """Counts for the log what of the block was handed out."""
         block = self._block
         if block is not None and self._at > self._counted:
             some = slice(self._counted - block.start, self._at - block.start)
@@ -430,32 +438,32 @@ class Teacher:
 
     @own_state()
     def _next(self, count: int) -> Block:
-        """What the curriculum proposes, when it has observed what was told."""
-        for told, results in self._ledger.take():
-            self.curriculum.observe(self.student, told, as_outcome(results))
+        """Lets the curriculum observe the results there are, and returns what it then proposes."""
+        for batch, results in self._ledger.take():
+            self.curriculum.observe(self.student, batch, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
         self._proposals += 1
         return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
-        """The levels of a block, as the loop gets them, which may change them."""
+        """Returns the levels of a block as the loop gets them, which may change them."""
         levels = moved(block.batch.levels, self.device).clone()
         return self._given(levels[0] if self._alone else levels)
 
-    def _tell(self, ids: NDArray[np.int64], told: Mapping[str, Any]) -> None:
+    def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
         shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
-            name: as_array(_argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
-            for name, value in told.items()
+            name: as_array(argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
+            for name, value in results.items()
         }
-        self._check_score(told)
+        self._check_score(results)
         self._ledger.tell(self._ledger.find(ids), arrays)
-        self._scored = "score" in told
-        self._tally.told(len(ids), arrays["return"], arrays.get("success"))
+        self._scored = "score" in results
+        self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
-        """Observe a rollout [K, n, T], or [n, T] of one student: each row is of one ticket."""
+        """Observes a rollout [K, n, T], or [n, T] of one student, with a row for each ticket."""
         if self._alone and rollout.ndim < 3:
             rollout = rollout.unsqueeze(0)
         if tuple(rollout.batch_size[:2]) != (self.students, len(ids)):
@@ -485,10 +493,10 @@ class Teacher:
             batch = block.batch[:, torch.from_numpy(place)]
             self.curriculum.observe(self.student, batch, outcome[:, rows])
         self._ledger.drop(parts)
-        self._tally.told(len(ids), numbers["return"], numbers.get("success"))
+        self._tally.returned(len(ids), numbers["return"], numbers.get("success"))
 
-    def _check_score(self, told: Mapping[str, Any]) -> None:
-        if self._scored not in (None, "score" in told):
+    def _check_score(self, results: Mapping[str, Any]) -> None:
+        if self._scored not in (None, "score" in results):
             how = "missing: other levels were told with one" if self._scored else "others had none"
             raise ArgumentError(f"score: {how}; give it for all or for none")
 
@@ -497,7 +505,7 @@ class Teacher:
             raise ArgumentError(f"success: missing: this curriculum reads it; {how}")
 
     def _proposed(self) -> NDArray[np.int64]:
-        """The tickets of the one batch that is out."""
+        """Returns the tickets of the one batch that is out."""
         whole = [block for block in self._ledger.blocks if block.start in self._whole]
         out = [block for block in whole if (block.state == OUT).any()]
         if len(out) != 1:
@@ -507,32 +515,3 @@ class Teacher:
                 "need ask(n) and its tickets"
             )
         return np.arange(out[0].start, out[0].end)
-
-    def _ids(self, ids: Any) -> NDArray[np.int64]:
-        """Tickets as an array [n] on the CPU."""
-        array = np.asarray(ids.detach().cpu() if isinstance(ids, Tensor) else ids)
-        if array.size == 0:
-            return np.zeros(0, np.int64)
-        if array.ndim > 1 or array.dtype.kind not in "iu":
-            raise ArgumentError(
-                f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
-            )
-        return array.reshape(-1).astype(np.int64)
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        told = f"{_argument(name)}={shown(value)}"
-        raise ArgumentError(f"{told}: must be a number of float32") from error
-    if not -LARGEST <= number <= LARGEST:
-        raise ArgumentError(f"{_argument(name)}={number}: must be finite in float32")
-    # Arrays take a while to make; few numbers need one.
-    if name in COUNTS or (name == "success" and not 0 <= number <= 1):
-        check_values(name, np.array([number]))
-    return number
-
-
-def _argument(name: str) -> str:
-    return "return_" if name == "return" else name

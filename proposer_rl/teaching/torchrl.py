@@ -20,7 +20,7 @@ from torchrl.envs import (
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
-from proposer_rl.teaching.segments import LEVEL_ID
+from proposer_rl.teaching.results import LEVEL_ID
 from proposer_rl.teaching.teacher import Success, Teacher
 
 NONE = -1  # the identity of no level
@@ -40,11 +40,11 @@ class _Played:
 
 
 class LevelTransform(Transform):
-    """Asks for a level at every reset, also of some environments of a batch; tells at every end.
+    """Asks a teacher for a level at every reset, and reports every episode.
 
-    The number of the level that is played, its ticket, is ``level_id`` in every step. An episode
-    goes to the level that it began on, in whichever rollout it ends. One that a full reset cuts off
-    counts for nothing.
+    Resets may be of some environments of a batch. ``level_id``, in every step, is the ticket of the
+    level that is played. An episode goes to the level that it began on, in whichever rollout it
+    ends. One that a full reset cuts off counts for nothing.
 
     It works in a collector with and without ``reset_at_each_iter``, and with ``teacher.client()``
     in environments of other processes. Put it behind transforms that end episodes and before those
@@ -54,19 +54,19 @@ class LevelTransform(Transform):
         teacher: of one student; in another process than its own, its client.
         set_level: ``set_level(env, levels)`` makes the environment, without transforms, play levels
             [*B] from its next reset on. Of those that go on the levels are as before.
-        success: as of :class:`Teacher`, or another entry of ``next``; None for its entry
+        success: see :class:`Teacher`, or another entry of ``next``; None for its entry
             ``success``, or what the environment's class has as ``success_rule``.
         once: whether it may be one in any step, so that what is reached and lost again counts.
         reward: the entry of ``next`` that returns are of, one number for each environment; or a
             function of ``next`` that makes it of several agents' or objectives'.
-        tell: whether it tells returns and success; False where the loop gives whole rollouts to
+        tell: whether it reports returns and success; False where the loop gives whole rollouts to
             :meth:`Teacher.observe`. A collector with ``set_truncated``, which ends episodes in a
             rollout alone, then needs ``reset_at_each_iter``.
 
     Raises:
-        ArgumentError: if the teacher is of several students, or reads rollouts and is to be told;
-            at the first reset, if the environment has no such reward or success, resets itself, or
-            is one of several that levels do not get into from outside.
+        ArgumentError: if the teacher is of several students, or reads rollouts while ``tell`` is
+            true; at the first reset, if the environment has no such reward or success, resets
+            itself, or is one of several that levels do not get into from outside.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class LevelTransform(Transform):
         return played.setdefault(id(self._teacher), _Played())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add ``level_id``."""
+        """Adds ``level_id``."""
         shape = (*observation_spec.shape, 1)
         device = observation_spec.device
         observation_spec[LEVEL_ID] = Unbounded(shape, dtype=torch.int64, device=device)
@@ -130,7 +130,7 @@ class LevelTransform(Transform):
         return self._marked(after)
 
     def _begin(self, tensordict: TensorDictBase | None) -> None:
-        """Give levels to environments that are reset."""
+        """Gives levels to environments that are reset."""
         env, now = self.parent.base_env, self._now
         count = env.batch_size.numel()
         device = env.device or torch.device("cpu")
@@ -180,7 +180,7 @@ class LevelTransform(Transform):
         now.succeeded = torch.zeros_like(now.out)
 
     def _check(self) -> None:
-        """Refuse what a step will lack, before there is one."""
+        """Refuses what a step will lack, before there is one."""
         after = self.parent.fake_tensordict()["next"]
         self._of_each("done", "done", after)
         for name, rule in (("reward", self._reward), ("success", self._success(after))):
@@ -188,7 +188,7 @@ class LevelTransform(Transform):
                 self._of_each(name, rule, after)
 
     def _end(self, ended: Tensor) -> None:
-        """Tell what came of episodes, bool [n]."""
+        """Reports the episodes of the environments where one has ended, bool [n]."""
         now = self._now
         which = ended.nonzero().squeeze(-1)  # waits for the device once, where each mask would
         if self._tells and len(which):
@@ -201,7 +201,7 @@ class LevelTransform(Transform):
         now.out = now.out & ~ended
 
     def _of_each(self, name: str, rule: Any, after: TensorDictBase) -> Tensor:
-        """One number of each environment, [n], by an entry or a function."""
+        """Returns one number of each environment, [n], by an entry or a function."""
         how = "it must be one number for each environment, an entry or a function of next"
         entry = rule(after) if callable(rule) else after.get(rule, None)
         if entry is None:
@@ -215,7 +215,7 @@ class LevelTransform(Transform):
         return entry.reshape(-1)
 
     def _success(self, after: TensorDictBase) -> Any:
-        """The entry or function that says what is a success; None where nothing does."""
+        """Returns the entry or function that says what is a success; None where nothing does."""
         if self._rule is not None:
             return self._rule
         if "success" in after.keys():

@@ -1,4 +1,4 @@
-"""TRL: a curriculum of prompts in a GRPOTrainer, told by its reward."""
+"""A curriculum of prompts in TRL's GRPOTrainer, whose rewards are its results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FILE = "teacher.pt"  # of a checkpoint
 
 
 class TaughtReward(TrainerCallback):
-    """A reward function that tells a teacher, which then draws the trainer's prompts.
+    """A reward function that reports to a teacher, which draws the trainer's prompts.
 
         reward = TaughtReward(teacher, solved)
         trainer = GRPOTrainer(model, reward, config, rows)
@@ -29,7 +29,7 @@ class TaughtReward(TrainerCallback):
         trainer.train()
 
     Groups and their repetitions follow from the trainer's config; an epoch has as many prompts as
-    the training set. Evaluation tells nothing. Checkpoints hold the curriculum, and
+    the training set. Evaluation does not count. Checkpoints hold the curriculum, and
     ``train(resume_from_checkpoint=...)`` goes on with it. In a launch each rank does the same.
 
     Args:
@@ -52,11 +52,11 @@ class TaughtReward(TrainerCallback):
             raise ArgumentError("reward: must be no coroutine: ranks are told in step")
         self._teacher, self._rows, self._reward = teacher, teacher.space.size, reward
         self._told = 0  # generations
-        self._again = False  # whether the next one repeats the last that was told
+        self._again = False  # whether the next one repeats the last that was reported
         update_wrapper(self, reward)  # TRL logs it by its name
 
     def attach(self, trainer: Any) -> None:
-        """Draw the prompts of a trainer, before it trains.
+        """Makes the teacher draw the prompts of a trainer, before that trains.
 
         Args:
             trainer: ``GRPOTrainer`` or another that generates groups as that does.
@@ -87,7 +87,7 @@ class TaughtReward(TrainerCallback):
         trainer.add_callback(self)
 
     def __call__(self, completions: Sequence[Any], **columns: Any) -> Sequence[float | None]:
-        """The rewards, of which the teacher is told while the model trains."""
+        """Returns the rewards; while the model trains, the teacher gets them as results."""
         if self._trainer is None:
             raise ArgumentError("trainer: missing: call attach(trainer) before it trains")
         items = columns.pop(ROW, None)
@@ -100,7 +100,7 @@ class TaughtReward(TrainerCallback):
         return rewards
 
     def load(self, folder: str | Path) -> None:
-        """Go on with the curriculum of a checkpoint that does not lie in the config's output_dir.
+        """Loads the curriculum of a checkpoint that does not lie in the config's output_dir.
 
         Raises:
             ArgumentError: if it has none.
@@ -115,7 +115,7 @@ class TaughtReward(TrainerCallback):
         self._told, self._loaded = state["told"], True
 
     def on_train_begin(self, args: Any, state: Any, control: Any, **_: Any) -> None:
-        """Where training is resumed, with the curriculum of that step."""
+        """Loads the curriculum of the step at which training is resumed."""
         if not state.global_step:  # nothing comes of what an earlier training has drawn ahead
             self._sampler.drop()
             self._told, self._loaded = 0, False
@@ -123,13 +123,13 @@ class TaughtReward(TrainerCallback):
         if not self._loaded:
             self.load(Path(args.output_dir) / f"checkpoint-{state.global_step}")
         self._loaded = False
-        # Within the steps of a generation TRL generates again, of prompts that were told before.
+        # Within the steps of a generation TRL generates again, of prompts whose rewards it has.
         per_step = args.gradient_accumulation_steps
         epoch, step = divmod(state.global_step, -(-self._groups * self._rounds // per_step))
         self._again = self._told > epoch * self._groups + step * per_step // self._rounds
 
     def on_save(self, args: Any, state: Any, control: Any, **_: Any) -> None:
-        """Put the curriculum into the checkpoint; that of all ranks is the same."""
+        """Puts the curriculum into the checkpoint; that of all ranks is the same."""
         if args.should_save:
             made = {
                 "teacher": self._teacher.state_dict(),

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from proposer_rl.models import available_cores
-from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, Vectorization
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, Vectorization
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.gymnasium.settings import SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from research.benchmarks.environment import through_torchrl
 from research.benchmarks.results import Options, Result, Row

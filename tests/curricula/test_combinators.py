@@ -212,12 +212,6 @@ def test_a_schedule_trains_replicas_where_a_stage_does() -> None:
     assert Schedule([plain, learnt()], [1]).trains_replicas
 
 
-@pytest.mark.parametrize("until", [[], [2], [3, 2], [2, 2], [0, 4]])
-def test_a_schedule_refuses_ends_that_do_not_fit(until: list[int]) -> None:
-    with pytest.raises(ValueError, match="3 stages need 2 ascending positive"):
-        Schedule([SamplingCurriculum(TASK.space)] * 3, until)
-
-
 @pytest.mark.parametrize(("count", "shares"), [(8, [4, 2, 2]), (3, [2, 0, 1]), (1, [0, 1, 0])])
 def test_each_curriculum_of_a_mixture_has_its_share(count: int, shares: list[int]) -> None:
     parts = [Noted(10 * i) for i in range(3)]

@@ -17,8 +17,8 @@ from proposer_rl.curricula import gaussians
 from proposer_rl.curricula.gaussians import (
     MixtureCurriculum,
     absolute_progress,
-    draw,
-    fit,
+    draw_points,
+    fit_mixture,
     nearest,
 )
 from proposer_rl.streams import Streams
@@ -66,7 +66,7 @@ def clusters(generator: torch.Generator) -> torch.Tensor:
 
 def test_a_mixture_has_the_least_aic() -> None:
     points = clusters(torch.Generator().manual_seed(0))
-    found, _ = fit(points, 6, torch.Generator().manual_seed(1))
+    found, _ = fit_mixture(points, 6, torch.Generator().manual_seed(1))
     # Written out: 2 * (numbers of the model) - 2 * log-likelihood, D + 1 = 3 coordinates.
     scores = {}
     for count in range(2, 7):
@@ -84,15 +84,15 @@ def test_a_mixture_has_the_least_aic() -> None:
 @pytest.mark.parametrize("seed", [0, 7])
 def test_equal_generators_give_equal_mixtures(seed: int) -> None:
     points = torch.rand(60, 3, generator=torch.Generator().manual_seed(2))
-    one, again = (fit(points, 4, Streams(seed).generator("mixture")) for _ in range(2))
+    one, again = (fit_mixture(points, 4, Streams(seed).generator("mixture")) for _ in range(2))
     assert all(map(torch.equal, one, again))
 
 
 def test_points_that_are_all_alike_make_a_mixture_without_a_warning(
     recwarn: pytest.WarningsRecorder,
 ) -> None:
-    found = fit(torch.zeros(20, 3), 5, torch.Generator())
-    drawn = draw(*found, 1000, torch.Generator())
+    found = fit_mixture(torch.zeros(20, 3), 5, torch.Generator())
+    drawn = draw_points(*found, 1000, torch.Generator())
     assert drawn.abs().max() < 0.1
     assert len(recwarn) == 0
 
@@ -104,7 +104,7 @@ def test_gaussians_are_drawn_by_their_progress_and_with_their_moments() -> None:
         covariance.double().expand(3, 3, 3),
     )
     count = 40_000
-    drawn = draw(*mixture, count, torch.Generator().manual_seed(3))
+    drawn = draw_points(*mixture, count, torch.Generator().manual_seed(3))
     assert (drawn[:, 1] < 20).all()  # that without progress never
     left = drawn[:, 0] < 0
     assert float(left.double().mean()) == pytest.approx(0.75, abs=4 * math.sqrt(0.19 / count))
@@ -117,7 +117,7 @@ def test_gaussians_are_drawn_by_their_progress_and_with_their_moments() -> None:
 def test_without_progress_all_gaussians_are_alike() -> None:
     means = torch.tensor([[-1.0, 0.0], [1.0, 0.0]]).double()
     spread = torch.diag(torch.tensor([1e-4, 1.0])).double().expand(2, 2, 2)
-    drawn = draw(means, spread, 10_000, torch.Generator().manual_seed(4))
+    drawn = draw_points(means, spread, 10_000, torch.Generator().manual_seed(4))
     assert float((drawn > 0).double().mean()) == pytest.approx(0.5, abs=0.02)
 
 
@@ -214,9 +214,9 @@ def test_mixtures_are_made_of_the_last_window_when_it_is_full(
 
     def noted(points: torch.Tensor, most: int, generator: torch.Generator) -> Any:
         made.append(points)
-        return fit(points, most, generator)
+        return fit_mixture(points, most, generator)
 
-    monkeypatch.setattr(gaussians, "fit", noted)
+    monkeypatch.setattr(gaussians, "fit_mixture", noted)
     task = Scripted(torch.rand(1, 8), batch_size=24)
     curriculum = small(task, warmup=70, refit=50)
     fitted = []

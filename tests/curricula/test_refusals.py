@@ -106,8 +106,10 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (partial(Mixed, TWO), {"shares": [1.0]}, r"shares=\[1.0\]: 2 curricula need as many"),
     (partial(Mixed, TWO), {"shares": [1.0, -1.0]}, "shares.1=-1.0: input should be greater"),
     (partial(Mixed, TWO), {"shares": [0.0, 0.0]}, "shares=.*, not all of them zero"),
-    (partial(Schedule, TWO), {"until": [3, 2]}, r"until=\[3, 2\]: 2 stages need 1 ascending"),
-    (partial(Schedule, TWO), {"until": [0]}, r"until=\[0\]: 2 stages need 1 ascending positive"),
+    *(
+        (partial(Schedule, [*TWO, TWO[0]]), {"until": until}, "3 stages need 2 ascending positive")
+        for until in ([], [2], [3, 2], [2, 2], [0, 4])
+    ),
 ]
 
 

@@ -18,9 +18,10 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     level_keys,
+    lineage,
     score_weights,
 )
-from proposer_rl.curricula.children import easiness, lineage
+from proposer_rl.curricula.replay import easiness
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.process import StopSignals

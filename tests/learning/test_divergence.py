@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from proposer_rl.learning import DivergedError, located
 from proposer_rl.learning.divergence import require_finite
-from tests.learning.test_ppo import generators, learner
+from tests.draws import generators
+from tests.learning.test_ppo import learner
 
 K, S = 3, 2
 BAD = [float("nan"), float("inf"), float("-inf")]

@@ -21,6 +21,7 @@ from proposer_rl.tasks.view_mazes.view_settings import (
     ViewNetworkSettings,
     view_network,
 )
+from tests.draws import generators
 from tests.tasks.view_mazes.oracles import random_levels
 
 K, P, T, M = 2, 3, 14, 8
@@ -40,10 +41,6 @@ def learner(copies: range = range(K), settings: PPOSettings = SETTINGS, **how: A
     return PPO(ViewMazeEnv(levels, max_steps=6), agent, settings)
 
 
-def generators(copies: range = range(K)) -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(k) for k in copies]
-
-
 def through_time(ppo: PPO, rollout: TensorDict) -> TensorDict:
     with set_recurrent_mode(True), torch.no_grad():
         return ppo.agent(rollout.clone())
@@ -51,7 +48,7 @@ def through_time(ppo: PPO, rollout: TensorDict) -> TensorDict:
 
 def test_training_starts_from_the_probabilities_that_acted() -> None:
     ppo = learner()
-    rollout = ppo.collect(generators())
+    rollout = ppo.collect(generators(*range(K)))
     assert rollout["is_init"][:, :, 1:].any()
     again = through_time(ppo, rollout)
     log_prob = ppo.agent.distribution(again).log_prob(rollout["action"])
@@ -64,7 +61,7 @@ def test_training_starts_from_the_probabilities_that_acted() -> None:
 
 
 def test_values_after_a_step_are_those_before_the_next_one() -> None:
-    rollout = learner().collect(generators())
+    rollout = learner().collect(generators(*range(K)))
     going_on = ~rollout["next", "done"][:, :, :-1]
     before, after = rollout["state_value"][:, :, 1:], rollout["next", "state_value"][:, :, :-1]
     torch.testing.assert_close(before[going_on], after[going_on], rtol=1e-5, atol=1e-6)
@@ -75,12 +72,12 @@ def test_values_after_a_step_are_those_before_the_next_one() -> None:
 @pytest.mark.parametrize("how", [{}, {"batched": True}], ids=["one by one", "batched"])
 def test_copies_together_learn_what_each_learns_alone(how: dict[str, Any]) -> None:
     together = learner(**how)
-    rollouts = [together.update(generators()).rollout for _ in range(2)]
+    rollouts = [together.update(generators(*range(K))).rollout for _ in range(2)]
     for k in range(K):
         copy = range(k, k + 1)
         alone = learner(copy)
         for rollout in rollouts:
-            own = alone.update(generators(copy)).rollout
+            own = alone.update(generators(*copy)).rollout
             assert torch.equal(own["action"][0], rollout["action"][k])
             torch.testing.assert_close(
                 own["advantage"][0], rollout["advantage"][k], rtol=1e-4, atol=1e-5
@@ -94,7 +91,7 @@ def test_copies_together_learn_what_each_learns_alone(how: dict[str, Any]) -> No
 
 def test_a_second_look_at_a_rollout_remembers_with_the_present_weights() -> None:
     ppo = learner()
-    rollout = ppo.collect(generators())
+    rollout = ppo.collect(generators(*range(K)))
     ppo.optimise(rollout)
     steps = rollout.clone()
     set_values(ppo.agent, steps, TensorDict({}, [K, P]))
@@ -120,7 +117,7 @@ def test_torchrls_own_rollout_carries_the_memory() -> None:
 def test_a_policys_gradient_goes_through_time() -> None:
     """That of the surrogate is that of a loop over the steps, each with the memory before it."""
     ppo = learner()
-    agent, rollout = ppo.agent, ppo.collect(generators())
+    agent, rollout = ppo.agent, ppo.collect(generators(*range(K)))
     advantage = torch.randn(K, P, T, generator=torch.Generator().manual_seed(0))
     parameters = list(agent.parameters())
     found = torch.autograd.grad(surrogate(agent, rollout, advantage).sum(), parameters)

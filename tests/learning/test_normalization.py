@@ -17,6 +17,7 @@ from proposer_rl.meta.first_order import LevelGradients
 from proposer_rl.models.normalization import FARTHEST, RunningMoments
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
+from tests.draws import generators
 from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import tiny_task
 
@@ -41,14 +42,10 @@ def made(**changed: Any) -> tuple[Any, PPO]:
     return task, learner
 
 
-def generators() -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(seed) for seed in range(K)]
-
-
 @pytest.fixture(scope="module", params=[False, True], ids=["from resets", "continued"])
 def trained(request: pytest.FixtureRequest) -> Any:
     task, learner = made(continue_episodes=request.param)
-    draws = generators()
+    draws = generators(*range(K))
     return task, learner, [learner.update(draws).rollout for _ in range(4)]
 
 
@@ -118,7 +115,7 @@ def test_training_is_that_on_rewards_divided_by_the_unit() -> None:
     }  # fmt: skip
     _, scaled = made(**changed)
     _, plain = made(**changed, normalize_rewards=False)
-    rollout = scaled.collect(generators())
+    rollout = scaled.collect(generators(*range(K)))
     copied = rollout.clone()
     metrics = scaled.optimise(rollout)
     unit = scaled.agent.normalization.returns.deviation[:, None, None, None]
@@ -138,7 +135,7 @@ def test_only_training_moves_the_moments(trained: Any) -> None:
     student = TaskStudent(task, learner)
     levels = torch.stack([task.evaluated_on["target"][:2]] * K)
     task.measure(learner.agent)
-    rollout = student.play(levels, generators())
+    rollout = student.play(levels, generators(*range(K)))
     probes = student.probe(levels[0])
     assert (learner.snapshot() == before).all()
     agent = learner.agent

@@ -29,6 +29,7 @@ from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from tests.draws import generators
 from tests.host_reads import HostRead, NoHostReads
 from tests.tiny import TASK, tiny_view_task
 
@@ -69,10 +70,6 @@ def train(ppo: PPO, updates: int) -> list[TensorDict]:
         rollout, metrics = ppo.update(generators(*(10 * update + k for k in range(copies))))
         history.append(TensorDict({"rollout": rollout, "metrics": metrics}))
     return history
-
-
-def generators(*seeds: int) -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
 def assert_equal_but_for_rounding(one: TensorDict, other: TensorDict) -> None:

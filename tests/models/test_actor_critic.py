@@ -22,6 +22,7 @@ from proposer_rl.models import (
     read_maps,
     uniform_noise,
 )
+from tests.draws import generators
 
 K, P, T, H, W = 2, 3, 5, 6, 7
 
@@ -132,9 +133,6 @@ def test_draw_sees_through_independence_and_takes_other_distributions() -> None:
 
 
 def test_noise_of_a_copy_depends_on_its_generator_alone() -> None:
-    def generators(*seeds: int) -> list[torch.Generator]:
-        return [torch.Generator().manual_seed(seed) for seed in seeds]
-
     device = torch.device("cpu")
     both = uniform_noise(torch.Size([2, 3]), 4, generators(5, 6), device)
     alone = uniform_noise(torch.Size([1, 3]), 4, generators(6), device)

@@ -1,4 +1,4 @@
-"""What a task cannot give, or must not be asked: one line, and nothing is written."""
+"""What a task cannot give, or must not be asked, and files that would be misread: one line."""
 
 from __future__ import annotations
 
@@ -7,41 +7,102 @@ from typing import Any
 
 import pytest
 
-from tests.tasks.gymnasium.toys import TINY
+from proposer_rl.cli.loggers import wandb_id
+from tests.tasks.gymnasium.toys import TINY, WALK
 
 CARS = ["task=cartpole", *TINY]
 VIEWS = ["task=view_maze_smoke", "compute.progress=false"]
+SEEDS = ["task=gymnasium", f"task.env_id={WALK}", "task.success.kind=terminated", *TINY]
+REFUSED = [
+    ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
+    ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
+    ([*CARS, "+method=plr", "compute.collector=multiprocess"],
+     "leave compute.collector=single; task.vectorization=async spreads one Solver's env"),
+    ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
+    ([*SEEDS, "+method=plr", "+filter=model"], "space: must have axes"),
+    ([*VIEWS, "+method=first_order_gain"], "ViewMazeTask must define differentiable_performance"),
+    ([*VIEWS, "+method=regret"], "needs a student with exact_performance: ViewMazeTask"),
+    ([*VIEWS, "+method=sfl"], "needs a student with exact_performance: ViewMazeTask"),
+    ([*VIEWS, "+method=target", "task.maze.height=4"], "ood: perfect mazes have odd"),
+    ([*VIEWS, "+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23"),
+    ([*VIEWS, "+method=target", "task.distributions.id.kind=spiral"],
+     "input tag 'spiral' found using 'kind' does not match any of the expected tags"),
+]  # fmt: skip
+
+FIRST = "# @package _global_\n"
+WIDTH = "    width: {set: argument, values: [1.0, 2.0], target: 2.0}\n"
+FILE = f"""\
+defaults: [gymnasium, _self_]
+task:
+  env_id: {WALK}
+  parameters:
+{WIDTH}  success: {{kind: terminated}}
+"""
+WHOLE = FIRST + FILE
+AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(9))
+PARAMETERS = "  parameters:\n"
+MISREAD = [
+    (FILE.encode(), "line.yaml must be '# @package _global_'"),
+    (WHOLE.encode("utf-8-sig"), "byte-order mark hides it: save the file as UTF-8"),
+    (("# a note\n" + WHOLE).encode(), "line.yaml must be '# @package _global_'"),
+    (("# Größe\n" + WHOLE).encode("latin-1"), "line.yaml: is not encoded in UTF-8"),
+    (WHOLE.replace("defaults: [gymnasium, _self_]", "").encode(),
+     "task._target_: missing: the class that makes the task; a file of one's own has it"),
+    (WHOLE.encode("utf-16"), "line.yaml: is not encoded in UTF-8"),
+    (WHOLE.encode("utf-16-le"), "line.yaml"),
+    (WHOLE.replace("  env_id", "\tenv_id").encode(), "line.yaml"),
+    (WHOLE.replace("values: [1.0, 2.0]", "low: 1, high: 2, bins: 257").encode(),
+     "task.parameters.width.bins=257: input should be less than or equal to 256"),
+    (WHOLE.replace("target: 2.0", "target: .nan").encode(),
+     "task.parameters.width.target=nan: must be finite"),
+    ((WHOLE + "  transforms: [{_target_: torchrl.envs.NoSuch}]\n").encode(),
+     "task.transforms: Error locating target 'torchrl.envs.NoSuch'"),
+    (WHOLE.replace(f"{PARAMETERS}{WIDTH}", "  parameters: [width]\n").encode(),
+     "task/line: a list where there must be a mapping, {NAME: VALUE} (it has lists in "
+     "task.parameters)"),
+    (WHOLE.replace(PARAMETERS, PARAMETERS + AXES).encode(),
+     "task: space: Dictionary should have at most 8 items"),
+    *((WHOLE.replace("width:", f"{name}:").encode(),
+       f"task.parameters: {read} without quotes is no name here; a name has quotes")
+      for name, read in (
+          ("on", "on, yes or true"), ("No", "off, no or false"), ("~", "null or ~"))),
+]  # fmt: skip
+
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
-        ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
-        (
-            [*CARS, "+method=plr", "compute.collector=multiprocess"],
-            "leave compute.collector=single; task.vectorization=async spreads one Solver's env",
-        ),
-        ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
-        (
-            [*VIEWS, "+method=first_order_gain"],
-            "ViewMazeTask must define differentiable_performance",
-        ),
-        ([*VIEWS, "+method=regret"], "needs a student with exact_performance: ViewMazeTask"),
-        ([*VIEWS, "+method=sfl"], "needs a student with exact_performance: ViewMazeTask"),
-        ([*VIEWS, "+method=target", "task.maze.height=4"], "ood: perfect mazes have odd"),
-        ([*VIEWS, "+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23"),
-        (
-            [*VIEWS, "+method=target", "task.distributions.id.kind=spiral"],
-            "input tag 'spiral' found using 'kind' does not match any of the expected tags",
-        ),
-    ],
-)
+@pytest.fixture
+def refused(train: Any, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Returns the only line of a command that must not begin a run."""
+
+    def line(*words: str) -> str:
+        assert train(*words, "hydra.run.dir=run") == 2
+        assert not Path("run").exists()
+        (said,) = capsys.readouterr().err.strip().splitlines()
+        return said
+
+    return line
+
+
+@pytest.mark.parametrize(("words", "said"), REFUSED)
 def test_what_a_task_lacks_is_refused_before_anything_is_written(
-    words: list[str], said: str, train: Any, capsys: pytest.CaptureFixture[str]
+    words: list[str], said: str, refused: Any
 ) -> None:
-    assert train(*words, "hydra.run.dir=run") == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and said in lines[0]
-    assert not Path("run").exists()
+    assert said in refused(*words)
+
+
+@pytest.mark.parametrize(("content", "said"), MISREAD)
+def test_a_file_that_would_be_misread_is_refused(content: bytes, said: str, refused: Any) -> None:
+    folder = Path("conf/task")
+    folder.mkdir(parents=True)
+    (folder / "line.yaml").write_bytes(content)
+    changed = TINY if b"defaults" in content else []  # what is not there cannot be changed
+    line = refused("--config-dir=conf", "task=line", "+method=target", *changed)
+    assert line.startswith("error: ") and said in line
+
+
+def test_a_run_keeps_its_name_at_weights_and_biases() -> None:
+    first, other = Path("a"), Path("b")
+    for folder in (first, other):
+        folder.mkdir()
+    assert wandb_id(first) == wandb_id(first) != wandb_id(other)

@@ -13,7 +13,7 @@ from torch.distributions import Categorical
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 import proposer_rl as prl
-from proposer_rl.teaching.segments import ended
+from proposer_rl.teaching.results import ended
 
 SPACE = prl.Parameters({"arm": [0, 1]}, target={"arm": 1})
 

@@ -20,13 +20,20 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
-from tests.teaching.counting import ITEMS, Counting, LevelEnv, check, set_level
+from tests.teaching.counting import LevelEnv, check, counted, seen, set_level
 
 SPACE = prl.Parameters({"gravity": (5.0, 25.0)}, seeded=True)
 
 
 def taught(teacher: Any) -> gymnasium.Env:
     return prl.TaughtEnv(LevelEnv(), teacher, set_level)
+
+
+def play(env: Any, episodes: int) -> None:
+    for _ in range(episodes):
+        env.reset()
+        while not any(env.step(0)[2:4]):
+            pass
 
 
 def cartpole(how: Any, **more: Any) -> prl.TaughtEnv:
@@ -37,7 +44,7 @@ def cartpole(how: Any, **more: Any) -> prl.TaughtEnv:
 @pytest.mark.filterwarnings("ignore")
 def test_it_is_an_environment_of_gymnasium() -> None:
     """But for the levels: one that has no effect, for the same seed begins the same episode."""
-    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher = counted()
     env = prl.TaughtEnv(LevelEnv(), teacher, lambda env, level: None)
     check_env(env, skip_render_check=True)
 
@@ -138,8 +145,7 @@ def test_the_length_of_cartpole_is_all_of_what_it_computes_from_it() -> None:
 @pytest.mark.filterwarnings("ignore:This process")
 @pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
 def test_all_environments_of_a_vector_have_one_teacher(kind: Any) -> None:
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("success", block=3)
     given = teacher if kind is SyncVectorEnv else teacher.client()
     env = kind([partial(taught, given)] * 3)
     _, info = env.reset()
@@ -148,14 +154,14 @@ def test_all_environments_of_a_vector_have_one_teacher(kind: Any) -> None:
     for _ in range(24):
         *_, info = env.step(env.action_space.sample())
     env.close()
-    teacher.propose(1)  # takes in what was told
-    check(curriculum.seen)
-    assert len(curriculum.seen) > 8
+    came = seen(teacher)
+    check(came)
+    assert len(came) > 8
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_forked_teacher_is_refused() -> None:
-    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher = counted()
     env: Any = AsyncVectorEnv([partial(taught, teacher)] * 2, context="fork", shared_memory=False)
     with pytest.raises(RuntimeError, match=r"give that process teacher\.client"):
         env.reset()
@@ -170,7 +176,7 @@ def test_a_forked_teacher_is_refused() -> None:
         (lambda: cartpole({"gravity": "a.b"}).reset(), "set.gravity='a.b': CartPoleEnv has no"),
         (lambda: cartpole({"mass": "gravity"}).reset(), "set.mass: no parameter; there are: grav"),
         (
-            lambda: prl.TaughtEnv(LevelEnv(), prl.Teacher(Counting(), ITEMS), {"g": "g"}).reset(),
+            lambda: prl.TaughtEnv(LevelEnv(), counted(), {"g": "g"}).reset(),
             "set.g: no parameter; there are: none",
         ),
     ],
@@ -191,16 +197,11 @@ RULES = {
 @pytest.mark.parametrize("rule", RULES)
 def test_success_is_what_the_rule_says(rule: str) -> None:
     how: Any = (lambda info: info["truncated"]) if rule == "a function" else rule
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted("success")
     env = prl.TaughtEnv(LevelEnv(), teacher, set_level, success=how)
-    for _ in range(4):
-        env.reset()
-        while not env.step(0)[2]:
-            pass
-    teacher.propose(1)  # takes in what was told
+    play(env, 4)
     expected = {0: 0.0, 1: 1.0, 2: 1.0, 3: 0.0} if RULES[rule] is None else {}
-    assert {n: s for n, (_, s) in curriculum.seen.items()} == {
+    assert {n: s for n, (_, s) in seen(teacher).items()} == {
         n: expected.get(n, RULES[rule]) for n in range(4)
     }
 
@@ -215,13 +216,11 @@ def paying(reward: Any) -> gymnasium.Env[Any, Any]:
 
 @pytest.mark.parametrize("reward", [0.5, np.array([0.5]), np.array(0.5), torch.tensor([[0.5]])])
 def test_one_number_in_an_array_is_a_reward(reward: Any) -> None:
-    curriculum = Counting()
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted()
     env = prl.TaughtEnv(paying(reward), teacher, set_level)
     env.reset()
     assert type(env.step(0)[1]) is float
-    teacher.propose(1)  # takes in what was told
-    assert curriculum.seen[0][0] == 0.5
+    assert seen(teacher)[0][0] == 0.5
 
 
 @pytest.mark.parametrize(
@@ -237,32 +236,25 @@ def test_one_number_in_an_array_is_a_reward(reward: Any) -> None:
     ],
 )
 def test_what_a_step_must_not_answer(env: Any, more: Any, message: str) -> None:
-    curriculum = Counting()
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted()
     env = prl.TaughtEnv(env, teacher, set_level, **more)
     env.reset()
     with pytest.raises(ArgumentError, match=message) as refused:
         env.step(0)
-    teacher.propose(1)
-    assert not curriculum.seen and "\n" not in str(refused.value)
+    assert not seen(teacher) and "\n" not in str(refused.value)
 
 
 def told(outside: bool, **more: Any) -> dict[int, tuple[float, float]]:
     """What is told of nine episodes of three steps at most, the time limit around or inside."""
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted("success")
     inner = LevelEnv() if outside else TimeLimit(LevelEnv(), 3)
     how: Any = dict(success="terminated", **more)
     env: Any = prl.TaughtEnv(inner, teacher, set_level, **how)
     env = TimeLimit(env, 3) if outside else env
-    for _ in range(9):
-        env.reset()
-        while not any(env.step(0)[2:4]):
-            pass
+    play(env, 9)
     env.reset()
     env.reset()  # nothing has begun
-    teacher.propose(1)  # takes in what was told
-    return curriculum.seen
+    return seen(teacher)
 
 
 def test_a_time_limit_outside_is_warned_of_or_counts() -> None:
@@ -280,7 +272,7 @@ def test_a_time_limit_outside_is_warned_of_or_counts() -> None:
 def test_one_episode_may_be_cut_off() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = prl.TaughtEnv(LevelEnv(), prl.Teacher(Counting(), ITEMS), set_level)
+        env = prl.TaughtEnv(LevelEnv(), counted(), set_level)
         env.reset()
         env.step(0)
         env.reset()
@@ -340,16 +332,11 @@ def test_a_success_may_be_of_any_step(once: bool) -> None:
         won = self.played % 2 == 0 and (self.steps == 1 or self.played % 4 == 0)
         return seen, reward, *ends, {"deep": {"won": np.array([won])}}
 
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted("success")
     env = prl.TaughtEnv(answering(step=step), teacher, set_level, success="deep.won", once=once)
-    for _ in range(8):
-        env.reset()
-        while not env.step(0)[2]:
-            pass
-    teacher.propose(1)  # takes in what was told
-    for number in range(8):
-        assert curriculum.seen[number][1] == (number % (2 if once else 4) == 0)
+    play(env, 8)
+    for number, (_, success) in seen(teacher).items():
+        assert success == (number % (2 if once else 4) == 0)
 
 
 def test_success_is_asked_for_where_nothing_says_it() -> None:

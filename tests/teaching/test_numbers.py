@@ -6,6 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
+from proposer_rl.tasks.ranges import RangeSettings, spaces
 from tests.teaching.counting import Counting
 
 NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
@@ -98,6 +100,46 @@ def test_ranges_and_counts_may_be_of_any_library() -> None:
     assert teacher.ask()[1]["a"] == 2 and teacher.ask()[1]["a"] != 2
 
 
+NORMAL = {"distribution": "norm", "loc": 8.0, "scale": 2.0}
+WEIGHED = {"values": [3, 8.5], "weights": [1, 2]}
+LINES = {"low": 0.0, "high": 10.0, "bins": 4}, {"values": [1, 2, 4]}
+FILES: list[tuple[dict[str, Any], Any]] = [  # a parameter in a task's file, its target in Python
+    ({**LINES[0], "target": 7.0}, 7.0),
+    ({**LINES[0], "target": [2.0, 5.0]}, (2.0, 5.0)),
+    ({**LINES[0], "target": NORMAL}, NORMAL),
+    ({**LINES[0], "target": WEIGHED}, {**WEIGHED, "values": np.array([3, 8.5])}),
+    ({**LINES[1], "target": [1, 4]}, np.array([1, 4])),
+    ({**LINES[1], "target": {**WEIGHED, "values": [1, 4]}}, {**WEIGHED, "values": (1, 4)}),
+]
+
+
+@pytest.mark.parametrize(("file", "target"), FILES, ids=[str(file["target"]) for file, _ in FILES])
+def test_a_file_and_python_describe_one_parameter_in_one_way(file: Any, target: Any) -> None:
+    line = file["values"] if "values" in file else (file["low"], file["high"])
+    own = prl.Parameters({"g": line}, bins=4, target={"g": target})
+    read = prl.Parameters(json.loads(json.dumps({"g": file})))
+    assert read.description == own.description
+    task, aim = spaces({"g": RangeSettings(**file)}, seeded=False)
+    assert task.axes == own.axes == read.axes
+    assert task.shares(aim).tolist() == own.target_shares.tolist() == read.target_shares.tolist()
+    drawn = [
+        one.sample(9, torch.Generator().manual_seed(0))["g"].tolist()
+        for one in (aim, own.target, read.target)
+    ]
+    assert drawn[0] == drawn[1] == drawn[2]
+
+
+def test_texts_have_targets_as_numbers_have() -> None:
+    file = {"values": ["flat", "stairs", "gap"], "target": ["gap", "flat"]}
+    space = prl.Parameters(
+        {"h": file}, named={"odd": {"h": {"values": ["gap", "flat"], "weights": [3, 1]}}}
+    )
+    assert space.target_shares.tolist() == [0.5, 0, 0.5]
+    assert space.shares(space.distributions["odd"]).tolist() == [0.25, 0, 0.75]
+    assert prl.Parameters({"h": file}, target={"h": "stairs"}).target_shares.tolist() == [0, 1, 0]
+    assert space.description["named"]["odd"]["h"] == "gap (weight 3) or flat (weight 1)"
+
+
 @pytest.mark.parametrize("where", ["ranges", "target"])
 def test_two_numbers_in_a_list_are_two_and_that_is_said_once(where: str) -> None:
     """A file has no tuples: what is meant as a range would be two values in silence."""
@@ -160,55 +202,69 @@ def draws(what: Any) -> Any:
     return prl.Teacher("plr", prl.LevelGenerator(lambda n, g: what(n))).ask()
 
 
-NO_SPACE = [
-    (lambda: prl.Parameters({"g": (0.0, HUGE)}), r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
-    (lambda: prl.Parameters({"g": (NAN, 1.0)}), r"ranges.g=\(nan, 1.0\): low=nan must be below"),
-    (lambda: prl.Parameters({"g": (2.0, 1.0)}), r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),
-    (lambda: prl.Parameters({"g": (0, 10**400)}), r"ranges.g=\(0, 10{70}.*too large"),
-    (lambda: prl.Parameters({"g": [1.0, NAN, 2.0]}), r"ranges.g=\[1.0, nan, 2.0\]: .* be finite"),
-    (
-        lambda: prl.Parameters({"g": np.array([0, 1, HUGE])}),
-        r"ranges.g=\[0.0, 1.0, 1e\+39\]: .* at",
-    ),
-    (lambda: prl.Parameters({"g": [1, 2**63]}), r"ranges.g=\[1, 9223372036854775808\]: .* at most"),
-    (lambda: prl.Parameters({"g": range(2**64)}), r"ranges.g=range\(0, 18446744073709551616\): "),
-    (lambda: prl.Parameters({"g": range(9)}, target={"g": True}), "target.g=True: must be "),
-    (lambda: prl.Parameters({"g": range(9)}, target={"g": ["a"]}), r"target.g=\['a'\]: must be "),
-    (lambda: prl.Parameters({"g": range(9)}, target=3), "target=3: must have ranges by the param"),
-    (lambda: prl.Parameters(pd.DataFrame({"g": [1]})), "ranges=g 0 1: must have ranges by"),
-    (lambda: prl.Parameters({"g": range(9)}, bins=True), "bins=True: must be a whole number, at"),
-    (
-        lambda: prl.Parameters({"g": range(9)}, bins={"g": np.float64(2)}),
-        "bins.g=2.0: must be a wh",
-    ),
-    (lambda: prl.Items(np.bool_(True)), "count=True: must be a whole number, at least 1"),
-    (lambda: prl.Items(3.0), "count=3.0: must be a whole number"),
-    (
-        lambda: prl.Items(4, target=np.array([True, False])),
-        r"target=\[True, False\]: must be places",
-    ),
-    (lambda: prl.Items(4, target=np.array([1.0])), r"target=\[1.0\]: must be places from 0 to 3"),
-    (lambda: prl.Items(2, features=np.array([[HUGE], [0]])), r"features=\[2, 1\]: .* finite"),
-    (lambda: prl.Items(1, features=pd.DataFrame({"a": ["x"]})), "features=a 0 x: must be numbers"),
-    (
-        lambda: draws(lambda n: np.array(["a"] * n)),
-        "draw=ndarray: must give a tensor, a tensordict",
-    ),
-    (lambda: draws(lambda n: pd.DataFrame({"a": range(n)})), "draw=DataFrame: must give a tensor"),
-    (lambda: draws(lambda n: [{"a": 1}] * n), "draw=list: must give a tensor"),
-    (lambda: draws(lambda n: np.ones((n + 1, 2))), r"draw=\[2, 2\]: must give 1 levels"),
-    (lambda: prl.Teacher("plr", LINE, seed=True), "seed=True: must be a whole number"),
-    (
-        lambda: prl.Teacher("plr", LINE, block=np.float64(3)),
-        "block=3.0: input should be a valid int",
-    ),
+NINE = {"g": range(9)}
+BOTH, LOW = {"low": 0, "high": 1, "values": [1]}, {"low": 0, "high": 9}
+NO_PARAMETERS: list[tuple[Any, dict[str, Any], str]] = [
+    ({"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
+    ({"g": (NAN, 1.0)}, {}, r"ranges.g=\(nan, 1.0\): low=nan must be below"),
+    ({"g": (2.0, 1.0)}, {}, r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),
+    ({"g": (0, 10**400)}, {}, r"ranges.g=\(0, 10{70}.*too large"),
+    ({"g": [1.0, NAN, 2.0]}, {}, r"ranges.g=\[1.0, nan, 2.0\]: .* be finite"),
+    ({"g": np.array([0, 1, HUGE])}, {}, r"ranges.g=\[0.0, 1.0, 1e\+39\]: .* at"),
+    ({"g": [1, 2**63]}, {}, r"ranges.g=\[1, 9223372036854775808\]: .* at most"),
+    ({"g": range(2**64)}, {}, r"ranges.g=range\(0, 18446744073709551616\): "),
+    ({"g": []}, {}, r"ranges.g=\[\]: must be \(low, high\), a range or a list"),
+    ({"g": {"low": 0.0}}, {}, "ranges.g={'low': 0.0}: needs values, or low, high and perhaps bins"),
+    ({"g": BOTH}, {}, "ranges.g={'low': 0, 'high': 1, .*}: either values, or low, high and bins"),
+    ({"g": {"lo": 0.0}}, {}, "ranges.g.lo: unknown; there are: values, low, high, bins"),
+    ({"g": {**LOW, "bins": 0}}, {}, "ranges.g.bins=0: input should be greater than or equal to 1"),
+    ({"g": {**LOW, "target": [5, 11]}}, {}, r"target.g=\(5, 11\): must lie within 0 to 9"),
+    ({"g": LOW}, {"target": {"g": {**NORMAL, "scale": 0}}}, "target.g.scale=0: input should be gr"),
+    ({"g": LOW}, {"target": {"g": {**NORMAL, "distribution": "t"}}}, "target.g.distribution='t': "),
+    ({"g": LOW}, {"target": {"g": {"values": [11], "weights": [1]}}}, "target.g=.*: must lie w"),
+    ({"g": [1.0, 2.0, 4.0]}, {"target": {"g": 3.0}}, r"target.g=3.0: must be among \[1.0, 2.0, "),
+    ({"g": [1.0, 2.0, 4.0]}, {"target": {"g": (1.0, 2.0)}}, r"target.g=\(1.0, 2.0\): must be amon"),
+    (NINE, {"target": {"g": NORMAL}}, "target.g.distribution=norm: of a continuous range only"),
+    (NINE, {"target": {"g": 2.5}}, "target.g=2.5: must be whole, as the range is"),
+    (NINE, {"target": {"g": True}}, "target.g=True: must be "),
+    (NINE, {"target": {"g": ["a"]}}, r"target.g=\['a'\]: must be "),
+    (NINE, {"target": 3}, "target=3: must have ranges by the param"),
+    (NINE, {"bins": True}, "bins=True: must be a whole number, at"),
+    (NINE, {"bins": {"g": np.float64(2)}}, "bins.g=2.0: must be a wh"),
+    (pd.DataFrame({"g": [1]}), {}, "ranges=g 0 1: must have ranges by"),
+]  # fmt: skip
+NO_ITEMS: list[tuple[Any, dict[str, Any], str]] = [
+    (np.bool_(True), {}, "count=True: must be a whole number, at least 1"),
+    (3.0, {}, "count=3.0: must be a whole number"),
+    (4, {"target": np.array([True, False])}, r"target=\[True, False\]: must be places"),
+    (4, {"target": np.array([1.0])}, r"target=\[1.0\]: must be places from 0 to 3"),
+    (2, {"features": np.array([[HUGE], [0]])}, r"features=\[2, 1\]: .* finite"),
+    (1, {"features": pd.DataFrame({"a": ["x"]})}, "features=a 0 x: must be numbers"),
+]  # fmt: skip
+NO_LEVELS: list[tuple[Any, dict[str, Any], str]] = [
+    (lambda n: np.array(["a"] * n), {}, "draw=ndarray: must give a tensor, a tensordict"),
+    (lambda n: pd.DataFrame({"a": range(n)}), {}, "draw=DataFrame: must give a tensor"),
+    (lambda n: [{"a": 1}] * n, {}, "draw=list: must give a tensor"),
+    (lambda n: np.ones((n + 1, 2)), {}, r"draw=\[2, 2\]: must give 1 levels"),
+]
+NO_TEACHER: list[tuple[Any, dict[str, Any], str]] = [
+    (LINE, {"seed": True}, "seed=True: must be a whole number"),
+    (LINE, {"block": np.float64(3)}, "block=3.0: input should be a valid int"),
+]
+NOT_THERE = [
+    *((prl.Parameters, *row) for row in NO_PARAMETERS),
+    *((prl.Items, *row) for row in NO_ITEMS),
+    *((draws, *row) for row in NO_LEVELS),
+    *((partial(prl.Teacher, "plr"), *row) for row in NO_TEACHER),
 ]
 
 
-@pytest.mark.parametrize(("make", "message"), NO_SPACE, ids=[line for _, line in NO_SPACE])
-def test_what_is_no_number_there_is_refused_in_one_line(make: Any, message: str) -> None:
+@pytest.mark.parametrize(("make", "given_", "more", "message"), NOT_THERE)
+def test_what_is_no_number_there_is_refused_in_one_line(
+    make: Any, given_: Any, more: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ArgumentError, match=rf"^{message}") as refused:
-        make()
+        make(given_, **more)
     assert "\n" not in str(refused.value)
 
 
@@ -220,40 +276,26 @@ def rollout(*rewards: float, dtype: torch.dtype = torch.float32) -> TensorDict:
     return TensorDict({"next": {**after, "terminated": done, "success": done}}, done.shape[:2])
 
 
+def observe(*rewards: float, dtype: torch.dtype = torch.float32) -> Callable[[prl.Teacher], Any]:
+    return lambda t: t.observe(prl.outcome_of(rollout(*rewards, dtype=dtype)), ids=0)
+
+
 TOO_LARGE: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "a return": (lambda t: t.tell(0, HUGE, 1), r"return_=1e\+39: must be finite in float32"),
     "one below": (lambda t: t.tell(0, -HUGE, 1), r"return_=-1e\+39: must be finite"),
     "one of NumPy's": (lambda t: t.tell(0, np.float64(HUGE), 1), r"return_=1e\+39: must be finite"),
-    "among others": (
-        lambda t: t.tell([0, 1], [0, HUGE], [1, 1]),
-        r"return_=1e\+39: must be finite",
-    ),
+    "among others": (lambda t: t.tell([0, 1], [0, HUGE], [1, 1]), r"return_=1e\+39: must be fini"),
     "an integer": (lambda t: t.tell(0, 10**400, 1), "return_=1000.*: must be a number of float32"),
-    "integers": (
-        lambda t: t.tell([0], [10**400], 1),
-        r"return_=\[1000.*: must be numbers of float32",
-    ),
+    "integers": (lambda t: t.tell([0], [10**400], 1), r"return_=\[1000.*: must be numbers of floa"),
     "a score": (lambda t: t.tell(0, 0, 1, score=HUGE), r"score=1e\+39: must be finite"),
     "scores": (lambda t: t.tell([0], [0], [1], score=[INF]), "score=inf: must be finite"),
     "episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* at most 1e\+15"),
     "steps": (lambda t: t.tell([0], [0], [1], steps=1e30), r"steps=1e\+30: must be a whole number"),
-    "a success": (
-        lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]),
-        "success=1: must be fr",
-    ),
-    "a rollout's sum": (
-        lambda t: t.observe(prl.outcome_of(rollout(3e38, 3e38)), ids=0),
-        "return=inf: must be finite",
-    ),
-    "one of float64": (
-        lambda t: t.observe(prl.outcome_of(rollout(HUGE, dtype=torch.float64)), ids=0),
-        r"return=1e\+39: must be finite",
-    ),
-    "a sum of both signs": (
-        lambda t: t.observe(prl.outcome_of(rollout(INF, -INF)), ids=0),
-        "return=nan: must be finite",
-    ),
-}
+    "a success": (lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]), "success=1: must be "),
+    "a rollout's sum": (observe(3e38, 3e38), "return=inf: must be finite"),
+    "one of float64": (observe(HUGE, dtype=torch.float64), r"return=1e\+39: must be finite"),
+    "a sum of both signs": (observe(INF, -INF), "return=nan: must be finite"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", TOO_LARGE)

@@ -14,7 +14,8 @@ from proposer_rl.recipes import available
 
 PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "own_loop.md"
 TABLE = PAGE.read_text(encoding="utf-8").partition("## What each curriculum needs")[2]
-LINES = [line.split("|")[1:-1] for line in TABLE.splitlines() if line.startswith("| `")]
+CURRICULA, _, FUNCTIONS = TABLE.partition("| function |")
+LINES = [line.split("|")[1:-1] for line in CURRICULA.splitlines() if line.startswith("| `")]
 ROWS = {
     name: [*(re.findall(r"\w+", cell) for cell in cells[1:4])]
     for cells in LINES
@@ -54,3 +55,8 @@ def test_it_names_all_that_works_on_spaces() -> None:
     others = {*learned, "first_order_proposer", "first_order_proposer_sampled"}
     listed = {row.partition("(")[0] for row in ROWS}
     assert listed | others >= {*available("method")} - others
+
+
+def test_it_explains_each_function_that_it_names() -> None:
+    named = {name for _, functions, _ in ROWS.values() for name in functions}
+    assert named == {*re.findall(r"^\| `(\w+)`", FUNCTIONS, re.MULTILINE)}

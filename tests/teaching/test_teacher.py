@@ -6,8 +6,9 @@ import copy
 import io
 import json
 import pickle
-import re
 from collections.abc import Callable
+from multiprocessing import util
+from multiprocessing.connection import Listener
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import proposer_rl as prl
 from proposer_rl.curricula import Batch, Curriculum
 from proposer_rl.recipes import available
 from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching.remote import TeacherClient
 from tests.curricula.test_contract import same
 from tests.tiny import TASK
 
@@ -35,6 +37,7 @@ SPACE = prl.Parameters(
     named={"easy": {"walls": range(0, 10)}},
 )
 ITEMS = prl.Items(100)
+ONE: dict[str, Any] = {"slope": (0.0, 8.0)}
 SMALL = {"capacity": 32, "fill": 0.25}
 PROGRESS = prl.curricula.learning_progress(source="episodes")
 
@@ -71,7 +74,7 @@ class Spy(Curriculum):
             self.seen[number] = tuple(came)
 
 
-@profile(max_examples=30)
+@profile(max_examples=20)
 @given(st.data())
 def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
     """Against a plain dict: singles, batches and parts, any number outstanding, in any order."""
@@ -116,7 +119,7 @@ def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
 
 def test_it_forgets_what_is_over() -> None:
     teacher = prl.Teacher(Spy(), ITEMS, block=16)
-    for _ in range(200):
+    for _ in range(40):
         ids, _ = teacher.ask(40)
         teacher.tell(ids, torch.zeros(40), torch.zeros(40))
     assert len(teacher._ledger.blocks) <= 4
@@ -173,13 +176,13 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
         return
     whole = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
     assert whole.curriculum.needs == ()
-    play(whole, 7)
+    play(whole, 5)
     file = io.BytesIO()
     torch.save(whole.state_dict(), file)
     file.seek(0)
     parts = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
     parts.load_state_dict(torch.load(file, weights_only=True))
-    for one, other in zip(play(whole, 6), play(parts, 6), strict=True):
+    for one, other in zip(play(whole, 3), play(parts, 3), strict=True):
         assert same(plain(one), plain(other))
     assert same(whole.state_dict(), parts.state_dict())
     assert whole.log().keys() == parts.log().keys()
@@ -192,65 +195,40 @@ def plain(levels: Any) -> Any:
 
 
 def ranges(**given: Any) -> prl.Parameters:
-    return prl.Parameters({"slope": (0.0, 8.0)}, **given)
+    return prl.Parameters(ONE, **given)
 
 
 def drawn(shape: int) -> prl.LevelGenerator:
     return prl.LevelGenerator(lambda n, g: torch.rand(n, shape, generator=g))
 
 
+GROUND = ["flat", "stairs", "gap"]
 OTHERS: dict[str, tuple[Any, Any, str]] = {
     "a parameter more": (
         ranges(),
-        prl.Parameters({"slope": (0.0, 8.0), "wind": range(9)}, bins=4),
+        prl.Parameters({**ONE, "wind": range(9)}, bins=4),
         "ranges.wind was missing, is 0 to 8, whole",
     ),
     "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was 0 to 8, is mis"),
-    "smaller": (
-        ranges(),
-        prl.Parameters({"slope": (0.0, 1.0)}),
-        "ranges.slope was 0 to 8, is 0 to 1",
-    ),
-    "a little smaller": (
-        ranges(),
-        prl.Parameters({"slope": (0.0, 7.9999999)}),
-        "is 0 to 7.9999999",
-    ),
+    "smaller": (ranges(), prl.Parameters({"slope": (0.0, 1.0)}), "slope was 0 to 8, is 0 to 1"),
+    "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
     "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
-    "other features": (
-        ITEMS,
-        prl.Items(100, features=torch.arange(200.0).view(100, 2) % 7),
-        "feat",
-    ),
-    "another target": (
-        prl.Items(9, target=[1]),
-        prl.Items(9, target=[2]),
-        r"target was \[1\], is \[2\]",
-    ),
+    "other features": (ITEMS, prl.Items(100, features=torch.eye(100)), "feat"),
+    "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
     "another name": (
-        ranges(named={"easy": {"slope": 1}}),
-        ranges(named={"easy": {"slope": 2}}),
+        *(ranges(named={"easy": {"slope": slope}}) for slope in (1, 2)),
         "named.easy.slope was .1",
     ),
     "another kind": (ITEMS, ranges(), "kind was Items, is Parameters$"),
     "another order": (
-        prl.Parameters({"ground": ["flat", "stairs", "gap"]}),
-        prl.Parameters({"ground": ["gap", "flat", "stairs"]}),
-        r"ranges.ground was \['flat', 'stairs', 'gap'\], is \['gap', 'flat', 'stairs'\]",
+        *(prl.Parameters({"ground": order}) for order in (GROUND, GROUND[::-1])),
+        r"ranges.ground was \['flat', 'stairs', 'gap'\], is \['gap', 'stairs', 'flat'\]",
     ),
-    "whole": (
-        prl.Parameters({"n": range(11)}),
-        prl.Parameters({"n": (0, 10)}),
-        "0 to 10, whole, is 0",
-    ),
+    "whole": (*(prl.Parameters({"n": n}) for n in (range(11), (0, 10))), "0 to 10, whole, is 0"),
     "other bins": (ranges(), ranges(bins=4), "bins.slope was 8, is 4"),
     "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
-    "a shape": (
-        drawn(3),
-        drawn(4),
-        r"levels.level was torch.float32 \[3\], is torch.float32 \[4\]",
-    ),
+    "a shape": (drawn(3), drawn(4), r"level was torch.float32 \[3\], is torch.float32 \[4\]"),
     "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
 }
 
@@ -258,15 +236,16 @@ OTHERS: dict[str, tuple[Any, Any, str]] = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_a_state_of_another_space_is_refused_and_changes_nothing(what: str) -> None:
     before, now, message = OTHERS[what]
-    state = prl.Teacher("plr", before, block=8)
+    made = prl.curricula.plr(**SMALL)
+    state = prl.Teacher(made, before, block=8)
     state.ask(12)
-    teacher = prl.Teacher("plr", now, block=8)
+    teacher = prl.Teacher(made, now, block=8)
     teacher.ask(3)
     kept = copy.deepcopy(teacher.state_dict())
     with pytest.raises(ArgumentError, match=f"^state: of another space: .*{message}") as refused:
         teacher.load_state_dict(state.state_dict())
     assert "\n" not in str(refused.value) and same(kept, teacher.state_dict())
-    own = prl.Teacher("plr", now, block=8)
+    own = prl.Teacher(made, now, block=8)
     own.load_state_dict({**kept, "of": json.loads(json.dumps(kept["of"]))})
     assert same(kept, own.state_dict())
 
@@ -280,11 +259,7 @@ MODEL: Any = {"labels": "success"}
     [
         (C.plr(capacity=20), C.plr(capacity=40), "capacity was 20, is 40"),
         (C.plr(), C.domain_randomization(), "kind was plr, is domain_randomization$"),
-        (
-            C.model_transport(),
-            C.model_transport(**MODEL),
-            "model.labels was above_worst, is success",
-        ),
+        (C.model_transport(), C.model_transport(**MODEL), "model.labels was above_w.*, is success"),
         (Spy(), C.plr(), "kind was Spy, is plr$"),
     ],
 )
@@ -292,6 +267,9 @@ def test_a_state_of_another_setting_is_refused(before: Any, now: Any, message: s
     state = prl.Teacher(before, SPACE).state_dict()
     with pytest.raises(ArgumentError, match=f"^state: of another curriculum: {message}"):
         prl.Teacher(now, SPACE).load_state_dict(state)
+
+
+def test_a_recipe_and_its_name_have_one_state() -> None:
     prl.Teacher("plr", SPACE).load_state_dict(prl.Teacher(C.plr(), SPACE).state_dict())
 
 
@@ -340,7 +318,7 @@ def hills(values: Any, generator: torch.Generator) -> torch.Tensor:
 
 
 def test_made_levels_have_bins_a_target_and_edits() -> None:
-    space = prl.MadeLevels({"slope": (0.0, 8.0)}, hills, bins=4, target={"slope": (6.0, 8.0)})
+    space = prl.MadeLevels(ONE, hills, bins=4, target={"slope": (6.0, 8.0)})
     assert space.target_shares.tolist() == [0, 0, 0, 1]
     steep = prl.Teacher("target", space).propose(64)
     assert steep.shape == (64, 3) and float((steep[:, 1] - steep[:, 0]).min()) >= 6
@@ -352,17 +330,17 @@ def test_made_levels_have_bins_a_target_and_edits() -> None:
     for one in (old, new, space.at(torch.tensor([[[0.5], [-1.0]]]), g)):
         torch.testing.assert_close(one["level"][..., 2] - one["level"][..., 1], one["slope"])
     assert (old["slope"] != new["slope"]).all()
-    few = prl.MadeLevels({"slope": (0.0, 8.0)}, lambda values, g: torch.zeros(1))
+    few = prl.MadeLevels(ONE, lambda values, g: torch.zeros(1))
     with pytest.raises(ArgumentError, match=r"make=\[1\]: must give 384 levels"):
         prl.Teacher("plr", few).ask()
-    model = prl.MadeLevels({"slope": (0.0, 8.0)}, hills, features=lambda levels: levels[..., :1])
+    model = prl.MadeLevels(ONE, hills, features=lambda levels: levels[..., :1])
     assert model.features(old).shape == (1, 2, 1)
 
 
 def test_all_that_need_nothing_are_here() -> None:
-    """No method with ``needs == ()`` is left out above."""
+    """No method with ``needs == ()`` is left out above; others are refused below."""
     free = set()
-    for name in available("method"):
+    for name in {*available("method")} - {*NEEDS, *OF_TASKS}:
         settings = {"hand_designed": {"distributions": ["easy"], "until": []}}.get(name, {})
         try:
             teacher = prl.Teacher(getattr(prl.curricula, name)(**settings), SPACE)
@@ -380,23 +358,6 @@ def test_many_parameters_have_one_bin_each() -> None:
             prl.Parameters(ranges, **bins)  # type: ignore[arg-type]
     _, level = prl.Teacher("plr", prl.Parameters(ranges, bins=1)).ask()
     assert level.keys() == ranges.keys()
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: prl.Parameters({"g": (0, float("inf"))}), r"ranges.g=\(0, inf\): .* both finite"),
-        (lambda: prl.Parameters({"seed": (0, 1)}, seeded=True), "ranges.seed, seeded=True: a lev"),
-        (
-            lambda: prl.Parameters({"g": ["a", "b"]}, target={"g": ["a", "a"]}),
-            r"target.g=\['a', 'a'\]: must be among \['a', 'b'\], each once",
-        ),
-        (lambda: prl.Items(2, features=torch.tensor([[0.0], [NAN]])), r"features=\[2, 1\]: .*fin"),
-    ],
-)
-def test_what_is_no_space_is_refused(make: Any, message: str) -> None:
-    with pytest.raises(ArgumentError, match=message):
-        make()
 
 
 def test_spaces_take_arrays_and_choices_of_any_kind() -> None:
@@ -440,11 +401,11 @@ def test_levels_with_progress_come_again() -> None:
         score="l1_value_loss", capacity=16, fill=0.5, staleness=0.1, temperature=0.1
     )
     teacher = prl.Teacher(curriculum, items, block=8)
-    drawn = torch.zeros(16)
-    for i in range(1200):
-        ticket, item = teacher.ask()
-        drawn[item] += i > 600
-        teacher.tell(ticket, float(np.random.default_rng(i).random()) if item == 5 else 0.5)
+    drawn, generator = torch.zeros(16), torch.Generator().manual_seed(0)
+    for i in range(120):
+        ids, items = teacher.ask(8)
+        drawn += (i > 60) * items.bincount(minlength=16)
+        teacher.tell(ids, torch.rand(8, generator=generator).where(items == 5, 0.5))
     assert int(drawn.argmax()) == 5 and float(drawn[5]) > 3 * float(drawn.median())
 
 
@@ -454,7 +415,7 @@ def test_a_loop_may_score_levels_itself() -> None:
         prl.Items(16),
         block=8,
     )
-    for _ in range(40):
+    for _ in range(20):
         ids, items = teacher.ask(8)
         teacher.tell(ids, torch.zeros(8), score=items.double())
     buffer = teacher.curriculum.buffer[0]
@@ -480,10 +441,7 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "no numbers": (lambda t: t.tell([0, 1], ["a", "b"], [1, 1]), "return_=.*: must be numbers"),
     "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum reads it; tell it"),
     "no episodes": (lambda t: t.tell(0, 1.0, 1, episodes=0), "episodes=0: must be a whole number"),
-    "half a step": (
-        lambda t: t.tell([0, 1], [1.0] * 2, [1] * 2, steps=1.5),
-        "steps=1.5: must be a whole number, at least 0",
-    ),
+    "half a step": (lambda t: t.tell([0], [1.0], [1], steps=1.5), "steps=1.5: must be .* least 0"),
     "a state of other students": (
         lambda t: t.load_state_dict(prl.Teacher("plr", SPACE, students=2).state_dict()),
         "state: of 2 students, not 1",
@@ -497,19 +455,10 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         "state: levels of this teacher are out",
     ),
     "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7: must be from 0 to 1"),
-    "too few": (
-        lambda t: t.tell([0, 1, 2], [0.0, 1.0], [1, 0, 0]),
-        r"return_: has shape \[2\], but",
-    ),
-    "nine results for eight levels": (
-        lambda t: t.tell([0, 1, 2], [0.0] * 3, [1] * 4),
-        r"success: has shape \[4\], but must have \[3\]",
-    ),
+    "too few": (lambda t: t.tell([0, 1], [0.0], [1, 0]), r"return_: has shape \[1\], but"),
+    "too many": (lambda t: t.tell([0, 1], ZEROS[:2], [1] * 3), r"success: .* must have \[2\]"),
     "a matrix": (lambda t: t.tell([0, 1], [[0.0, 1.0]], [1, 0]), r"return_: has shape \[1, 2\]"),
-    "tickets that are none": (
-        lambda t: t.tell([0.5, 1.5], [0.0] * 2, [1] * 2),
-        "ids: must be whole",
-    ),
+    "tickets that are none": (lambda t: t.tell([0.5], [0.0], [1]), "ids: must be whole"),
     "observed before it was proposed": (
         lambda t: t.observe({"return": ZEROS, "success": ZEROS}),
         "ids: missing: nothing is out",
@@ -587,32 +536,75 @@ def test_a_copy_in_another_process_is_refused() -> None:
         teacher.ask()
 
 
-NEEDS = {
-    "sfl": "sfl needs a student with exact_performance: it has no exact_performance(levels)",
-    "robust_plr": "robust_plr needs a student with play: it has no play(levels, generators)",
-    "accel": "accel needs a student with play",
-    "currot": "currot needs a student with performance",
-    "first_order_sampled": "first_order_sampled needs a student with sampled_direction",
-    "pace": "pace needs a student with gradient_norms",
-}
+def recipe(name: str, **settings: Any) -> Any:
+    return getattr(prl.curricula, name)(**settings)
 
 
-@pytest.mark.parametrize("name", NEEDS)
-def test_what_is_missing_of_a_student_is_named(name: str) -> None:
-    with pytest.raises(TypeError, match=re.escape(NEEDS[name])):
-        prl.Teacher(getattr(prl.curricula, name)(), SPACE)
-
-
+NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
 OF_TASKS = ["perf_gain", "task_difficulty", "paired"]
 OF_TASKS += ["first_order_proposer", "first_order_proposer_sampled"]
+NEEDS = {
+    "sfl": r"student with exact_performance: it has no exact_performance\(levels\)",
+    "robust_plr": r"student with play: it has no play\(levels, generators\)",
+    "accel": "student with play",
+    "currot": "student with performance",
+    "first_order_sampled": "student with sampled_direction",
+    "pace": "student with gradient_norms",
+}
+UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [
+    *(
+        (lambda name=name: prl.Teacher(recipe(name), SPACE), TypeError, f"{name} needs a {needs}")
+        for name, needs in NEEDS.items()
+    ),
+    *(
+        (
+            lambda n=name: prl.Teacher(recipe(n), SPACE),
+            ArgumentError,
+            f"curriculum={name}: needs .*",
+        )
+        for name in OF_TASKS
+    ),
+    (lambda: prl.Teacher("target", NO_TARGET), ArgumentError, "target: missing"),
+    (lambda: prl.Teacher("plrr", SPACE), AttributeError, "there is no 'plrr'"),
+    (
+        lambda: prl.Teacher("target", SPACE, filter="hard"),
+        ArgumentError,
+        "filter='hard': must be one",
+    ),
+    (lambda: prl.Teacher("target", SPACE, filter={"times": 1}), ArgumentError, "times=1"),
+    *(
+        (lambda n=name, given=given: prl.Teacher(recipe(n, **given), SPACE), ArgumentError, message)
+        for name, given, message in (
+            ("plr", {"capacity": 0}, "capacity=0: input should be"),
+            ("model_transport", {"labels": "much"}, "labels='much': input should be"),
+            ("model_transport", {"lables": "success"}, "lables: unknown; there are: .*labels"),
+        )
+    ),
+    *(
+        (lambda make=make: make(), ArgumentError, message)
+        for make, message in (
+            (lambda: prl.Parameters({"g": (0, float("inf"))}), r"ranges.g=\(0, inf\): .* both fin"),
+            (
+                lambda: prl.Parameters({"seed": (0, 1)}, seeded=True),
+                "ranges.seed, seeded=True: a l",
+            ),
+            (
+                lambda: prl.Parameters({"g": ["a", "b"]}, target={"g": ["a", "a"]}),
+                r"target.g=\['a', 'a'\]: must be among \['a', 'b'\], each once",
+            ),
+            (
+                lambda: prl.Items(2, features=torch.tensor([[0], [NAN]])),
+                r"features=\[2, 1\]: .*fin",
+            ),
+        )
+    ),
+]
 
 
-@pytest.mark.parametrize("name", OF_TASKS)
-def test_what_a_space_lacks_is_named(name: str) -> None:
-    with pytest.raises(ArgumentError, match=f"curriculum={name}: needs .* of a task"):
-        prl.Teacher(getattr(prl.curricula, name)(), SPACE)
-    with pytest.raises(ArgumentError, match="target: missing"):
-        prl.Teacher("target", prl.Parameters({"gravity": (0.0, 1.0)}))
+@pytest.mark.parametrize(("make", "error", "message"), UNFIT)
+def test_what_does_not_fit_is_named(make: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        make()
 
 
 def solved(levels: Any) -> dict[str, Any]:
@@ -679,10 +671,6 @@ def test_filtering_works_on_spaces() -> None:
     )
     walls = teacher.propose(256)["walls"].double()
     assert float((walls - 29.5).abs().mean()) < 11  # of uniform draws it is 15
-    with pytest.raises(ArgumentError, match="filter='hard': must be one of"):
-        prl.Teacher("target", SPACE, filter="hard")
-    with pytest.raises(ArgumentError, match="times=1"):
-        prl.Teacher("target", SPACE, filter={"times": 1})
 
 
 def test_a_model_reads_success_where_it_is_asked_to() -> None:
@@ -702,19 +690,6 @@ def test_a_model_reads_success_where_it_is_asked_to() -> None:
     assert recipe.overrides()[1:] == [
         *("++model.labels='success'", "++model.half_life=5", "++curriculum.probes=1"),
     ]
-    for wrong, message in (
-        ({"labels": "much"}, "labels='much': input should be"),
-        ({"lables": "success"}, "lables: unknown; there are: .*labels"),
-    ):
-        with pytest.raises(ArgumentError, match=message):
-            prl.Teacher(prl.curricula.model_transport(**wrong), SPACE)
-
-
-def test_recipes_of_ones_own_and_their_settings() -> None:
-    with pytest.raises(ArgumentError, match="capacity=0: input should be"):
-        prl.Teacher(prl.curricula.plr(capacity=0), SPACE)
-    with pytest.raises(AttributeError, match="there is no 'plrr'"):
-        prl.Teacher("plrr", SPACE)
 
 
 def test_the_parts_of_a_curriculum_are_one_import_and_their_defaults_agree() -> None:
@@ -760,3 +735,36 @@ def test_a_score_from_gradients_says_what_it_lacks_and_takes_a_function() -> Non
     teacher.observe(prl.outcome_of(rollout))
     assert teacher.log()["mean_score"] == pytest.approx([float(levels["gravity"].mean())])
     assert seen == [(1, 8, 3)]
+
+
+def test_a_client_says_that_its_teacher_has_ended() -> None:
+    listener = Listener()
+    client = TeacherClient(listener.address, b"", 1, ())
+    listener.close()
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="the process of the teacher has ended"):
+            client.ask()
+
+
+def test_clients_where_the_temporary_folder_has_a_long_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("job_" * 30)
+    folder.mkdir()
+    monkeypatch.setattr(util, "get_temp_dir", lambda: str(folder))
+    client = pickle.loads(pickle.dumps(plr().client()))
+    ticket, _ = client.ask()
+    client.tell(ticket, 0.5)
+    with pytest.raises(ArgumentError, match="told before"):
+        client.tell(ticket, 0.5)
+
+
+def test_clients_change_no_precision_of_the_loop() -> None:
+    client = plr().client()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(RuntimeError, match=r"default dtype is torch\.float64: a teacher"):
+            client.ask()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    client.ask()

@@ -29,7 +29,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from tests.host_reads import CountedReads
-from tests.teaching.counting import ITEMS, Counting, LevelsEnv, check, length, set_level
+from tests.teaching.counting import ITEMS, LevelsEnv, check, counted, length, seen, set_level
 
 LEVELS = 4
 
@@ -53,19 +53,18 @@ def collected(env: Any, steps: int, batches: int, **how: Any) -> list[Any]:
 
 @pytest.mark.parametrize("count", [LEVELS, None])
 def test_it_keeps_what_torchrl_asks_of_environments(count: int | None) -> None:
-    check_env_specs(taught(prl.Teacher(Counting(), ITEMS), count), break_when_any_done="both")
+    check_env_specs(taught(counted(), count), break_when_any_done="both")
 
 
 @pytest.mark.parametrize("afresh", [True, False])
 @pytest.mark.parametrize("steps", [3, 8])
 def test_an_episode_goes_to_the_level_that_it_began_on(afresh: bool, steps: int) -> None:
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("success", block=3)
     rollouts = collected(taught(teacher), steps, 5, reset_at_each_iter=afresh)
-    teacher.propose(1)  # takes in what was told
-    check(curriculum.seen)
+    came = seen(teacher)
+    check(came)
     ended = sum(int(rollout["next", "done"].sum()) for rollout in rollouts)
-    assert len(curriculum.seen) == ended > 4
+    assert len(came) == ended > 4
     for rollout in rollouts:  # the reward of a step is the number of its level
         ids = rollout["level_id"].squeeze(-1)
         assert (rollout["next", "reward"].squeeze(-1) == ids).all()
@@ -88,14 +87,13 @@ def test_levels_that_are_set_beside_a_collector_would_be_credited_wrongly() -> N
 @pytest.mark.parametrize("afresh", [True, False])
 def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
     """Whole episodes, also those that began in an earlier rollout."""
-    curriculum = Counting("rollout", "success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("rollout", "success", block=3)
     env = taught(teacher, tell=False)
     for rollout in collected(env, 3, 6, reset_at_each_iter=afresh):
         teacher.observe(rollout)
-    check(curriculum.seen)
-    assert len(curriculum.rollouts) == len(curriculum.seen) > 4
-    for number, rollout in curriculum.rollouts.items():
+    check(teacher.curriculum.seen)
+    assert len(teacher.curriculum.rollouts) == len(teacher.curriculum.seen) > 4
+    for number, rollout in teacher.curriculum.rollouts.items():
         steps = int(length(number))
         assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
         assert rollout["next", "done"].flatten().tolist() == [
@@ -106,8 +104,7 @@ def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
 @pytest.mark.parametrize("how", ["alternating", "one after another", "split"])
 def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> None:
     """As of several workers that come by turns, or whose time is one line; or of trajectories."""
-    curriculum = Counting("rollout", "success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("rollout", "success", block=3)
     workers = [
         Collector(
             taught(teacher, tell=False),
@@ -125,9 +122,9 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
             teacher.observe(rollout)
     for worker in workers:
         worker.shutdown()
-    check(curriculum.seen)
-    assert len(curriculum.seen) > 16
-    for number, rollout in curriculum.rollouts.items():
+    check(teacher.curriculum.seen)
+    assert len(teacher.curriculum.seen) > 16
+    for number, rollout in teacher.curriculum.rollouts.items():
         steps = int(length(number))
         assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
         assert rollout["is_step"].sum() == steps
@@ -135,50 +132,45 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
 
 def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
     """Every call resets all environments, also those whose episodes have been observed."""
-    curriculum = Counting("rollout", "success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("rollout", "success", block=3)
     env = taught(teacher, tell=False).append_transform(StepCounter(2))
     for _ in range(4):
         teacher.observe(env.rollout(10))
-    assert len(curriculum.seen) == 4 * LEVELS
-    assert all(total == 2 * number for number, (total, _) in curriculum.seen.items())
+    assert len(teacher.curriculum.seen) == 4 * LEVELS
+    assert all(total == 2 * number for number, (total, _) in teacher.curriculum.seen.items())
 
 
 @pytest.mark.parametrize("tell", [True, False])
 def test_transforms_that_step_by_themselves_may_stand_behind_it(tell: bool) -> None:
     """They step through clones of those before them."""
-    curriculum = Counting("success", *([] if tell else ["rollout"]))
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("success", *([] if tell else ["rollout"]), block=3)
     env = taught(teacher, tell=tell).append_transform(FrameSkipTransform(2))
     rollout = env.rollout(16, break_when_any_done=False)
     if tell:
-        teacher.propose(1)  # takes in what was told
-        check(curriculum.seen)
+        check(seen(teacher))
     else:
         teacher.observe(rollout)
-    assert len(curriculum.seen) == int(rollout["next", "done"].sum()) > LEVELS
+    assert len(teacher.curriculum.seen) == int(rollout["next", "done"].sum()) > LEVELS
 
 
 def test_a_clone_has_episodes_of_its_own_in_another_environment() -> None:
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("success", block=3)
     env = taught(teacher)
     state = env.reset()
     TransformedEnv(LevelsEnv(LEVELS), env.transform.clone()).rollout(2)
     env.rollout(16, break_when_any_done=False, auto_reset=False, tensordict=state)
-    teacher.propose(1)  # takes in what was told
-    check(curriculum.seen)
-    assert {*range(LEVELS)} < curriculum.seen.keys()
+    came = seen(teacher)
+    check(came)
+    assert {*range(LEVELS)} < came.keys()
 
 
 def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
-    curriculum = Counting()
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted(block=3)
     transforms = prl.LevelTransform(teacher, set_level), StepCounter(2), RewardScaling(0.0, 0.1)
     rollouts = collected(TransformedEnv(LevelsEnv(), Compose(*transforms)), 4, 3)
-    teacher.propose(1)  # takes in what was told
-    assert len(curriculum.seen) >= 8
-    for number, (total, _) in curriculum.seen.items():
+    came = seen(teacher)
+    assert len(came) >= 8
+    for number, (total, _) in came.items():
         assert total == 2 * number
     assert rollouts[0]["level_id"].unique().numel() > LEVELS
 
@@ -186,8 +178,7 @@ def test_a_transform_that_ends_episodes_may_stand_behind_it() -> None:
 def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
     # What TorchRL asks: forks of this process import nothing.
     monkeypatch.setattr(torch.multiprocessing, "get_start_method", lambda **_: "fork")
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS, block=3)
+    teacher = counted("success", block=3)
     # As where the process is none that forked from this one.
     make = partial(taught, pickle.loads(pickle.dumps(teacher.client())), None)
     env = ParallelEnv(2, make)
@@ -201,17 +192,17 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
     )
     rollouts = [rollout, *(each.clone() for each in collector)]
     collector.shutdown()
-    teacher.propose(1)  # takes in what was told
-    check(curriculum.seen)
+    came = seen(teacher)
+    check(came)
     begun = [set(each["level_id"].unique().tolist()) for each in rollouts]
-    assert len(curriculum.seen) > 6 and not begun[0] & begun[1]
+    assert len(came) > 6 and not begun[0] & begun[1]
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: taught(prl.Teacher("domain_randomization", ITEMS, students=2)), "teacher: of 2"),
-        (lambda: taught(prl.Teacher(Counting("rollout"), ITEMS)), "tell=True: this curriculum"),
+        (lambda: taught(counted("rollout")), "tell=True: this curriculum"),
     ],
 )
 def test_what_cannot_be_taught_is_refused(make: Any, message: str) -> None:
@@ -224,7 +215,7 @@ def test_environments_that_reset_themselves_are_refused() -> None:
     """They would begin each episode on the level of the one before."""
     for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
         vector = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")] * 2, autoreset_mode=mode)
-        teacher = prl.Teacher(Counting(), ITEMS)
+        teacher = counted()
         transform = prl.LevelTransform(teacher, lambda env, levels: None)
         env = TransformedEnv(GymWrapper(vector), transform)
         if mode is AutoresetMode.DISABLED:
@@ -280,7 +271,7 @@ AGENTS, OBJECTIVES = (("agents", "reward"), (2, 1)), ("reward", (2,))
     ],
 )
 def test_what_an_environment_lacks_is_said_before_a_step(make: Any, how: Any, message: str) -> None:
-    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher = counted()
     env = TransformedEnv(make(), prl.LevelTransform(teacher, set_level, **how))
     with pytest.raises(ArgumentError, match=message) as refused:
         env.reset()
@@ -290,14 +281,13 @@ def test_what_an_environment_lacks_is_said_before_a_step(make: Any, how: Any, me
 
 @pytest.mark.parametrize("rewards", [AGENTS, OBJECTIVES])
 def test_a_function_makes_one_reward_of_several(rewards: Any) -> None:
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted("success")
     how = {"reward": lambda after: after[rewards[0]].flatten(1).sum(-1, keepdim=True)}
     env = TransformedEnv(Several(*rewards), prl.LevelTransform(teacher, set_level, **how))
     env.rollout(12, break_when_any_done=False)
-    teacher.propose(1)  # takes in what was told
-    check(curriculum.seen)
-    assert len(curriculum.seen) > 3
+    came = seen(teacher)
+    check(came)
+    assert len(came) > 3
 
 
 @pytest.mark.parametrize("once", [True, False])
@@ -308,18 +298,17 @@ def test_a_success_may_be_of_any_step(once: bool) -> None:
         level = after["reward"]  # see LevelsEnv
         return ((after["observation"] == 1) & (level % 2 == 1)) | (after["done"] & (level % 4 == 0))
 
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, ITEMS)
+    teacher = counted("success")
     taught(teacher, success=won, once=once).rollout(16, break_when_any_done=False)
-    teacher.propose(1)  # takes in what was told
-    assert len(curriculum.seen) > 8
-    for number, (_, success) in curriculum.seen.items():
+    came = seen(teacher)
+    assert len(came) > 8
+    for number, (_, success) in came.items():
         assert success == (number % 4 == 0 or (once and number % 2 == 1)), number
 
 
 def test_mazes_say_what_is_a_success() -> None:
     """The goal is to the right: the first episode gets there, the second one does not."""
-    teacher: Any = prl.Teacher(Counting("success"), ITEMS)
+    teacher: Any = counted("success")
     env = prl.MazeEnv(prl.Level.from_text("S.G"), max_steps=3)
     env = TransformedEnv(env, prl.LevelTransform(teacher, lambda env, level: None))
     for action in (3, 2):
@@ -343,12 +332,10 @@ def test_success_is_asked_for() -> None:
             return super()._step(tensordict).exclude("success")
 
     def env(**how: Any) -> Any:
-        curriculum = Counting("success")
-        teacher = prl.Teacher(curriculum, ITEMS)
+        teacher = counted("success")
         made = TransformedEnv(Silent(), prl.LevelTransform(teacher, set_level, **how))
         made.rollout(8, break_when_any_done=False)
-        teacher.propose(1)  # takes in what was told
-        return curriculum.seen
+        return seen(teacher)
 
     with pytest.raises(ArgumentError, match="success: missing: this curriculum reads it, and"):
         env()
@@ -357,7 +344,7 @@ def test_success_is_asked_for() -> None:
 
 
 def test_the_end_of_episodes_waits_for_the_device_once() -> None:
-    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher = counted()
     env = taught(teacher)
     env.reset()
     ended = torch.tensor([True, False, True, False])

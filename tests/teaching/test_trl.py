@@ -60,6 +60,8 @@ class Trainer:
     num_iterations`` steps there is a generation, counted from where training is resumed.
     """
 
+    saves = (1, 3)
+
     def __init__(self, reward: Any, settings: Settings, folder: Path) -> None:
         filled = {"steps_per_generation": settings["gradient_accumulation_steps"]}
         filled |= {"num_iterations": 1, "num_generations": ANSWERS} | settings
@@ -103,9 +105,10 @@ class Trainer:
                 self.model.training = False
                 self.generate([{"prompt": "0", "row": 0}] * 4)
                 self.model.training = True
-                (args.output_dir / f"checkpoint-{state.global_step}").mkdir(exist_ok=True)
-                for callback in self.callbacks:
-                    callback.on_save(args, state, None)
+                if state.global_step in self.saves:
+                    (args.output_dir / f"checkpoint-{state.global_step}").mkdir(exist_ok=True)
+                    for callback in self.callbacks:
+                        callback.on_save(args, state, None)
 
     def _get_train_sampler(self) -> Any:
         raise NotImplementedError
@@ -169,7 +172,7 @@ def trained(
 def test_generations_are_told_and_go_on_bit_by_bit(
     taught: Any, which: str, make: Any, tmp_path: Path
 ) -> None:
-    """Every step is a checkpoint; from each of them the rest of the run is the same."""
+    """From each of its checkpoints the rest of the run is the same."""
     settings, steps = SETTINGS[which], 4
     whole, sampler = trained(taught, make, settings, tmp_path, steps)
     for items in whole:  # answers to one prompt stand together

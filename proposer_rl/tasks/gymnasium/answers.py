@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from proposer_rl.settings import settings
+from proposer_rl.tasks.parameters import LARGEST
+
 # Spaces whose values are one number or an array of them.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class UnfitEnvironmentError(ValueError):
@@ -27,7 +29,7 @@ class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
-        """Reset; what comes back must be an observation and an info."""
+        """Resets the environment, which must return an observation and an info."""
         try:
             result = self.env.reset(**given)
         except TypeError as error:
@@ -44,12 +46,12 @@ class Answers(gymnasium.Wrapper[Any, Any, Any, Any]):
         return result
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step; what comes back must be five values."""
+        """Takes a step, which must return five values."""
         return stepped(self.env.step(action))
 
 
 def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """What a step has returned: the reward as a finite float, the ends as truth values.
+    """Returns what a step has returned, the reward as a finite float, the ends as truth values.
 
     Raises:
         UnfitEnvironmentError: if it is not that.
@@ -60,8 +62,8 @@ def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
             f"info, which is a dictionary; it returns {_what(result)} (as in old Gym?)"
         )
     seen, reward, terminated, truncated, info = result
-    over = flag(terminated, "terminated"), flag(truncated, "truncated")
-    reward = number(reward, "the reward")
+    over = as_flag(terminated, "terminated"), as_flag(truncated, "truncated")
+    reward = as_number(reward, "the reward")
     if not abs(reward) <= LARGEST:
         raise UnfitEnvironmentError(
             f"step pays a reward of {reward}: it must be finite, also as float32"
@@ -69,8 +71,8 @@ def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     return seen, reward, *over, info
 
 
-def number(value: Any, what: str) -> float:
-    """A number, or the only element of an array, as a float.
+def as_number(value: Any, what: str) -> float:
+    """Returns a number, or the only element of an array, as a float.
 
     Raises:
         UnfitEnvironmentError: if it is none.
@@ -85,8 +87,8 @@ def number(value: Any, what: str) -> float:
     )
 
 
-def flag(value: Any, what: str) -> bool:
-    """A truth value, 0 or 1, or the only element of an array, as a bool.
+def as_flag(value: Any, what: str) -> bool:
+    """Returns a truth value, 0 or 1, or the only element of an array, as a bool.
 
     Raises:
         UnfitEnvironmentError: if it is none.
@@ -100,15 +102,106 @@ def flag(value: Any, what: str) -> bool:
 
 
 def entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """An info's entries by their names, also those within others: ``metrics.won``."""
+    """Yields an info's entries by their names, also those within others, as ``metrics.won``."""
     for name, value in info.items():
         yield f"{within}{name}", value
         if isinstance(value, Mapping):
             yield from entries(value, f"{within}{name}.")
 
 
+class Step(NamedTuple):
+    """A step, mostly the last one of an episode.
+
+    Attributes:
+        terminated: whether the environment ended it.
+        truncated: whether it was cut off.
+        in_time: whether the time limit had not been reached.
+        returns: the sum of the episode's rewards.
+        info: the environment's further entries.
+    """
+
+    terminated: bool
+    truncated: bool
+    in_time: bool
+    returns: float
+    info: Mapping[str, Any]
+
+
+@settings
+class SuccessSettings:
+    """When an episode counts as a success; called with its last step, it says whether it does.
+
+    Attributes:
+        kind: ``return``: it has at least the return ``least``; ``survived``: the time limit ended
+            it, and nothing else; ``terminated``: the environment did, before; ``info``: an entry of
+            the last step's info is true.
+        least: the return.
+        key: the entry's name; dots lead to entries of entries.
+        optional: whether the entry is there only where the episode is a success.
+        once: whether the entry may be true in any step, so that what is reached and lost again is a
+            success, too.
+    """
+
+    kind: Literal["return", "survived", "terminated", "info"]
+    least: float | None = None
+    key: str | None = None
+    optional: bool = False
+    once: bool = False
+
+    def check(self) -> None:
+        """Refuses a kind that lacks what it needs, or has more.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        needed = {"return": "least", "info": "key"}.get(self.kind)
+        for name in ("least", "key"):
+            given = getattr(self, name) is not None
+            if given != (name == needed):
+                verb = "has no effect" if given else "missing"
+                raise ValueError(f"success.{name}: {verb} with success.kind={self.kind}")
+        for name in ("optional", "once"):
+            if getattr(self, name) and self.kind != "info":
+                raise ValueError(f"success.{name}: has no effect with success.kind={self.kind}")
+
+    def __call__(self, step: Step) -> bool:
+        """Returns whether an episode with this last step, or with ``once`` any such, is a success.
+
+        Raises:
+            UnfitEnvironmentError: if its info says it in something else than a truth value.
+        """
+        if self.kind == "return":
+            return step.returns >= (self.least or 0.0)
+        if self.kind == "survived":
+            return not step.terminated and not step.in_time
+        if self.kind == "terminated":
+            return step.terminated
+        value = self._entry(step.info)
+        return value is not None and as_flag(
+            value, f"success.key={self.key}: the entry of the info"
+        )
+
+    def check_told(self, info: Mapping[str, Any]) -> None:
+        """Refuses the last info of an episode that does not say whether that was a success.
+
+        Raises:
+            UnfitEnvironmentError: naming the key and the entries that there are.
+        """
+        if self.kind == "info" and not self.optional and self._entry(info) is None:
+            there = ", ".join(name for name, _ in entries(info))
+            raise UnfitEnvironmentError(
+                f"success.key={self.key}: the last info of an episode has no such entry; it has: "
+                f"{there or 'none'}; where only episodes that succeed have it, set "
+                "success.optional=true"
+            )
+
+    def _entry(self, info: Mapping[str, Any]) -> Any:
+        """Returns the info's entry; None where it is absent."""
+        return dict(entries(info)).get(self.key or "")
+
+
 def check_seen(space: spaces.Space[Any], seen: Any, by: str) -> None:
-    """Refuse an observation that would be read as another than it is.
+    """Refuses an observation that would be read as another than it is.
 
     A number beyond its bounds is not: nothing here depends on them.
 
@@ -157,7 +250,7 @@ def _short(seen: Any) -> str:
 
 
 def _element(value: Any) -> Any:
-    """The only element of an array or a list as a number of Python's; anything else as it is."""
+    """Returns the only element of an array or a list as Python's own; anything else as it is."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError):

@@ -18,8 +18,8 @@ class AttributeRefusedError(ValueError):
     """An environment has no such thing, or does not take it; the message is one line."""
 
 
-def read(environment: Any, path: str) -> Any:
-    """What stands at a path in an environment without wrappers.
+def read_attribute(environment: Any, path: str) -> Any:
+    """Returns what stands at a path in an environment without wrappers.
 
     A path is names of attributes, keys of mappings and indices, with dots in between.
 
@@ -39,16 +39,16 @@ def read(environment: Any, path: str) -> Any:
     return place
 
 
-def write(environment: Any, path: str, value: Any) -> None:
-    """Put a number in the place of another, or a text in that of what is none, and see it there.
+def write_attribute(environment: Any, path: str, value: Any) -> None:
+    """Sets a number at a path, or a text where no number stands, and sees that it is there.
 
     Raises:
         AttributeRefusedError: if there is no such thing at the path, or it cannot be changed.
     """
-    before = read(environment, path)
+    before = read_attribute(environment, path)
     within, _, last = path.rpartition(".")
-    holder = read(environment, within) if within else environment
-    new = _alike(before, value, path)
+    holder = read_attribute(environment, within) if within else environment
+    new = _in_place_of(before, value, path)
     key = _key(holder, last)
     try:
         shadows = key is None and _shadows(holder, last)
@@ -73,7 +73,7 @@ def write(environment: Any, path: str, value: Any) -> None:
 
 
 def stray(environment: Any, path: str, value: Any) -> str | None:
-    """A line that says what stands at a path, where it is not this value; else None.
+    """Returns a line that says what stands at a path, where it is not this value; else None.
 
     A wrapper that has something there by itself, beside the environment, must have the same.
     """
@@ -92,22 +92,22 @@ def stray(environment: Any, path: str, value: Any) -> str | None:
 
 
 def _readings(environment: Any, path: str) -> Iterator[tuple[Any, Any]]:
-    """What stands at a path in an environment, and in those of its wrappers that have it."""
+    """Yields what stands at a path in an environment, and in those wrappers that have it."""
     first = path.partition(".")[0]
     while isinstance(environment, gymnasium.Wrapper):
         if hasattr(environment, first):
             with suppress(AttributeRefusedError):
-                yield environment, read(environment, path)
+                yield environment, read_attribute(environment, path)
         environment = environment.env
-    yield environment, read(environment, path)
+    yield environment, read_attribute(environment, path)
 
 
 def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
-def _alike(before: Any, value: Any, path: str) -> Any:
-    """A value as what it replaces: a truth value, a tensor without dimensions."""
+def _in_place_of(before: Any, value: Any, path: str) -> Any:
+    """Returns a value of the type that it replaces: a truth value, a tensor without dimensions."""
     if not isinstance(value, int | float):
         if isinstance(before, Number):
             raise AttributeRefusedError(f"{path} is a number, {before}, and no place for {value!r}")
@@ -132,7 +132,7 @@ def _alike(before: Any, value: Any, path: str) -> Any:
 
 
 def _key(holder: Any, name: str) -> str | int | None:
-    """The key or index of an item by its name; None for an attribute."""
+    """Returns the key or index of an item by its name; None for an attribute."""
     if isinstance(holder, Mapping) and name in holder:
         return name
     if name.removeprefix("-").isdecimal():
@@ -141,7 +141,7 @@ def _key(holder: Any, name: str) -> str | int | None:
 
 
 def _shadows(holder: Any, name: str) -> bool:
-    """Whether an attribute is none of the object's own: it looks it up elsewhere."""
+    """Returns whether an attribute is none of the object's own, which looks it up elsewhere."""
     try:
         inspect.getattr_static(holder, name)
     except AttributeError:
@@ -150,7 +150,7 @@ def _shadows(holder: Any, name: str) -> bool:
 
 
 def _numbers(environment: Any) -> list[str]:
-    """Names of an environment's own numbers."""
+    """Returns the names of an environment's own numbers."""
     found = {**vars(type(environment)), **getattr(environment, "__dict__", {})}
     return sorted(
         name

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def set_length(environment: Any, length: float) -> None:
-    """Set half the pole's length, in metres, and what CartPole computes from it once.
+    """Sets half the pole's length, in metres, and what CartPole computes from it once.
 
     Args:
         environment: ``CartPole-v1`` without wrappers.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Gt, Len
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import Categorical, MultiCategorical, TensorSpec
@@ -12,7 +14,7 @@ from torchrl.modules import MLP
 
 from proposer_rl.models import MemoryNetwork, orthogonal_
 from proposer_rl.models.population import StackedLinear
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings
+from proposer_rl.settings import settings
 from proposer_rl.tasks.gymnasium.spaces import channels_first
 
 SMALL_MAP = 8  # pixels along its shorter side at most: no more is halved
@@ -24,6 +26,29 @@ WIDTHS, SCREEN_WIDTHS = (16, 32), (32, 64, 64)
 FIRST_LOG_SCALE = -0.5  # of the policy over continuous actions
 POLICY_GAIN = 0.01  # of the policy's last layer: the first policy is nearly uniform
 NEVER = -1e9  # logit of an action that there is not
+
+
+Widths = list[Annotated[int, Ge(1)]]
+
+
+@settings
+class NetworkSettings:
+    """The Solver's network: an MLP of numbers, a CNN of images.
+
+    Attributes:
+        hidden: widths of the hidden layers, of the policy and of the critic.
+        channels: of the convolutions before them, for images; None for what their size asks for.
+        scale: observations are multiplied with it; None for 1, and 1/255 of bytes.
+        image: order of an image's axes; None for what its shape tells.
+        memory: width of an LSTM between what is seen and the heads, which then have one hidden
+            layer, of the last width; None for no memory.
+    """
+
+    hidden: Annotated[Widths, Len(1)]
+    channels: Widths | None = None
+    scale: Annotated[float, Gt(0)] | None = None
+    image: Literal["HWC", "CHW"] | None = None
+    memory: Annotated[int, Ge(1)] | None = None
 
 
 class SolverNetwork(nn.Module):
@@ -41,14 +66,14 @@ class SolverNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.encoder = Encoder(seen, settings)
-        features, actions = self.encoder.features, Actions(acts)
+        features, actions = self.encoder.features, ActionLogits(acts)
         self.policy = _mlp(features, actions.numbers, settings.hidden, POLICY_GAIN)
         self.critic = _mlp(features, 1, settings.hidden, 1.0)
         self.actions = actions
         self.stackable = not self.encoder.convolutions
 
     def forward(self, *observed: Tensor) -> tuple[Tensor, Tensor]:
-        """Of observations [*B, ...] logits as :class:`Actions` has them, and values [*B, 1]."""
+        """Returns :class:`ActionLogits`' logits and values [*B, 1] of observations [*B, ...]."""
         features = self.encoder(*observed)
         return self.actions(self.policy(features)), self.critic(features)
 
@@ -56,9 +81,9 @@ class SolverNetwork(nn.Module):
 def memory_network(
     seen: Sequence[TensorSpec], acts: TensorSpec, settings: NetworkSettings
 ) -> MemoryNetwork:
-    """The same with memory: numbers and images, then an LSTM, then one hidden layer each."""
+    """Returns a network with memory: numbers and images, an LSTM, then one hidden layer each."""
     assert settings.memory is not None
-    encoder, actions = Encoder(seen, settings), Actions(acts)
+    encoder, actions = Encoder(seen, settings), ActionLogits(acts)
     network = MemoryNetwork(
         encoder,
         encoder.features,
@@ -71,7 +96,7 @@ def memory_network(
 
 
 class Encoder(nn.Module):
-    """F ``features`` of what is seen: numbers as they are, images through convolutions."""
+    """Makes F ``features`` of what is seen: numbers as they are, images through convolutions."""
 
     def __init__(self, seen: Sequence[TensorSpec], settings: NetworkSettings) -> None:
         super().__init__()
@@ -95,7 +120,7 @@ class Encoder(nn.Module):
             self.features += shape[0]
 
     def forward(self, *observed: Tensor) -> Tensor:
-        """Features [*B, F] of observations [*B, ...]."""
+        """Returns features [*B, F] of observations [*B, ...]."""
         layers, parts = iter(self.convolutions), []
         for seen, scale, first in zip(observed, self._scales, self._first, strict=True):
             part = seen.float() * scale
@@ -107,11 +132,11 @@ class Encoder(nn.Module):
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
-class Actions(nn.Module):
-    """A policy's numbers [*B, O] as logits.
+class ActionLogits(nn.Module):
+    """Makes logits of a policy's numbers [*B, O].
 
-    Of one of n actions [*B, n]; of D choices among at most n each [*B, D, n]; of D numbers their
-    locations and log-scales [*B, D, 2].
+    They are [*B, n] for one of n actions, [*B, D, n] for D choices among at most n each, and
+    [*B, D, 2] for D numbers: their locations and log-scales.
 
     Attributes:
         numbers: how many a policy has to give, O.
@@ -131,7 +156,7 @@ class Actions(nn.Module):
             self.log_scale = nn.Parameter(torch.full((self.numbers,), FIRST_LOG_SCALE))
 
     def forward(self, numbers: Tensor) -> Tensor:
-        """Logits of numbers."""
+        """Returns the logits of a policy's numbers [*B, O]."""
         if self.log_scale is not None:
             between = [1] * (numbers.ndim - self.log_scale.ndim)
             scale = self.log_scale.unflatten(-1, (*between, -1))  # [K, D] of stacked replicas
@@ -144,9 +169,9 @@ class Actions(nn.Module):
 
 
 def _convolutions(channels: int, side: int, widths: Sequence[int] | None) -> nn.Sequential:
-    """Convolutions, as those of screens where a map is as large as one.
+    """Returns convolutions, those of screens where a map is as large as one.
 
-    Else they are 3x3, with a stride of 2 as long as the map is not small.
+    Others are 3x3, with a stride of 2 as long as the map is not small.
     """
     screen = side >= LARGE_MAP
     layers: list[nn.Module] = []

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from proposer_rl.models import callers_state
 from proposer_rl.runs.records import written
-from proposer_rl.tasks.gymnasium.env import as_actions
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
+from proposer_rl.tasks.gymnasium.batched_env import as_actions
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
 from proposer_rl.tasks.parameters import SEED
 
 # Of pygame, with which most environments draw: no greeting, and no window or sound is needed.
@@ -33,7 +32,7 @@ MODE = "rgb_array"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
 LONGER_SIDE = 150  # pixels
 LATER = 3  # moments of an episode that are drawn over its start
-KEY = "The environment's frames: the start, and more faintly three later moments of the episode."
+FRAMES = "The environment's frames: the start, and more faintly three later moments of the episode."
 NO_FRAMES = "The environment draws no frames here; the numbers are those of the level."
 
 
@@ -60,7 +59,7 @@ class Camera:
             self.works = False
 
     def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
-        """A picture uint8 [H, W, 3] of a level, and of an episode with actions [T, ...] there."""
+        """Draws a level, and an episode there with actions [T, ...]: uint8 [H, W, 3]."""
         if self.works:
             try:
                 return self._drawn(play, actions)
@@ -96,9 +95,9 @@ class Camera:
 
 @contextmanager
 def _without_display() -> Iterator[None]:
-    """Let MuJoCo draw by EGL where there is no display and nobody has said how.
+    """Lets MuJoCo draw by EGL meanwhile, where there is no display and nobody has said how.
 
-    Only meanwhile: where there is no EGL, a new process could not even import it.
+    It is undone, because without EGL a new process could not even import MuJoCo.
     """
     if sys.platform != "linux" or any(map(os.environ.get, DISPLAYS)):
         yield

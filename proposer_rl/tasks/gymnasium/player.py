@@ -8,21 +8,49 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import gymnasium
+from annotated_types import Len
 from gymnasium.wrappers import TimeLimit
 
-from proposer_rl.tasks.gymnasium.answers import Answers, UnfitEnvironmentError, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write
-from proposer_rl.tasks.gymnasium.settings import (
-    ParameterSettings,
+from proposer_rl.settings import settings
+from proposer_rl.tasks.gymnasium.answers import (
+    Answers,
     Step,
     SuccessSettings,
-    WrapperSettings,
+    UnfitEnvironmentError,
+    stepped,
 )
-from proposer_rl.tasks.gymnasium.spaces import plain
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
+from proposer_rl.tasks.gymnasium.spaces import plain_env
 from proposer_rl.tasks.parameters import SEED
+from proposer_rl.tasks.ranges import RangeSettings
+
+# The dotted name of a function or class, or that with its further arguments by name.
+WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
+
+
+@settings
+class ParameterSettings(RangeSettings):
+    """A number of the environment that differs between levels.
+
+    Attributes:
+        set: how it gets into the environment, before each reset: as an attribute, as an argument
+            of the constructor (the environment is then built anew where it changes), as an option
+            of the reset, or by a function that is called with the environment and the number.
+        name: of the attribute (dots lead to parts of the environment, numbers to elements),
+            argument, option or function (which must be given), or of several that all get the
+            value; None for the parameter's own name.
+    """
+
+    set: Literal["attribute", "argument", "option", "call"] = "attribute"
+    name: str | Annotated[list[str], Len(1)] | None = None
+
+    def names(self, own: str) -> list[str]:
+        """Returns the names that get the value of the parameter, whose own name is given."""
+        name = own if self.name is None else self.name
+        return [name] if isinstance(name, str) else name
 
 
 class RefusedLevelError(ValueError):
@@ -38,7 +66,7 @@ class WrapperError(ValueError):
 
 
 def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> WrapperError:
-    """What is wrong with a wrapper, as an error that another process can send."""
+    """Returns what is wrong with a wrapper, as an error that another process can send."""
     name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
     return WrapperError(f"wrappers: {name}: {error if isinstance(error, str) else told(error)}")
 
@@ -52,7 +80,7 @@ class MakeEnvironment:
             :class:`~proposer_rl.tasks.gymnasium.task.GymnasiumTask`.
         check: whether Gymnasium's own checker watches, and warns.
         as_it_is: whether observations and actions are those of the environment; else those of
-            :func:`~proposer_rl.tasks.gymnasium.spaces.plain`.
+            :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env`.
     """
 
     env_id: str
@@ -63,7 +91,7 @@ class MakeEnvironment:
     as_it_is: bool = False
 
     def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """Make one with further arguments.
+        """Makes an environment with further arguments.
 
         Raises:
             WrapperError: if a wrapper cannot be put around it.
@@ -83,10 +111,10 @@ class MakeEnvironment:
                 env = wrapper_of(wrapper)(env)
             except Exception as error:
                 raise wrapper_error(wrapper, error) from error
-        return env if self.as_it_is else plain(env)
+        return env if self.as_it_is else plain_env(env)
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
-        """Steps after which an episode is truncated; None for never."""
+        """Returns the steps after which an episode is truncated; None for never."""
         limits = [limit._max_episode_steps for limit in _time_limits(env)]
         declared = self.max_steps
         if declared is None and env.unwrapped.spec is not None:
@@ -103,7 +131,7 @@ class Play(NamedTuple):
     seed: int
 
     def __str__(self) -> str:
-        """The level."""
+        """Returns the level as a text."""
         values = [f"{name}={value:g}" for name, value in self.values.items()]
         return ", ".join([*values, f"{SEED}={self.seed}"])
 
@@ -111,7 +139,7 @@ class Play(NamedTuple):
 class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment whose resets set up the level that it plays.
 
-    Of an info only ``success`` is handed on, where a step ended an episode that is one.
+    An info has ``success`` alone, where a step ended an episode that is one.
 
     Args:
         make, parameters: the environment, and what differs between levels, by name.
@@ -146,7 +174,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def play(self) -> Play:
-        """What is played from the next reset on."""
+        """Returns what is played from the next reset on."""
         return self._play
 
     @play.setter
@@ -155,7 +183,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def in_time(self) -> bool:
-        """Whether the episode has reached no time limit, each counting the steps it has seen."""
+        """Returns whether no time limit is reached, each counting the steps that it has seen."""
         return all(
             (limit._elapsed_steps or 0) < limit._max_episode_steps
             for limit in _time_limits(self.env)
@@ -164,7 +192,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode on the level, whose seed and options are its own."""
+        """Begins an episode on the level, which has its own seed and options."""
         if self._once and self._played:
             self._still = True
             return self._seen, {}
@@ -182,7 +210,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._seen, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step, unless it stands still."""
+        """Takes a step, unless the episode of an evaluation is over."""
         if self._still:
             return self._seen, 0.0, False, False, {}
         try:
@@ -201,7 +229,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._seen, reward, terminated, truncated, info
 
     def strays(self) -> str | None:
-        """What of the level is not in the environment any more, as a line; None where all is."""
+        """Returns a line on what of the level the environment has lost; None where all is there."""
         for name, how, path in self._ways:
             line = how == "attribute" and stray(self.env, path, self._play.values[name])
             if line:
@@ -217,7 +245,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             value = self._play.values[name]
             if how == "attribute":
                 try:
-                    write(inner, path, value)
+                    write_attribute(inner, path, value)
                 except AttributeRefusedError as error:
                     raise RefusedLevelError(f"parameters.{name}: {error}") from error
             elif how == "call":
@@ -238,7 +266,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
 
     def _named(self, way: str) -> dict[str, float]:
-        """The values that get into the environment in one way, by the names they have there."""
+        """Returns the values that are set in one way, by the names that they have there."""
         values = self._play.values
         return {name: values[parameter] for parameter, how, name in self._ways if how == way}
 
@@ -256,7 +284,7 @@ def _time_limits(env: Any) -> Iterator[TimeLimit]:
 
 
 def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
-    """What puts a wrapper around an environment.
+    """Returns what puts a wrapper around an environment.
 
     Raises:
         ValueError: if there is no such thing.
@@ -268,7 +296,7 @@ def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
 
 
 def imported(name: str) -> Callable[..., Any]:
-    """What a dotted name stands for.
+    """Returns what a dotted name stands for.
 
     Raises:
         ValueError: if there is no such thing.
@@ -284,7 +312,7 @@ def imported(name: str) -> Callable[..., Any]:
 
 
 def told(error: Exception) -> str:
-    """An exception of an environment's as part of a line, and where it was raised."""
+    """Returns an environment's exception as part of a line, with the place that raised it."""
     *_, last = traceback.extract_tb(error.__traceback__)
     reason = " ".join(str(error).split()) or "no reason given"
     return f"{type(error).__name__}: {reason} ({Path(last.filename).name}, line {last.lineno})"

@@ -19,11 +19,11 @@ Env = gymnasium.Env[Any, Any]
 
 UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
 IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
-NUMBERS = "observation"  # the entry of all numbers, or of the only image
+NUMBERS_ENTRY = "observation"  # the entry of all numbers, or of the only image
 
 
-def plain(env: Env) -> Env:
-    """An environment whose observations and actions are plain arrays.
+def plain_env(env: Env) -> Env:
+    """Returns an environment whose observations and actions are plain arrays.
 
     Observations become a box: of numbers [D], where whole numbers to choose from are one-hot; or of
     an image of three axes. Where both are seen, or several images, they are a dictionary of boxes:
@@ -67,7 +67,7 @@ def _with_plain_observations(env: Env) -> Env:
         low, high = (_of_three_axes(end) for end in (box.low, box.high))
         new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, box.dtype.type))
     if rest.spaces:
-        new[NUMBERS] = spaces.flatten_space(rest)
+        new[NUMBERS_ENTRY] = spaces.flatten_space(rest)
 
     def changed(seen: Any) -> Any:
         shown = dict(zip(parts, _in_order(space, seen), strict=True))
@@ -76,7 +76,7 @@ def _with_plain_observations(env: Env) -> Env:
             for name, box in images.items()
         }
         if rest.spaces:
-            out[NUMBERS] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
+            out[NUMBERS_ENTRY] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
         return out if len(out) > 1 else next(iter(out.values()))
 
     together = spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
@@ -84,7 +84,7 @@ def _with_plain_observations(env: Env) -> Env:
 
 
 def _typed(space: spaces.Box, seen: Any) -> Array:
-    """An observation in the type of its box.
+    """Returns an observation in the type of its box.
 
     Raises:
         UnfitEnvironmentError: where a whole number would become another.
@@ -96,7 +96,7 @@ def _typed(space: spaces.Box, seen: Any) -> Array:
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
-    """Whether a space is of images: three axes or four, or two of bytes and not short."""
+    """Returns whether a space is of images: three axes or four, or two of bytes and not short."""
     if not isinstance(space, spaces.Box):
         return False
     bytes_ = space.dtype == np.uint8 and min(space.shape, default=0) >= IMAGE_SIDE
@@ -104,7 +104,7 @@ def is_image(space: spaces.Space[Any]) -> bool:
 
 
 def channels_first(shape: tuple[int, ...]) -> bool:
-    """Whether the channels of an image are its first axis, or else its last.
+    """Returns whether the channels of an image are its first axis, or else its last.
 
     They are the axis that differs where the other two are alike, or else the shortest.
 
@@ -126,7 +126,7 @@ def channels_first(shape: tuple[int, ...]) -> bool:
 
 
 def _of_three_axes(image: Array) -> Array:
-    """Grey images get an axis of channels; of stacked images it is that of the stack, too."""
+    """Returns a grey image with an axis of channels, stacked images with theirs along it."""
     if image.ndim == 2:
         return image[..., None]
     if image.ndim == 3:
@@ -163,13 +163,13 @@ def _with_plain_actions(env: Env) -> Env:
 
     def changed(action: Array) -> Any:
         own = [make(part) for make, part in zip(read, np.split(action, ends), strict=True)]
-        return _composed(space, iter(own))
+        return _assembled(space, iter(own))
 
     return TransformAction(env, changed, new)
 
 
 class _Scaled:
-    """Numbers from -1 to 1 as those of a box; unbounded ones as they are."""
+    """Makes numbers from -1 to 1 those of a box; unbounded ones stay as they are."""
 
     def __init__(self, box: spaces.Box) -> None:
         self._box = box
@@ -186,7 +186,7 @@ class _Scaled:
 
 
 def _options(space: spaces.Space[Any]) -> Array:
-    """How many there are of each choice."""
+    """Returns how many options each choice has."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.n])
     if isinstance(space, spaces.MultiDiscrete):
@@ -195,7 +195,7 @@ def _options(space: spaces.Space[Any]) -> Array:
 
 
 def _chosen(space: spaces.Space[Any], choices: Array) -> Any:
-    """What choices counted from 0 are in a space."""
+    """Returns what choices counted from 0 are in a space."""
     if isinstance(space, spaces.Discrete):
         return int(choices[0] + space.start)
     shaped = choices.reshape(space.shape)
@@ -204,7 +204,7 @@ def _chosen(space: spaces.Space[Any], choices: Array) -> Any:
 
 
 def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Parts of a space or an observation that are no dictionaries or tuples, by dotted names."""
+    """Yields parts of a space or an observation below dictionaries and tuples, by dotted names."""
     if isinstance(whole, Mapping | tuple | spaces.Tuple):  # a space of dictionaries is a Mapping
         for part, inner in whole.items() if isinstance(whole, Mapping) else enumerate(whole):
             yield from leaves(inner, f"{name}.{part}" if name else str(part))
@@ -213,7 +213,7 @@ def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
-    """The parts of an observation, in the order of those of its space."""
+    """Yields the parts of an observation, in the order of those of its space."""
     if isinstance(space, spaces.Dict):
         for name, inner in space.spaces.items():
             yield from _in_order(inner, seen[name])
@@ -224,10 +224,10 @@ def _in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
         yield seen
 
 
-def _composed(space: spaces.Space[Any], values: Iterator[Any]) -> Any:
-    """A value of a space from those of its parts, in order."""
+def _assembled(space: spaces.Space[Any], values: Iterator[Any]) -> Any:
+    """Returns a value of a space from those of its parts, in order."""
     if isinstance(space, spaces.Dict):
-        return {name: _composed(inner, values) for name, inner in space.spaces.items()}
+        return {name: _assembled(inner, values) for name, inner in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(_composed(inner, values) for inner in space.spaces)
+        return tuple(_assembled(inner, values) for inner in space.spaces)
     return next(values)

@@ -22,7 +22,7 @@ GREY = (255, 255, 255), (153, 153, 153)
 
 
 class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
-    """The walker, the track from its next reset on.
+    """BipedalWalker on a track of stumps, which is laid at every reset.
 
     Args:
         render_mode: as of :class:`gymnasium.Env`.
@@ -39,7 +39,7 @@ class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in a new world: a used one keeps an order of its contacts."""
+        """Begins an episode in a new world, as a used one keeps an order of its contacts."""
         self._destroy()
         self.world = Box2D.b2World()
         return super().reset(seed=seed, options=options)

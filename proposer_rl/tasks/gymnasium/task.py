@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -33,23 +33,47 @@ from torchrl.envs import (
 from proposer_rl.extras import install_command
 from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
+from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task, distribution_of
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.env import FLAGS, GymnasiumEnv, Vectorization, plays
-from proposer_rl.tasks.gymnasium.networks import SolverNetwork, memory_network
-from proposer_rl.tasks.gymnasium.pictures import KEY, NO_FRAMES, Camera
-from proposer_rl.tasks.gymnasium.player import MakeEnvironment, told
-from proposer_rl.tasks.gymnasium.settings import (
-    EvaluationSettings,
-    NetworkSettings,
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectorization, plays
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
+from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
+from proposer_rl.tasks.gymnasium.player import (
+    MakeEnvironment,
     ParameterSettings,
-    SuccessSettings,
     WrapperSettings,
+    told,
 )
 from proposer_rl.tasks.gymnasium.trial import tried
 from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
 from proposer_rl.tasks.ranges import spaces
+
+
+@settings
+class EvaluationSettings:
+    """How Solvers are measured: by episodes.
+
+    Attributes:
+        levels: of each distribution, the same in every run.
+        episodes: played on each level, with drawn actions: the most probable ones make the same
+            episode every time, since each begins with the level's own seed.
+        actions: drawn from the policy, or the most probable ones.
+        seed: of the levels and of the actions.
+    """
+
+    levels: Annotated[int, Ge(1)]
+    episodes: Annotated[int, Ge(1)] = 1
+    actions: Literal["sampled", "most_probable"] = "sampled"
+    seed: Annotated[int, Ge(0)] = 0
+
+    def __post_init__(self) -> None:
+        if self.episodes > 1 and self.actions == "most_probable":
+            raise ValueError(
+                f"episodes={self.episodes}: with actions=most_probable all episodes on a level are "
+                "the same; leave episodes=1"
+            )
 
 
 class GymnasiumTask(Task):
@@ -156,18 +180,18 @@ class GymnasiumTask(Task):
 
     @property
     def target_shares(self) -> Tensor:
-        """The target as shares of the bins, what lies outside of them in the nearest: float [N]."""
+        """Returns the target's shares in bins, float [N]; what lies outside is in the nearest."""
         shares: Tensor = self.space.shares(self.target)
         return shares
 
     @property
     def key(self) -> str:  # type: ignore[override]
-        """What is to be seen in a record's picture."""
-        return KEY if self._camera.works else NO_FRAMES
+        """Returns what is to be seen in a record's picture."""
+        return FRAMES if self._camera.works else NO_FRAMES
 
     @property
     def about(self) -> dict[str, str]:
-        """Texts about the task, by their labels."""
+        """Returns texts about the task, by their labels."""
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
@@ -179,11 +203,11 @@ class GymnasiumTask(Task):
         }
 
     def environment(self, levels: TensorDictBase) -> EnvBase:
-        """Environments to be trained in."""
+        """Returns environments to be trained in."""
         return self._env(levels, self._transforms, vectorization=self._vectorization)
 
     def evaluation_environment(self, levels: TensorDictBase) -> EnvBase:
-        """The same environments for the same number of levels, played once."""
+        """Returns environments that play each level once; those of a batch shape are kept."""
         shape = levels.batch_size
         if shape not in self._envs:
             self._envs[shape] = self._env(
@@ -193,12 +217,12 @@ class GymnasiumTask(Task):
         return self._envs[shape]
 
     def network(self) -> nn.Module:
-        """The network of one Solver, by what the environment shows and takes."""
+        """Returns the network of one Solver, by what the environment shows and takes."""
         make = SolverNetwork if self._network.memory is None else memory_network
         return make(list(self._seen.values()), self._acts, self._network)
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """K networks, with memory or without."""
+        """Returns K networks, with memory or without."""
         seen, memory = list(self._seen), self._network.memory
         distribution = distribution_of(env.full_action_spec["action"])
         if memory is not None:
@@ -207,17 +231,17 @@ class GymnasiumTask(Task):
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def evaluation_distribution(self, name: str) -> ParameterSpace:
-        """A distribution, of other seeds than the training's."""
+        """Returns a distribution, of other seeds than the training's."""
         return self._test.get(name, self.distributions[name])
 
     def stream(self, use: str, name: str) -> torch.Generator:
-        """What ``"levels"`` of evaluations on a distribution, or their ``"actions"``, come from."""
+        """Returns the generator of an evaluation's ``"levels"`` or ``"actions"``."""
         return Streams(self._evaluation.seed, "evaluation").generator(use, name)
 
     def record(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[dict[str, Any]]:
-        """Frames of levels [n], and of the Solver's first episode there [n, T]; the parameters."""
+        """Returns pictures of levels [n] and first episodes there [n, T], and the parameters."""
         records = super().record(levels, rollout)
         return [
             {**record, "level": {**play.values, SEED: play.seed}}
@@ -227,7 +251,7 @@ class GymnasiumTask(Task):
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
-        """Frames of levels [n], and of the Solver's first episode there [n, T]."""
+        """Draws frames of levels [n], and of the Solver's first episode there [n, T]."""
         if rollout is None:
             return [self._camera.picture(play, None) for play in plays(levels)]
         first = in_first_episode(rollout)
@@ -256,7 +280,7 @@ class GymnasiumTask(Task):
         return TransformedEnv(env, Compose(*map(_copied, transforms))) if transforms else env
 
     def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
-        """Of what Solvers see and do, after the transforms; the network is tried on them.
+        """Returns specs of what Solvers see and do after the transforms, and tries the network.
 
         Raises:
             ValueError: naming the key, where there is no network for them.
@@ -277,12 +301,12 @@ class GymnasiumTask(Task):
         for name in ("channels", "image"):
             given = getattr(self._network, name)
             if given is not None and all(spec.ndim == 1 for spec in seen.values()):
-                raise ValueError(f"network.{name}={given}: is of images, of which none is seen")
+                raise ValueError(f"network.{name}={given}: has no effect where no image is seen")
         return seen, acts
 
     @torch.no_grad()
     def _try_transforms(self, level: TensorDictBase, network: nn.Module, seen: list[str]) -> None:
-        """Play a level twice, side by side but not in step, to the end of an episode."""
+        """Plays a level twice, side by side but not in step, to the end of an episode."""
         self._unpaid()  # asks each for its keys, as an evaluation will
         env = self._env(torch.stack([level, level], 1), self._transforms)
         action = env.full_action_spec["action"].zero()
@@ -299,7 +323,7 @@ class GymnasiumTask(Task):
 
 
 def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
-    """The transforms one by one, also those of a Compose.
+    """Yields the transforms one by one, also those of a Compose.
 
     Raises:
         ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
@@ -333,14 +357,14 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
 
 
 def _copied(transform: Transform) -> Transform:
-    """A copy for another environment; deepcopy takes no buffers that have no shape yet."""
+    """Returns a copy for another environment; deepcopy takes no buffers without a shape."""
     copy: Transform = pickle.loads(pickle.dumps(CloudpickleWrapper(transform))).fn
     return copy
 
 
 @contextmanager
 def _named(env_id: str, extra: str | None) -> Iterator[None]:
-    """Say in one line what is wrong with an environment that cannot be made."""
+    """Says in one line what is wrong with an environment that cannot be made."""
     try:
         yield
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:

@@ -1,4 +1,4 @@
-"""A trial of an environment before anything is trained: what it shows, takes, pays and tells."""
+"""A trial before anything is trained: spaces, levels, rewards and successes of an environment."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from gymnasium.utils.passive_env_checker import check_action_space, check_observ
 
 from proposer_rl.models import callers_state
 from proposer_rl.task import named
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, check_seen
-from proposer_rl.tasks.gymnasium.attributes import read
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError, check_seen
+from proposer_rl.tasks.gymnasium.attributes import read_attribute
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
+    ParameterSettings,
     Play,
     RefusedLevelError,
     WrapperError,
@@ -29,11 +30,10 @@ from proposer_rl.tasks.gymnasium.player import (
     wrapper_error,
     wrapper_of,
 )
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings, SuccessSettings
 from proposer_rl.tasks.gymnasium.spaces import leaves
 from proposer_rl.tasks.parameters import Bins
 
-EXACT = 2**24  # up to which float32 has all whole numbers
+WHOLE_IN_FLOAT32 = 2**24  # up to which float32 has all whole numbers
 SHORT = 64  # steps of an episode in which levels are compared
 RESETS = 3  # after which a level must still be there
 
@@ -46,7 +46,7 @@ def tried(
     target: Play,
     success: SuccessSettings,
 ) -> int:
-    """Play a whole episode on a level of the target, and a short one at the ends of each parameter.
+    """Plays an episode on a level of the target, and short ones at both ends of each parameter.
 
     At the ends of a parameter's bins all others are as in the target.
 
@@ -91,7 +91,7 @@ def _check_module(env_id: str) -> None:
 
 
 def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
-    """Refuse two parameters of which one would undo the other."""
+    """Refuses two parameters of which one would undo the other."""
     taken: dict[tuple[str, str], str] = {}
     for name, given in parameters.items():
         for path in given.names(name):
@@ -115,7 +115,7 @@ def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSe
 def _check_wrappers(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
 ) -> None:
-    """Play the same twice, without wrappers and after each of them has been put around."""
+    """Plays an episode twice, without wrappers and after each of them has been put around."""
     for count in range(len(make.wrappers) + 1):
         some = replace(make, wrappers=make.wrappers[:count], as_it_is=True)
         try:
@@ -134,7 +134,7 @@ def _check_wrappers(
             if isinstance(error, RefusedLevelError | UnfitEnvironmentError):
                 raise
             raise UnfitEnvironmentError(f"it does not work: {told(error)}") from error
-        if _alike(first, second) and not hasattr(player.env, "update_running_mean"):
+        if _same_episodes(first, second) and not hasattr(player.env, "update_running_mean"):
             continue
         if count:
             raise wrapper_error(
@@ -153,7 +153,7 @@ def _check_wrappers(
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
-    """Play one episode to its end, which must tell whether it was a success."""
+    """Plays one episode to its end, which must tell whether it was a success."""
     steps = list(_played(player, limit + 1))
     success.check_told(player.told)
     *_, last = steps
@@ -170,7 +170,7 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
 
 
 def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
-    """Refuse a return above what the environment says, warn of one above what it seems to pay."""
+    """Refuses a return above what the environment says, warns of one above what it seems to pay."""
     match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
         case (_, int() | float() as highest):
             pass
@@ -191,12 +191,12 @@ def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], li
 
 
 def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
-    """Warn of fractions in the place of whole numbers, before there has been a reset."""
+    """Warns of fractions in the place of whole numbers, before there has been a reset."""
     for name, given in player.parameters.items():
         if given.set != "attribute" or not bins[name].low.is_floating_point():
             continue
         for path in given.names(name):
-            before = read(player.unwrapped, path)
+            before = read_attribute(player.unwrapped, path)
             if isinstance(before, int) and not isinstance(before, bool):
                 warnings.warn(
                     f"parameters.{name}: {path} is a whole number, {before}, and gets fractions; "
@@ -206,9 +206,9 @@ def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
 
 
 def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
-    """Set both ends of a parameter, see that they are there and stay, and that they matter.
+    """Sets both ends of a parameter, and checks that they arrive, stay, and change something.
 
-    They do, too, if the environment draws them in different ways: it may take skill to get there.
+    A change of the picture suffices, as it may take skill to meet what differs.
     """
     shown = player.observation_space, player.action_space
     episodes: list[list[_Played]] = []
@@ -230,10 +230,10 @@ def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
     first, last = (play.values[name] for play in ends)
-    if first != last and _alike(*episodes) and _look_alike(player, ends):
+    if first != last and _same_episodes(*episodes) and _look_alike(player, ends):
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
-            "same to the last digit; does it arrive?",
+            "same to the last digit: the environment may not read this parameter",
             stacklevel=2,
         )
 
@@ -260,7 +260,7 @@ class _Played(NamedTuple):
 
 
 def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
-    """The steps of an episode of random actions, the same ones every time, each one checked."""
+    """Yields the checked steps of an episode of random actions, the same ones every time."""
     numbers = np.random.default_rng(0)
     player.action_space.seed(0)
     seen, _ = player.reset()
@@ -274,7 +274,7 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
 
 
 def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
-    """An action as a policy draws it at first; of a box that is no uniform one."""
+    """Returns an action as a new policy draws it, which for a box is a normal one."""
     if not isinstance(space, spaces.Box):
         return space.sample()
     drawn = numbers.normal(size=space.shape).clip(space.low, space.high)
@@ -282,7 +282,7 @@ def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
 
 
 def _tell_misleading(space: spaces.Space[Any]) -> None:
-    """Tell what a network gets otherwise than somebody may think."""
+    """Warns of what a network gets otherwise than expected."""
     for name, part in leaves(space):
         if name.split(".")[-1] == "action_mask":
             warnings.warn(
@@ -291,15 +291,15 @@ def _tell_misleading(space: spaces.Space[Any]) -> None:
         if isinstance(part, spaces.Box) and part.dtype.kind in "iu":
             largest = max(abs(int(part.low.min())), abs(int(part.high.max())))
             whole = np.iinfo(part.dtype)
-            if EXACT < largest < max(-whole.min, whole.max):
+            if WHOLE_IN_FLOAT32 < largest < max(-whole.min, whole.max):
                 warnings.warn(
                     f"{name or 'observation'}: whole numbers up to {largest:,} lose digits beyond "
-                    f"{EXACT:,}, since a network gets them as float32",
+                    f"{WHOLE_IN_FLOAT32:,}, since a network gets them as float32",
                     stacklevel=2,
                 )
 
 
-def _alike(one: list[_Played], other: list[_Played]) -> bool:
+def _same_episodes(one: list[_Played], other: list[_Played]) -> bool:
     return len(one) == len(other) and all(
         a[1:] == b[1:] and all(map(np.array_equal, a.seen, b.seen))
         for a, b in zip(one, other, strict=True)

@@ -20,8 +20,7 @@ from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.models import own_state, population
 from proposer_rl.settings import settings, signed
 from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.networks import SolverNetwork
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 
 GATE = ("position", "width", "friction")

@@ -46,22 +46,6 @@ def odd(**members: Any) -> str:
     return name
 
 
-def rewarding(reward: Any) -> Any:
-    def step(self: Line, action: Any) -> Any:
-        seen, _, *rest = Line.step(self, action)
-        return (seen, reward, *rest)
-
-    return step
-
-
-def telling(**info: Any) -> Any:
-    return lambda self, action: (*Line.step(self, action)[:4], info)
-
-
-def showing(space: Any, seen: Any) -> dict[str, Any]:
-    return {"observation_space": space, "seen": lambda self: seen}
-
-
 def with_parts(self: Line, render_mode: str | None = None) -> None:
     """Numbers of all kinds, as simulators hold them."""
     self.render_mode = render_mode

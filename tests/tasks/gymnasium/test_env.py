@@ -13,10 +13,9 @@ from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.env import GymnasiumEnv, plays
+from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
+from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError, plays
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.gymnasium.processes import LostProcessError
-from proposer_rl.tasks.gymnasium.settings import Step, SuccessSettings
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
 
@@ -148,36 +147,29 @@ def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
         SuccessSettings(**settings).check()
 
 
-@pytest.mark.parametrize("once", [True, False])
-def test_a_success_may_be_of_the_last_step_or_of_any(once: bool) -> None:
-    """Who has been far on the left may be back at the end."""
-    rule = SuccessSettings(kind="info", key="far", once=once)
-    env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule)
-    rollout = env.rollout(10 * LIMIT, break_when_any_done=False)
-    found = set()
-    for row in rollout.reshape(K * P, -1):
-        been = False
-        for step in row["next"]:
-            far, over = bool(step["observation"][0] < -1), bool(step["done"])
-            been |= far
-            assert step["success"].item() == (over and (been if once else far))
-            found |= {(been, far)} if over else set()
-            been &= not over
-    assert found == {(True, True), (True, False), (False, False)}
+RULES = [
+    (SuccessSettings(kind="info", key="far", once=True), lambda far, rewards: any(far)),
+    (SuccessSettings(kind="info", key="far"), lambda far, rewards: far[-1]),
+    (SuccessSettings(kind="return", least=3.0), lambda far, rewards: sum(rewards) >= 3.0),
+]
 
 
-def test_returns_count_from_the_start_of_each_episode() -> None:
-    least = 3.0
-    rule = SuccessSettings(kind="return", least=least)
+@pytest.mark.parametrize(("rule", "expected"), RULES)
+def test_a_success_is_of_one_episode(rule: SuccessSettings, expected: Any) -> None:
+    """Who has been far on the left may be back at the end; returns begin anew, unscaled."""
     env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, reward_scale=0.1)
-    rollout = env.rollout(5 * LIMIT, break_when_any_done=False)
-    found = set()
+    rollout = env.rollout(10 * LIMIT, break_when_any_done=False)
+    found, last_alone = set(), set()
     for row in rollout.reshape(K * P, -1):
-        total = 0.0
-        for step in row:
-            total += 10 * step["next", "reward"].item()
-            over = step["next", "done"].item()
-            assert step["next", "success"].item() == (over and total >= least)
-            found.add((over, total >= least))
-            total = 0.0 if over else total
-    assert {(True, True), (True, False)} <= found
+        far: list[bool] = []
+        rewards: list[float] = []
+        for step in row["next"]:
+            far.append(bool(step["observation"][0] < -1))
+            rewards.append(10 * step["reward"].item())
+            over = bool(step["done"])
+            assert step["success"].item() == (over and expected(far, rewards))
+            if over:
+                found.add(step["success"].item())
+                last_alone.add(any(far) and not far[-1])
+                far, rewards = [], []
+    assert found == last_alone == {True, False}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.settings import EvaluationSettings
+from proposer_rl.tasks.gymnasium.task import EvaluationSettings
 from tests.tasks.gymnasium.toys import WALK, set_wind, walk_task
 
 K, E = 2, 5

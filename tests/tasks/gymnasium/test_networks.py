@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hypothesis import given
+from hypothesis import settings as profile
+from hypothesis import strategies as st
 from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.models import Population, draw_at, joint_categorical, normal
-from proposer_rl.tasks.gymnasium.networks import SolverNetwork
-from proposer_rl.tasks.gymnasium.settings import NetworkSettings
-from proposer_rl.tasks.gymnasium.spaces import plain
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork
+from proposer_rl.tasks.gymnasium.spaces import plain_env
 from tests.tasks.gymnasium.odd import Mixed
 
 SETTINGS = NetworkSettings(hidden=[16, 8], channels=[4, 6])
@@ -132,7 +134,7 @@ def test_what_is_seen_becomes_numbers_and_images(space: Any, shapes: Any) -> Non
     """By Gymnasium's own flattening, and pixel by pixel."""
     env: Any = gymnasium.make("Mixed-v0")
     env.unwrapped.observation_space = space
-    made = plain(env)
+    made = plain_env(env)
     shown: Any = made.observation_space
     boxes = shown.spaces if isinstance(shown, spaces.Dict) else {"observation": shown}
     assert {name: box.shape for name, box in boxes.items()} == shapes
@@ -154,3 +156,37 @@ def test_what_is_seen_becomes_numbers_and_images(space: Any, shapes: Any) -> Non
         assert np.array_equal(parts["observation"][..., 5], seen[1, ..., 2])
     else:
         assert np.array_equal(parts["observation"][..., 0], seen)
+
+
+ONE = spaces.Box(-1, 1, (1,))
+NAMES = st.sampled_from(["a", "b", "a.b", "a.0", "0", "b.a.b"])
+NESTED = st.recursive(
+    st.just(ONE),
+    lambda inner: (
+        st.dictionaries(NAMES, inner, min_size=1, max_size=4).map(spaces.Dict)
+        | st.lists(inner, min_size=1, max_size=3).map(tuple).map(spaces.Tuple)
+    ),
+    max_leaves=8,
+)
+
+
+def reordered(seen: Any) -> Any:
+    """As an environment may show it: its dictionaries in another order than the space's."""
+    if isinstance(seen, tuple):
+        return tuple(map(reordered, seen))
+    if isinstance(seen, dict):
+        return {name: reordered(part) for name, part in reversed(seen.items())}
+    return seen
+
+
+@profile(max_examples=50, deadline=None)
+@given(NESTED)
+def test_all_numbers_are_seen_whatever_their_names_are(space: Any) -> None:
+    env: Any = gymnasium.make("Mixed-v0", disable_env_checker=True)
+    env.unwrapped.observation_space = space
+    seen = space.sample()
+    env.unwrapped.seen = lambda: reordered(seen)
+    shown = plain_env(env).reset()[0]
+    assert sorted(shown) == sorted(spaces.flatten(space, seen))
+    env.unwrapped.seen = lambda: seen
+    assert list(plain_env(env).reset()[0]) == list(shown)

@@ -12,11 +12,11 @@ import pytest
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
+    ParameterSettings,
     Play,
     RefusedLevelError,
     imported,
 )
-from proposer_rl.tasks.gymnasium.settings import ParameterSettings
 from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
 
 LEVEL = {"speed": 1.25, "width": 2.0, "begin": 1, "wind": -1}
@@ -27,6 +27,9 @@ CARTPOLE = {
     "force": ParameterSettings(name="force_mag", values=[1], target=1),
     "gravity": ParameterSettings(values=[1], target=1),
 }
+
+
+STUMPED = "proposer_rl.tasks.gymnasium.stumps"
 
 
 def argument(**more: Any) -> ParameterSettings:
@@ -58,11 +61,8 @@ def test_once_it_stands_still_after_an_episode() -> None:
         last = player.reset()[0]
         for _ in range(2 * LIMIT):
             seen, reward, terminated, truncated, _ = player.step(2)
-            assert np.array_equal(seen, last) and (reward, terminated, truncated) == (
-                0,
-                False,
-                False,
-            )
+            assert np.array_equal(seen, last)
+            assert (reward, terminated, truncated) == (0, False, False)
 
 
 def steps(player: LevelPlayer, play: Play, count: int = 40) -> list[np.ndarray]:
@@ -80,38 +80,27 @@ def steps(player: LevelPlayer, play: Play, count: int = 40) -> list[np.ndarray]:
     return seen
 
 
+def numbers(*names: str, **named: str) -> dict[str, ParameterSettings]:
+    given = {**{name: name for name in names}, **named}
+    return {n: ParameterSettings(name=to, values=[1], target=1) for n, to in given.items()}
+
+
+STUMPS = ("stump_height", "stump_spacing")
+WIND = {"arguments": {"enable_wind": True}}
+CHEETAH = numbers(gravity="model.opt.gravity.2", mass="model.body_mass.1")
+ROOMS = {"size": argument(), "crossings": argument(name="num_crossings")}
+SYMBOLS = {"wrappers": ["minigrid.wrappers.ImgObsWrapper"]}
+CROSSING, TRACK = "minigrid:MiniGrid-SimpleCrossingS9N1-v0", f"{STUMPED}:BipedalStumps-v0"
+
+
 @pytest.mark.parametrize(
     ("env_id", "more", "parameters", "values"),
     [
         ("CartPole-v1", {}, CARTPOLE, [(0.5, 9.0, 5.0), (1.0, 4.0, 20.0)]),
-        (
-            "LunarLander-v3",
-            {"arguments": {"enable_wind": True}},
-            {n: ParameterSettings(values=[1], target=1) for n in ("gravity", "wind_power")},
-            [(-5.0, 10.0), (-10.0, 2.0)],
-        ),
-        pytest.param(
-            "proposer_rl.tasks.gymnasium.stumps:BipedalStumps-v0",
-            {},
-            {n: ParameterSettings(values=[1], target=1) for n in ("stump_height", "stump_spacing")},
-            [(0.5, 3.0), (2.0, 1.5)],
-            marks=NO_BOX2D,
-        ),
-        (
-            "HalfCheetah-v5",
-            {},
-            {
-                n: ParameterSettings(name=f"model.{n}", values=[1], target=1)
-                for n in ("opt.gravity.2", "body_mass.1")
-            },
-            [(-9.81, 6.0), (-6.0, 9.0)],
-        ),
-        (
-            "minigrid:MiniGrid-SimpleCrossingS9N1-v0",
-            {"wrappers": ["minigrid.wrappers.ImgObsWrapper"]},
-            {"size": argument(), "crossings": argument(name="num_crossings")},
-            [(9, 2), (7, 1)],
-        ),
+        ("LunarLander-v3", WIND, numbers("gravity", "wind_power"), [(-5.0, 10.0), (-10.0, 2.0)]),
+        pytest.param(TRACK, {}, numbers(*STUMPS), [(0.5, 3.0), (2.0, 1.5)], marks=NO_BOX2D),
+        ("HalfCheetah-v5", {}, CHEETAH, [(-9.81, 6.0), (-6.0, 9.0)]),
+        (CROSSING, SYMBOLS, ROOMS, [(9, 2), (7, 1)]),
     ],
 )
 def test_a_level_is_the_same_in_new_and_in_used_environments(
@@ -161,34 +150,22 @@ def test_continuous_actions_go_from_minus_one_to_one() -> None:
         assert ours[0] == pytest.approx(theirs[0]) and ours[1] == pytest.approx(theirs[1])
 
 
-@pytest.mark.parametrize(
-    ("parameters", "values", "message"),
-    [
-        (
-            {"lenght": ParameterSettings(values=[1], target=1)},
-            {"lenght": 1},
-            "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind",
-        ),
-        (
-            {"width": argument()},
-            {"width": -1},
-            "refuses width=-1, seed=0: ValueError: width",
-        ),
-        (
-            {"wdth": argument()},
-            {"wdth": 1},
-            "refuses wdth=1, seed=0: TypeError: .*'wdth'",
-        ),
-        (
-            {"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)},
-            {"a": 1},
-            r"refuses a=1, seed=0: TypeError: .* \(player.py, line",
-        ),
-    ],
-)
-def test_what_the_environment_refuses_is_told(parameters: dict, values: dict, message: str) -> None:
+REFUSED = [
+    (numbers("lenght"), 1,
+     "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind"),
+    ({"width": argument()}, -1, "refuses width=-1, seed=0: ValueError: width"),
+    ({"wdth": argument()}, 1, "refuses wdth=1, seed=0: TypeError: .*'wdth'"),
+    ({"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)}, 1,
+     r"refuses a=1, seed=0: TypeError: .* \(player.py, line"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("parameters", "value", "message"), REFUSED)
+def test_what_the_environment_refuses_is_told(parameters: Any, value: int, message: str) -> None:
     with pytest.raises(RefusedLevelError, match=message):
-        player = LevelPlayer(MakeEnvironment(WALK), parameters, Play(values, 0))
+        player = LevelPlayer(
+            MakeEnvironment(WALK), parameters, Play(dict.fromkeys(parameters, value), 0)
+        )
         player.reset()
         player.reset()
 
@@ -202,12 +179,8 @@ def test_what_cannot_be_imported_is_told(name: str) -> None:
 @NO_BOX2D
 def test_stumps_stand_where_they_are_asked_for() -> None:
     """As high and as far apart as the level says, by the bodies in Box2D's world."""
-    names = ("stump_height", "stump_spacing")
-    parameters = {name: ParameterSettings(values=[1.0], target=1.0) for name in names}
-    env_id = "proposer_rl.tasks.gymnasium.stumps:BipedalStumps-v0"
-    player = LevelPlayer(
-        MakeEnvironment(env_id), parameters, Play(dict(zip(names, (1.5, 4.0), strict=True)), 3)
-    )
+    play = Play(dict(zip(STUMPS, (1.5, 4.0), strict=True)), 3)
+    player = LevelPlayer(MakeEnvironment(TRACK), numbers(*STUMPS), play)
     player.reset()
     inner: Any = player.unwrapped
     boxes = [body.fixtures[0].shape.vertices for body in inner.terrain]

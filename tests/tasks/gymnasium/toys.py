@@ -12,13 +12,10 @@ import pytest
 
 from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.gymnasium.settings import (
-    EvaluationSettings,
-    NetworkSettings,
-    ParameterSettings,
-    SuccessSettings,
-)
-from proposer_rl.tasks.gymnasium.task import GymnasiumTask
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings
+from proposer_rl.tasks.gymnasium.player import ParameterSettings
+from proposer_rl.tasks.gymnasium.task import EvaluationSettings, GymnasiumTask
 
 WALK = "tests.tasks.gymnasium.toys:Walk-v0"
 LIMIT = 6

@@ -5,12 +5,9 @@ import torch
 from scipy.stats import chisquare
 
 from proposer_rl.tasks.mazes import LevelDistribution, SpecificationSpace, shortest_path_length
+from tests.draws import seeded
 
 SPACE = SpecificationSpace([0.0, 0.25, 0.5], [2, 5], height=6, width=6)
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3), 5])

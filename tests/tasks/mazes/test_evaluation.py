@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -11,8 +12,10 @@ from proposer_rl.tasks.mazes import Level, generate_levels
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
+    expected_visits,
     optimal_return,
     policy_path,
+    success_from_cells,
     worst_mean,
 )
 from tests.tasks.mazes.oracles import distances, moved, play, random_levels
@@ -302,3 +305,46 @@ def test_results_are_as_precise_as_the_logits(greedy: bool) -> None:
     for logits, told in [(torch.float64, torch.float64), (torch.float16, torch.float32)]:
         result = evaluate(level, torch.zeros(4, 1, 3, dtype=logits))
         assert {entry.dtype for entry in result.values()} == {told}
+
+
+STEPS = 9
+
+
+def chain(level: Level, policy: torch.Tensor) -> np.ndarray:
+    """Probability of moving from cell to cell, [H*W, H*W]; the goal absorbs."""
+    height, width = level.walls.shape
+    matrix = np.zeros((height * width, height * width))
+    for row, column in np.ndindex(height, width):
+        for action in range(4):
+            there = moved(level, (row, column), action)
+            there = (row, column) if level.goal.tolist() == [row, column] else there
+            chance = float(policy[action, row, column])
+            matrix[row * width + column, there[0] * width + there[1]] += chance
+    return matrix
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_they_are_those_of_the_markov_chain(seed: int) -> None:
+    level = random_levels(1, 4, 5, 0.3, seed)[0]
+    generator = torch.Generator().manual_seed(seed)
+    policy = torch.randn(4, 4, 5, generator=generator).softmax(0)
+    matrix = chain(level, policy)
+    start, goal = ((cell[0] * 5 + cell[1]).item() for cell in (level.start, level.goal))
+    success = np.linalg.matrix_power(matrix, STEPS)[:, goal].reshape(4, 5)
+    free = ~level.walls.numpy()
+    found = success_from_cells(level, policy, STEPS).numpy()
+    np.testing.assert_allclose(found[free], success[free], atol=1e-5)
+    visits = sum(np.linalg.matrix_power(matrix, step)[start] for step in range(STEPS))
+    visits[goal] = 0  # no step begins there
+    found = expected_visits(level, policy, STEPS).numpy()
+    np.testing.assert_allclose(found.ravel(), visits, atol=1e-5)
+
+
+def test_the_evaluator_tells_the_same_of_the_start() -> None:
+    for level in random_levels(5, 5, 5, 0.3, 1):
+        logits = torch.randn(4, 5, 5)
+        result = ExactEvaluator(STEPS, 0.5)(level, logits)
+        success = success_from_cells(level, logits.softmax(0), STEPS)[tuple(level.start.tolist())]
+        steps = expected_visits(level, logits.softmax(0), STEPS).sum()
+        torch.testing.assert_close(success, result["success"])
+        torch.testing.assert_close(success - 0.5 * steps, result["return"])

@@ -19,14 +19,11 @@ from proposer_rl.tasks.mazes import (
     validate_levels,
 )
 from proposer_rl.tasks.mazes.mechanisms import _open_cells
+from tests.draws import generators, seeded
 from tests.tasks.mazes.oracles import distances, path_length
 
 BINS = [(fraction / 10, length) for fraction in range(6) for length in range(2, 17, 2)]
 Cell = tuple[int, int]
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def assert_exact(levels: Level, obstacles: int, length: int) -> None:
@@ -295,10 +292,9 @@ def test_one_generator_for_each_index_draws_as_each_alone(mechanism: str, copies
     lengths = torch.tensor([[2, 12, 12, 6], [16, 16, 14, 3], [1, 1, 2, 2]])
     fractions, lengths = fractions[:copies].repeat(1, 5), lengths[:copies].repeat(1, 5)
 
-    def generators() -> list[torch.Generator]:
-        return [torch.Generator().manual_seed(seed) for seed in range(copies)]
-
-    together = generate_levels(fractions, lengths, mechanism=mechanism, generator=generators())
-    for k, generator in enumerate(generators()):
+    together = generate_levels(
+        fractions, lengths, mechanism=mechanism, generator=generators(*range(copies))
+    )
+    for k, generator in enumerate(generators(*range(copies))):
         alone = generate_levels(fractions[k], lengths[k], mechanism=mechanism, generator=generator)
         assert (together[k] == alone).all()

@@ -17,7 +17,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torchrl.envs import EnvBase, GymEnv
 
 from proposer_rl.tasks.mazes import Level, MazeEnv
-from proposer_rl.tasks.mazes.as_gymnasium import AHEAD
+from proposer_rl.tasks.mazes.as_gymnasium import LEVELS_AHEAD
 from tests.tasks.mazes.oracles import path_length, play
 
 ID = "proposer_rl/Maze-v0"
@@ -49,7 +49,7 @@ def test_gymnasiums_check_finds_nothing_not_even_a_warning(arguments: dict[str, 
 def test_levels_are_as_specified(path: Any) -> None:
     env = make(**{**EASY, "path_length": path})
     found = set()
-    for seed in [7, *[None] * (AHEAD + 4)]:
+    for seed in [7, *[None] * (LEVELS_AHEAD + 4)]:
         observation, _ = env.reset(seed=seed)
         level = env.unwrapped.level
         assert level.walls.sum() == 4
@@ -61,7 +61,7 @@ def test_levels_are_as_specified(path: Any) -> None:
 
 def test_the_seed_decides_the_levels() -> None:
     def levels(seed: int) -> list[str]:
-        drawn = [env.reset(seed=seed)] + [env.reset() for _ in range(AHEAD + 3)]
+        drawn = [env.reset(seed=seed)] + [env.reset() for _ in range(LEVELS_AHEAD + 3)]
         return [observation["planes"].tobytes() for observation, _ in drawn]
 
     env = make(**EASY)

@@ -101,68 +101,99 @@ def test_what_is_written_has_the_path_lengths() -> None:
     assert levels_to_text(levels).count("path_length: ") == 2
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "holds no levels"),
-        ("; nothing", "holds no levels"),
-        ("[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
-        ("[a]\nS.G\n..", "level 'a': a level is a rectangle"),
-        ("[a]\nS.x", "level 'a': a level holds only"),
-        ("[a]\nS..", "level 'a': a level has exactly one 'S' and one 'G'"),
-        ("[a]", "level 'a': a level is a rectangle"),
-        ("[a]\nS#G", "level 'a': the goal cannot be reached"),
-        ("[a]\npath_length: 3\nS.G", "path_length is 3, but the shortest path has 2 moves"),
-        ("[]\nS.G", "level '': a name has 1 to 80"),
-        ("[a[b]\nS.G", r"level 'a\[b': a name has 1 to 80 printable characters, no brackets"),
-        (f"[{'a' * 81}]\nS.G", "a name has 1 to 80 printable"),
-        ("[a\x1bb]\nS.G", "a name has 1 to 80 printable"),
-    ],
-)
-def test_bad_text_is_refused(text: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        levels_from_text(text)
-    (tmp_path / "bad.txt").write_text(text)
-    with pytest.raises(ValueError, match=r"bad.txt: "):
-        read_levels(tmp_path / "bad.txt")
+def serpentine(side: int) -> str:
+    """One way through all of it: every other row is a wall with a gap, at either end in turn."""
+    walls = ["#" * (side - 1) + ".", "." + "#" * (side - 1)]
+    rows = [walls[n // 2 % 2] if n % 2 else "." * side for n in range(side)]
+    return "\n".join(["S" + rows[0][1:], *rows[1:-1], rows[-1][:-1] + "G"])
+
+
+OF_TEXT = [
+    ("", "holds no levels"),
+    ("; nothing", "holds no levels"),
+    ("[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
+    ("[a]\nS.G\n..", "level 'a': a level is a rectangle"),
+    ("[a]\nS.x", "level 'a': a level holds only"),
+    ("[a]\nS..", "level 'a': a level has exactly one 'S' and one 'G'"),
+    ("[a]", "level 'a': a level is a rectangle"),
+    ("[a]\nS#G", "level 'a': the goal cannot be reached"),
+    ("[a]\npath_length: 3\nS.G", "path_length is 3, but the shortest path has 2 moves"),
+    ("[]\nS.G", "level '': a name has 1 to 80"),
+    ("[a[b]\nS.G", "level 'a[b': a name has 1 to 80 printable characters, no brackets"),
+    (f"[{'a' * 81}]\nS.G", "a name has 1 to 80 printable"),
+    ("[a\x1bb]\nS.G", "a name has 1 to 80 printable"),
+    ("S" + "." * 9_000_000 + "G", "level 'bad': 1x9,000,002 cells; at most 16,384 are read"),
+    ("S" + "." * 31_998 + "G", "level 'bad': 1x32,000 cells"),
+    (serpentine(400), "level 'bad': 400x400 cells"),
+    ("".join(f"[{i}]\nSG\n" for i in range(800_000)), "holds 800,000 levels; at most 10,000"),
+]
+OF_JSON = [
+    ("{", "is no JSON"),
+    ("[" * 100_000, "is no JSON"),
+    ("[]", 'an object with a list "levels"'),
+    ('{"levels": {}}', "levels={}: input should be a valid array"),
+    ('{"levels": []}', "holds no levels"),
+    ('{"levels": [{"name": "a"}]}', "levels.0.level: missing"),
+    ('{"levels": [{"name": 3, "level": ["S.G"]}]}', "levels.0.name=3: input should be a valid"),
+    (
+        '{"levels": [{"name": "a", "level": ["S.G"], "path_length": true}]}',
+        "levels.0.path_length=True: input should be a valid integer",
+    ),
+    (
+        '{"levels": [{"name": "a", "level": ["S.G"], "path_length": 1}]}',
+        "path_length is 1, but the shortest path has 2 moves",
+    ),
+    ('{"levels": [{"name": "a", "level": ["S.G"], "size": 3}]}', "levels.0.size: unknown"),
+    (
+        json.dumps({"levels": [{"name": "a"}] * 10_001}),
+        "holds 10,001 levels; at most 10,000 are read",
+    ),
+]
+NO_RECORDS = [
+    "{",
+    "[]",
+    "3",
+    "[" * 10_000,
+    '{"seed": 0, "levels": []}',
+    '{"seed": 0, "updates": "x", "levels": []}',
+    '{"seed": 0, "updates": Infinity, "levels": []}',
+    '{"seed": 0, "updates": 1, "levels": [{}]}',
+    '{"seed": 0, "updates": 1, "levels": [{"text": [3]}]}',
+    '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',
+]
+REFUSED = [
+    *(("bad.txt", text, message) for text, message in OF_TEXT),
+    *(("bad.json", text, message) for text, message in OF_JSON),
+    *(
+        ("bad.jsonl", f'{{"seed": 0, "updates": 1, "levels": []}}\n{line}\n', "line 2 is no record")
+        for line in NO_RECORDS
+    ),
+    ("bad.jsonl", "", "holds no levels"),
+    ("bad.csv", "", "must end in one of .txt, .json, .jsonl"),
+    ("bad.txt", b"\xff\xfe", "'utf-8' codec"),
+]
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "is no JSON"),
-        ("[" * 100_000, "is no JSON"),
-        ("[]", 'an object with a list "levels"'),
-        ('{"levels": {}}', "levels={}: input should be a valid array"),
-        ('{"levels": []}', "holds no levels"),
-        ('{"levels": [{"name": "a"}]}', "levels.0.level: missing"),
-        ('{"levels": [{"name": 3, "level": ["S.G"]}]}', "levels.0.name=3: input should be a valid"),
-        (
-            '{"levels": [{"name": "a", "level": ["S.G"], "path_length": true}]}',
-            "levels.0.path_length=True: input should be a valid integer",
-        ),
-        (
-            '{"levels": [{"name": "a", "level": ["S.G"], "path_length": 1}]}',
-            "path_length is 1, but the shortest path has 2 moves",
-        ),
-        ('{"levels": [{"name": "a", "level": ["S.G"], "size": 3}]}', "levels.0.size: unknown"),
-    ],
+    ("name", "content", "message"),
+    REFUSED,
+    ids=[f"{number}-{message}" for number, (*_, message) in enumerate(REFUSED)],
 )
-def test_bad_json_is_refused(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        levels_from_json(text)
+def test_what_holds_no_levels_is_refused(
+    name: str, content: str | bytes, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError) as caught:
+        read_levels(file)
+    assert str(caught.value).startswith(f"{file}: ") and message in str(caught.value)
 
 
-def test_bad_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"levels.csv: must end in one of .txt, .json, .jsonl"):
-        read_levels("levels.csv")
+def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"levels.jsonl: must end in one of .txt, .json$"):
         write_levels("levels.jsonl", levels_from_text(HALLS))
     with pytest.raises(OSError, match=r"cannot read .*nothing.txt: No such file"):
         read_levels(tmp_path / "nothing.txt")
-    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match=r"binary.txt: .*utf-8"):
-        read_levels(tmp_path / "binary.txt")
     monkeypatch.setattr(format_, "LARGEST_FILE_BYTES", 10)
     (tmp_path / "large.txt").write_text(HALLS)
     with pytest.raises(ValueError, match=r"large.txt: is larger than 10 bytes"):
@@ -243,61 +274,12 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "{",
-        "[]",
-        "3",
-        "[" * 10_000,
-        '{"seed": 0, "levels": []}',
-        '{"seed": 0, "updates": "x", "levels": []}',
-        '{"seed": 0, "updates": Infinity, "levels": []}',
-        '{"seed": 0, "updates": 1, "levels": [{}]}',
-        '{"seed": 0, "updates": 1, "levels": [{"text": [3]}]}',
-        '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',
-    ],
-)
-def test_a_line_that_is_no_record_is_named(line: str, tmp_path: Path) -> None:
-    (tmp_path / "a.jsonl").write_text(f'{{"seed": 0, "updates": 1, "levels": []}}\n{line}\n')
-    with pytest.raises(ValueError, match=r"a.jsonl: line 2 is no record of mazes"):
-        read_levels(tmp_path / "a.jsonl")
-    (tmp_path / "a.jsonl").write_text("")
-    with pytest.raises(ValueError, match=r"a.jsonl: holds no levels"):
-        read_levels(tmp_path / "a.jsonl")
-
-
-def serpentine(side: int) -> str:
-    """One way through all of it: every other row is a wall with a gap, at either end in turn."""
-    walls = ["#" * (side - 1) + ".", "." + "#" * (side - 1)]
-    rows = [walls[n // 2 % 2] if n % 2 else "." * side for n in range(side)]
-    return "\n".join(["S" + rows[0][1:], *rows[1:-1], rows[-1][:-1] + "G"])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("S" + "." * 9_000_000 + "G", "level 'bad': 1x9,000,002 cells; at most 16,384 are read"),
-        ("S" + "." * 31_998 + "G", "level 'bad': 1x32,000 cells"),
-        (serpentine(400), "level 'bad': 400x400 cells"),
-        ("".join(f"[{i}]\nSG\n" for i in range(800_000)), "holds 800,000 levels; at most 10,000"),
-    ],
-    ids=["large", "long", "serpentine", "many"],
-)
-def test_what_would_take_minutes_is_refused(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "bad.txt").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_levels(tmp_path / "bad.txt")
-
-
 def test_ways_that_would_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(format_, "MOST_FILE_STEPS", 9 * 9 * 48)  # cells and moves of the first
     first, both = f"[a]\n{serpentine(9)}\n", f"[a]\n{serpentine(9)}\n[b]\nSG\n"
     assert list(levels_from_text(first)) == ["a"]
     with pytest.raises(ValueError, match="level 'b': up to here, cells times moves of the"):
         levels_from_text(both)
-    with pytest.raises(ValueError, match="holds 10,001 levels; at most 10,000 are read"):
-        levels_from_json(json.dumps({"levels": [{"name": "a"}] * 10_001}))
 
 
 def test_what_never_ends_is_no_file(tmp_path: Path) -> None:

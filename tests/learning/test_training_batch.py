@@ -14,6 +14,7 @@ from torchrl.envs import GymEnv
 from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
+from tests.draws import generators
 from tests.learning import test_memory, test_ppo
 
 K = 2
@@ -36,20 +37,16 @@ def make(request: pytest.FixtureRequest) -> Callable[[PPOSettings], PPO]:
     return KINDS[request.param]
 
 
-def generators(*seeds: int) -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(seed) for seed in seeds or range(K)]
-
-
 def parts(ppo: PPO, rollout: TensorDict) -> list[TensorDict]:
     """Of the first epoch, each with its level's entries where an encoder reads them."""
     level = rollout.select(*ppo.agent.level_keys)[..., 0]
-    order = ppo._minibatches.draw(generators())["order_0_0"]
+    order = ppo._minibatches.draw(generators(*range(K)))["order_0_0"]
     return [some for some, _ in ppo._minibatches(rollout, level, order)]
 
 
 def test_each_step_is_in_one_part_of_its_own_replica(make: Callable[[PPOSettings], PPO]) -> None:
     ppo = make(replace(SETTINGS, minibatches=2))
-    rollout = ppo.collect(generators())
+    rollout = ppo.collect(generators(*range(K)))
     number = torch.arange(rollout.numel()).reshape(*rollout.shape, 1)
     rollout.set("advantage", number)
     drawn = [part["advantage"].flatten(1) for part in parts(ppo, rollout)]
@@ -61,7 +58,9 @@ def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(
     make: Callable[[PPOSettings], PPO],
 ) -> None:
     ppo = make(replace(SETTINGS, minibatches=1))
-    rollout = ppo.update(generators()).rollout  # the policy has moved on from the one that acted
+    rollout = ppo.update(
+        generators(*range(K))
+    ).rollout  # the policy has moved on from the one that acted
     rollout.set("acted_value", rollout["state_value"])
     level = rollout.select(*ppo.agent.level_keys)[..., 0]
     start, metrics, gradients = ppo.snapshot(), [], []
@@ -79,10 +78,10 @@ def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(
 def test_copies_together_are_shuffled_and_train_as_each_alone() -> None:
     settings = replace(SETTINGS, horizon=test_memory.T)
     together = test_memory.learner(settings=settings)
-    together.update(test_memory.generators())
+    together.update(generators(*range(K)))
     for k in range(K):
         alone = test_memory.learner(range(k, k + 1), settings)
-        alone.update(test_memory.generators(range(k, k + 1)))
+        alone.update(generators(k))
         for name, entry in alone.snapshot().items():
             own = together.snapshot()[name, "value"][k]
             torch.testing.assert_close(own, entry["value"][0], rtol=1e-4, atol=1e-5)
@@ -113,7 +112,7 @@ def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
     ppo = of_maze(settings, True)
     rates = []
     for update in range(6):
-        ppo.update(generators())
+        ppo.update(generators(*range(K)))
         rates.append(ppo._adam.param_groups[0]["lr"])
         if update == 1:
             ppo.restore(ppo.snapshot())
@@ -122,7 +121,7 @@ def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
             assert fresh.learning_rate == ppo.learning_rate
     assert rates == pytest.approx([1e-2 * share for share in (1, 0.75, 0.5, 0.25, 0, 0)])
     before = ppo.snapshot()
-    ppo.update(generators())
+    ppo.update(generators(*range(K)))
     for name, entry in ppo.snapshot().items():
         assert torch.equal(entry["value"], before[name, "value"])
 
@@ -130,7 +129,7 @@ def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:
 def test_the_learning_rate_falls_on_where_the_first_parameters_are_frozen() -> None:
     ppo = of_maze(replace(SETTINGS, anneal_updates=4), True)
     next(ppo.agent.parameters()).requires_grad_(False)
-    ppo.update(generators())
+    ppo.update(generators(*range(K)))
     ppo.restore(ppo.snapshot())
     assert ppo.left == 0.75
 
@@ -138,14 +137,14 @@ def test_the_learning_rate_falls_on_where_the_first_parameters_are_frozen() -> N
 def test_the_clip_falls_with_the_learning_rate() -> None:
     settings = replace(SETTINGS, anneal_updates=4, clip_epsilon=0.01, learning_rate=0.1)
     annealed = of_maze(replace(settings, anneal_clip=True), True)
-    annealed.update(generators())
+    annealed.update(generators(*range(K)))
     halved = of_maze(replace(settings, clip_epsilon=0.0075), True)
     halved.restore(annealed.snapshot())
     kept = of_maze(settings, True)
     kept.restore(annealed.snapshot())
     weights = []
     for ppo in (annealed, halved, kept):
-        ppo.update(generators())
+        ppo.update(generators(*range(K)))
         weights.append(ppo.snapshot())
     for name, entry in weights[0].items():
         torch.testing.assert_close(entry["value"], weights[1][name, "value"])
@@ -161,7 +160,7 @@ def test_a_clipped_value_loss_is_the_larger_error() -> None:
     """Of the value, and of the value moved from the old one by at most a little."""
     bound = 1e-3
     ppo = of_maze(replace(SETTINGS, minibatches=1, clip_value=bound), True)
-    rollout = ppo.update(generators()).rollout
+    rollout = ppo.update(generators(*range(K))).rollout
     rollout.set("acted_value", rollout["state_value"])
     level = rollout.select(*ppo.agent.level_keys)[..., 0]
     with torch.no_grad():

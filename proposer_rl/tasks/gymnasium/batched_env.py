@@ -1,0 +1,321 @@
+"""Environments of Gymnasium as one of TorchRL, each on its own level, in one process or several."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import CloudpickleWrapper
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
+from torchrl.envs import EnvBase
+
+from proposer_rl.models import available_cores, callers_state
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
+from proposer_rl.tasks.gymnasium.spaces import NUMBERS_ENTRY
+from proposer_rl.tasks.parameters import SEED
+
+Vectorization = Literal["sync", "async"]
+FLAGS = ("success", "is_init")  # entries that no Solver sees
+# A forked process need not import torch again, of which it has no use.
+CONTEXT: Any = multiprocessing.get_context(
+    "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+)
+
+
+class GymnasiumEnv(EnvBase):
+    """A batch of environments of Gymnasium, stepped by its vector environments.
+
+    An environment whose episode is over begins its level again, from the same seed. Observations
+    are those of :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env`, ``observation`` and perhaps
+    images; ``success``, bool [*B, 1], whether the step ended an episode that counts as one; and
+    ``is_init``, bool [*B, 1], whether the step begins one. ``reward`` is scaled.
+
+    Args:
+        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B]. Their
+            device is that of the states.
+        make: makes one environment.
+        parameters: what differs between levels, by name.
+        success: when an episode is one.
+        reward_scale: rewards are multiplied with it.
+        vectorization: one after another, or in as many processes as there are cores.
+        once: play one episode of each level, and then stand still, without reward.
+    """
+
+    def __init__(
+        self,
+        levels: TensorDictBase,
+        make: MakeEnvironment,
+        parameters: Mapping[str, ParameterSettings],
+        *,
+        success: SuccessSettings,
+        reward_scale: float = 1.0,
+        vectorization: Vectorization = "sync",
+        once: bool = False,
+    ) -> None:
+        super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
+        self._reward_scale = reward_scale
+        self._plays = plays(levels)
+        players = [
+            partial(LevelPlayer, make, parameters, play, success, once) for play in self._plays
+        ]
+        self._vector: SyncVectorEnv | ProcessVectorEnv
+        with callers_state():  # as wherever code of theirs runs
+            if vectorization == "sync":
+                self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
+            else:
+                self._vector = ProcessVectorEnv(players, available_cores())
+        self._make_specs()
+
+    def set_levels(self, levels: TensorDictBase) -> None:
+        """Sets the levels [*B] that are played from the next reset on."""
+        self._plays = plays(levels)
+        self._vector.set_attr("play", self._plays)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Closes all environments, and ends their processes."""
+        with callers_state():
+            self._vector.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        options = None if mask is None else {"reset_mask": mask.reshape(-1).cpu().numpy()}
+        with callers_state():
+            seen, _ = self._vector.reset(options=options)
+        # Of these TorchRL takes over only the entries of the environments that are reset.
+        none = np.zeros(self._vector.num_envs, np.bool_)
+        return self._batched(seen, success=none, is_init=~none)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        space = self._vector.single_action_space
+        actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
+        with callers_state():
+            seen, rewards, terminated, truncated, info = self._vector.step(actions)
+        none = np.zeros_like(terminated)
+        return self._batched(
+            seen,
+            success=info.get("success", none),
+            is_init=none,
+            reward=self._finite("reward", rewards * self._reward_scale),
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated | truncated,
+        )
+
+    def _batched(self, seen: Any, **entries: NDArray[Any]) -> TensorDict:
+        """Returns entries [n, ...] of all environments as [*B, ...], single numbers as [*B, 1]."""
+        observed = seen if isinstance(seen, dict) else {NUMBERS_ENTRY: seen}
+        numbers = {key: self._finite(key, entry) for key, entry in observed.items()}
+        tensors = {
+            key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
+            for key, entry in {**numbers, **entries}.items()
+        }
+        return TensorDict(tensors, self.batch_size).to(self.device)
+
+    def _finite(self, name: str, entry: NDArray[Any]) -> NDArray[Any]:
+        """Returns numbers [n, ...] as float32; bytes as they are.
+
+        Raises:
+            UnfitEnvironmentError: for one that is not finite, naming the level.
+        """
+        if entry.dtype == np.uint8:
+            return entry
+        numbers = entry.astype(np.float32, copy=False)
+        finite = np.isfinite(numbers)
+        if not finite.all():
+            first = int(finite.reshape(len(finite), -1).all(-1).argmin())
+            raise UnfitEnvironmentError(
+                f"{name}: NaN or infinity, or a number beyond float32, on the level "
+                f"{self._plays[first]}"
+            )
+        return numbers
+
+    def _make_specs(self) -> None:
+        batch = self.batch_size
+        acts = self._vector.single_action_space
+        seen = self._vector.single_observation_space
+        boxes = seen.spaces if isinstance(seen, spaces.Dict) else {NUMBERS_ENTRY: seen}
+        observed = {
+            name: Unbounded(
+                (*batch, *(box.shape or ())),
+                dtype=torch.uint8 if box.dtype == np.uint8 else torch.float32,
+            )
+            for name, box in boxes.items()
+        }
+        flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        flags = {name: flag.clone() for name in FLAGS}
+        self.observation_spec = Composite({**observed, **flags}, shape=batch).to(self.device)
+        if isinstance(acts, spaces.Discrete):
+            self.action_spec = Categorical(int(acts.n), shape=batch)
+        elif isinstance(acts, spaces.MultiDiscrete):
+            options = torch.as_tensor(acts.nvec)
+            self.action_spec = MultiCategorical(options, (*batch, len(options)))
+        else:
+            self.action_spec = Unbounded((*batch, *(acts.shape or ())))
+        self.action_spec = self.action_spec.to(self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(ends, shape=batch).to(self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Does nothing, as what is random belongs to the levels."""
+
+
+def plays(levels: TensorDictBase) -> list[Play]:
+    """Returns what players are to play for levels [*B], in one row."""
+    columns = {str(name): entry.flatten().tolist() for name, entry in levels.items()}
+    seeds = columns.pop(SEED)
+    return [
+        Play(dict(zip(columns, row, strict=True)), seed)
+        for seed, *row in zip(seeds, *columns.values(), strict=True)
+    ]
+
+
+def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
+    """Returns actions [n, ...] of a policy as environments of a space take them."""
+    taken = actions.cpu().numpy()
+    return taken + space.start if isinstance(space, spaces.Discrete) else taken
+
+
+class LostProcessError(RuntimeError):
+    """A process of the environments has ended; the message is one line."""
+
+    exit_code = 6
+
+
+class ProcessVectorEnv:
+    """The part of Gymnasium's vector environments that is used here, over several processes.
+
+    Which process an environment is in changes nothing that it does.
+
+    Args:
+        makes: make the environments.
+        count: processes, at most as many as environments.
+
+    Attributes:
+        num_envs: number n of environments.
+        single_observation_space, single_action_space: of each.
+        processes: that step them.
+    """
+
+    def __init__(self, makes: Sequence[Callable[[], Any]], count: int) -> None:
+        self.num_envs = len(makes)
+        self._parts = np.array_split(np.arange(len(makes)), min(count, len(makes)))
+        self._pipes: list[Connection] = []
+        self.processes = []
+        for part in self._parts:
+            ours, theirs = CONTEXT.Pipe()
+            some = [makes[index] for index in part]
+            side_by_side = partial(SyncVectorEnv, some, autoreset_mode=AutoresetMode.DISABLED)
+            make: Any = CloudpickleWrapper(side_by_side)
+            process = CONTEXT.Process(target=_serve, args=(theirs, ours, make), daemon=True)
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            self.processes.append(process)
+        found = self._ask("spaces", [()] * len(self._pipes))
+        self.single_observation_space: spaces.Space[Any] = found[0][0]
+        self.single_action_space: spaces.Space[Any] = found[0][1]
+
+    def reset(self, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode everywhere, or where the options' ``reset_mask``, bool [n], says so."""
+        parts = [(options and {"reset_mask": options["reset_mask"][part]},) for part in self._parts]
+        return _joined(self._ask("reset", parts)), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Takes a step in each environment, with actions [n, ...]."""
+        answers = self._ask("step", [(actions[part],) for part in self._parts])
+        seen, *ends, infos = zip(*answers, strict=True)
+        success = [
+            info.get("success", np.zeros(len(part), np.bool_))
+            for info, part in zip(infos, self._parts, strict=True)
+        ]
+        rewards, terminated, truncated, successes = map(np.concatenate, (*ends, success))
+        return _joined(seen), rewards, terminated, truncated, {"success": successes}
+
+    def set_attr(self, name: str, values: Sequence[Any]) -> None:
+        """Sets an attribute of each environment to its value."""
+        self._ask("set_attr", [(name, [values[i] for i in part]) for part in self._parts])
+
+    def close(self) -> None:
+        """Ends the processes."""
+        for pipe, process in zip(self._pipes, self.processes, strict=True):
+            # Processes that were forked later have the pipe, too: closing it would tell nothing.
+            with suppress(OSError):
+                pipe.send(None)
+            process.join()
+
+    def _ask(self, what: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Returns the answers of all processes, which work at the same time.
+
+        Raises:
+            Exception: what the first environment that failed has raised.
+            LostProcessError: if a process answers no more.
+        """
+        try:
+            for pipe, given in zip(self._pipes, arguments, strict=True):
+                pipe.send((what, given))
+            answers = [pipe.recv() for pipe in self._pipes]
+        except (EOFError, OSError) as error:
+            for process in self.processes:
+                process.join(1)
+            codes = [process.exitcode for process in self.processes if process.exitcode]
+            raise LostProcessError(
+                f"vectorization=async: a process of the environments was lost (exit code {codes}; "
+                "-9: killed, mostly for want of memory)"
+            ) from error
+        for failed, answer in answers:
+            if failed:
+                raise answer
+        return [answer for _, answer in answers]
+
+
+@callers_state()
+def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> None:
+    """Steps environments until the pipe is closed, or the parent is gone."""
+    parents.close()
+    # As its parent, which saves its work first, a forked process would otherwise answer signals.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    env, seen = None, None
+    while True:
+        try:
+            asked = pipe.recv()
+        except EOFError:
+            return
+        if asked is None:
+            return
+        what, given = asked
+        try:
+            env = env or make()
+            if what == "spaces":
+                answer: Any = env.single_observation_space, env.single_action_space
+            elif what == "reset":
+                # A vector environment takes no mask in which nothing is true.
+                if given[0] is None or given[0]["reset_mask"].any():
+                    seen = env.reset(options=given[0])[0]
+                answer = seen
+            else:
+                answer = getattr(env, what)(*given)
+            pipe.send((False, answer))
+        except Exception as error:
+            pipe.send((True, error))
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return np.concatenate(parts)

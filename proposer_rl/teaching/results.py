@@ -1,0 +1,188 @@
+"""What loops bring back, numbers or rollouts, as curricula observe it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.tasks.parameters import LARGEST
+
+RESULTS = ("return", "success", "score", "episodes", "steps")
+COUNTS = ("episodes", "steps")
+MOST_COUNTED = 1e15  # of these, which float64 still counts one by one
+LEVEL_ID = "level_id"
+MASK = ("collector", "mask")  # of the steps that are some, where trajectories were split
+ENDS = ("done", "terminated", "truncated", "success")
+
+
+def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
+    """Returns the outcome [K, n] that curricula observe, from results [K, n] by name.
+
+    NaN is a result that the loop did not give: a count is then 1; another result that is missing
+    for one level is left out for all.
+    """
+    outcome = {}
+    for name, result in results.items():
+        missing = np.isnan(result)
+        if name in COUNTS:
+            outcome[name] = torch.from_numpy(np.where(missing, 1, result).astype(np.int64))
+        elif not missing.any():
+            outcome[name] = torch.from_numpy(result.astype(np.float32))
+    return TensorDict(outcome, outcome["return"].shape)
+
+
+def as_array(
+    name: str, value: Any, shape: tuple[int, ...], for_all: bool = False
+) -> NDArray[np.float64]:
+    """Returns numbers as an array of a shape on the CPU, whatever they are given as.
+
+    Args:
+        name: of the argument.
+        value: the numbers; of one level without that dimension, too.
+        shape: [n] or [K, n].
+        for_all: whether one number may stand for all.
+
+    Raises:
+        ArgumentError: naming the argument, if it has another shape or a number that is not finite
+            in float32, or not allowed.
+    """
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().double()  # NumPy has no bfloat16
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        # RuntimeError: tensors with a gradient; OverflowError: an integer beyond float64.
+        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
+    if for_all and not array.ndim:
+        array = np.full(shape, array)
+    if shape[-1] == 1 and array.shape == shape[:-1]:
+        array = array[..., np.newaxis]
+    if array.shape != shape:
+        raise ArgumentError(
+            f"{name}: has shape {list(array.shape)}, but must have {list(shape)}: one number for "
+            "each level"
+        )
+    if (wrong := array[~(np.abs(array) <= LARGEST)]).size:  # results are kept in float32
+        raise ArgumentError(f"{name}={wrong[0]}: must be finite in float32")
+    check_values(name, array)
+    return array
+
+
+def as_number(name: str, value: Any) -> float:
+    """Returns one result as a number.
+
+    Raises:
+        ArgumentError: see :func:`as_array`.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        given = f"{argument(name)}={shown(value)}"
+        raise ArgumentError(f"{given}: must be a number of float32") from error
+    if not -LARGEST <= number <= LARGEST:
+        raise ArgumentError(f"{argument(name)}={number}: must be finite in float32")
+    # Arrays take a while to make; few numbers need one.
+    if name in COUNTS or (name == "success" and not 0 <= number <= 1):
+        check_values(name, np.array([number]))
+    return number
+
+
+def argument(name: str) -> str:
+    """Returns the name of the argument that a result is given as."""
+    return "return_" if name == "return" else name
+
+
+def as_ids(ids: Any) -> NDArray[np.int64]:
+    """Returns tickets as an array [n] on the CPU.
+
+    Raises:
+        ArgumentError: if they are no whole numbers [n].
+    """
+    array = np.asarray(ids.detach().cpu() if isinstance(ids, Tensor) else ids)
+    if array.size == 0:
+        return np.zeros(0, np.int64)
+    if array.ndim > 1 or array.dtype.kind not in "iu":
+        raise ArgumentError(
+            f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
+        )
+    return array.reshape(-1).astype(np.int64)
+
+
+def check_values(name: str, array: NDArray[np.float64]) -> None:
+    """Refuses what is no share of successes, or no count.
+
+    Raises:
+        ArgumentError: naming the argument.
+    """
+    if name == "success":
+        wrong, allowed = array[(array < 0) | (array > 1)], "from 0 to 1"
+    elif name in COUNTS:
+        least = int(name == "episodes")
+        wrong = array[(array < least) | (array > MOST_COUNTED) | (array % 1 != 0)]
+        allowed = f"a whole number, at least {least} and at most {MOST_COUNTED:g}"
+    else:
+        return
+    if wrong.size:
+        raise ArgumentError(f"{name}={wrong[0]:g}: must be {allowed}")
+
+
+def ended(
+    rollout: TensorDictBase, kept: TensorDictBase | None = None
+) -> tuple[NDArray[np.int64], TensorDictBase, TensorDictBase]:
+    """Returns the episodes that end in a rollout, and the steps of those that do not.
+
+    Args:
+        rollout: [*B, T] with ``level_id``, a number for each level that was begun, by which
+            parts of an episode find each other, in whichever rows they are.
+        kept: steps [L] of episodes that had not ended in the rollouts before it; None before the
+            first.
+
+    Returns:
+        Their levels' numbers [m]; a rollout [1, m, L] of whole episodes, in which what is behind
+        the end of each is no step, as ``is_step`` says: it has no reward and no end; and what is to
+        be kept for the next rollout.
+
+    Raises:
+        ArgumentError: if it does not say which levels it is of.
+    """
+    if LEVEL_ID not in rollout.keys():
+        raise ArgumentError(
+            "rollout: has no level_id, so that nothing shows on which levels its episodes "
+            "began; put LevelTransform around the environment, or give outcome_of(rollout) "
+            "where each row begins with a reset on its level"
+        )
+    steps: Any = rollout.flatten()
+    if MASK in rollout.keys(True):  # rows are filled up to one length
+        steps = steps[rollout[MASK].reshape(-1)]
+    if kept is not None:
+        # A checkpoint's tensors are on the CPU.
+        steps = torch.cat([kept.to(steps[LEVEL_ID].device), steps])
+    ids, done = (entry.reshape(-1) for entry in (steps[LEVEL_ID], steps["next", "done"]))
+    order = ids.argsort(stable=True)
+    ids, done = ids[order], done[order]
+    first = torch.ones_like(done)
+    first[1:] = done[:-1] | (ids[1:] != ids[:-1])
+    time = torch.arange(len(ids), device=ids.device)
+    begun = time.where(first, 0).cummax(0).values  # of the episode that a step belongs to
+    end = done.nonzero().squeeze(-1)
+    end = end[order[end].argsort()]  # row by row
+    start = begun[end]
+    left = steps[order[~torch.isin(begun, start)]]
+    length = (end - start + 1).max() if len(end) else 0
+    step = start.unsqueeze(1) + time[: int(length)]
+    inside = (step <= end.unsqueeze(1)).unsqueeze(-1)  # [m, L, 1]
+    episodes = steps[order[step.clamp(max=len(ids) - 1)]].unsqueeze(0)
+    after = episodes["next"]
+    for name in set(ENDS) & set(after.keys()):
+        after[name] = after[name] & inside
+    after["reward"] = after["reward"] * inside
+    episodes["is_step"] = inside.squeeze(-1).unsqueeze(0)
+    episodes.names = [None, None, "time"]
+    return ids[end].cpu().numpy(), episodes, left
