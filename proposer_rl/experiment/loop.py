@@ -33,7 +33,7 @@ from proposer_rl.task import NoSuccessError, Task
 
 @settings
 class _Counted:
-    """What a checkpoint, which may come from anybody, has counted."""
+    """The counts of a checkpoint, which are checked, since anybody may have written it."""
 
     updates: Annotated[int, Ge(0)]
     cycles: Annotated[int, Ge(0)]

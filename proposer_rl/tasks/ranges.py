@@ -221,8 +221,8 @@ def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list
         known = torch.cat([torch.zeros(1, dtype=torch.float64), reached])
         return known[torch.searchsorted(single.double(), ends.double(), right=True)]
 
-    names = [f"{one:g}" if is_real(one) else str(one) for one in values]
-    name = " or ".join(f"{n} (weight {w:g})" for n, w in zip(names, weights, strict=True))
+    pairs = zip(map(_text, values), map(_text, weights), strict=True)
+    name = " or ".join(f"{value} (weight {weight})" for value, weight in pairs)
     return Law(single[:1], single[-1:], quantile, cumulative, name)
 
 
@@ -243,7 +243,7 @@ def normal_law(
     def cumulative(ends: Tensor) -> Tensor:
         return torch.as_tensor(scipy.special.ndtr((ends.numpy() - loc) / scale))
 
-    name = f"norm(loc={loc:g}, scale={scale:g})"
+    name = f"norm(loc={_text(loc)}, scale={_text(scale)})"
     return Law(line.low[:1], line.high[-1:], quantile, cumulative, name)
 
 
@@ -296,3 +296,8 @@ def python_values(given: Any) -> Any:
 def is_real(value: Any) -> bool:
     """Returns whether a value is a number, which a truth value is not."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _text(value: Any) -> str:
+    """Returns a value with all of its digits, as states are compared by it."""
+    return str(value).removesuffix(".0") if is_real(value) else str(value)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from proposer_rl.curricula import outcome_of
+from proposer_rl.models import callers_state
 from proposer_rl.settings import ArgumentError, shown
 from proposer_rl.tasks.parameters import LARGEST
 
@@ -131,6 +133,22 @@ def check_values(name: str, array: NDArray[np.float64]) -> None:
         return
     if wrong.size:
         raise ArgumentError(f"{name}={wrong[0]:g}: must be {allowed}")
+
+
+def outcome_of_rollout(rollout: TensorDictBase, rule: Any) -> TensorDict:
+    """Returns the outcome [K, n] of a rollout [K, n, T], without success where nothing says it.
+
+    Args:
+        rollout: with ``success`` in its ``next``, or without.
+        rule: an entry or a function of ``next`` that then says it; None for none.
+    """
+    rollout, after = rollout.copy(), rollout["next"].copy()
+    if "success" not in after.keys() and rule is not None:
+        with callers_state():
+            after["success"] = rule(after) if callable(rule) else after[rule]
+    rollout["next"] = after
+    outcome = outcome_of(rollout)
+    return outcome if "success" in after.keys() else outcome.exclude("success")
 
 
 def ended(

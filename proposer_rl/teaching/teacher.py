@@ -17,10 +17,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from proposer_rl.curricula import Curriculum, Student, outcome_of, require
+from proposer_rl.curricula import Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
-from proposer_rl.models import callers_state, own_state
+from proposer_rl.models import own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, whole
@@ -40,6 +40,7 @@ from proposer_rl.teaching.results import (
     as_number,
     as_outcome,
     ended,
+    outcome_of_rollout,
 )
 from proposer_rl.teaching.spaces import LevelSpace
 from proposer_rl.teaching.tally import Tally
@@ -472,18 +473,9 @@ class Teacher:
                 f"{len(ids)} levels of {self.students} student(s)"
             )
         parts = self._ledger.find(ids)
-        rollout, after = rollout.copy(), rollout["next"].copy()
-        known = "success" in after.keys()
-        if not known and self._success is not None:
-            rule = self._success
-            with callers_state():
-                after["success"] = rule(after) if callable(rule) else after[rule]
-            known = True
+        outcome = outcome_of_rollout(rollout, self._success)
+        known = "success" in outcome.keys()
         self._require_success(known, "give Teacher(success=...), or the rollout a next success")
-        rollout["next"] = after
-        outcome = outcome_of(rollout)
-        if not known:
-            outcome = outcome.exclude("success")
         numbers = {
             name: as_array(name, outcome[name], tuple(outcome.batch_size))
             for name in (("return", "success") if known else ("return",))

@@ -285,14 +285,18 @@ def test_with_staleness_alone_every_level_comes_up() -> None:
         assert int(seen.diff().max()) <= 5 * 20
 
 
+def counts_of(slots: Tensor, shares: list[float]) -> Tensor:
+    """Draws of each of five slots, which follow the shares."""
+    expected, counts = slots.numel() * torch.tensor(shares), slots[0].bincount(minlength=5)
+    assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
+    return counts
+
+
 def test_draws_without_staleness_follow_the_shares() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, rule)
     slots = draw_slots(buffer, 20_000, rule, [torch.Generator().manual_seed(0)])
-    expected = 20_000 * torch.tensor(BY_SCORE["rank, T = 1"][1])
-    counts = slots[0].bincount(minlength=5)
-    assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
-    assert buffer["draws"][0, :5].equal(counts)
+    assert buffer["draws"][0, :5].equal(counts_of(slots, BY_SCORE["rank, T = 1"][1]))
 
 
 def test_copies_do_not_see_each_other() -> None:
@@ -344,9 +348,7 @@ def test_many_draws_at_once_follow_scores_and_ages() -> None:
     buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, RANK)
     buffer["touched"][0, :5] = buffer["clock"][0, 0] - AGE
     slots = draw_slots(buffer, 20_000, RANK, [torch.Generator().manual_seed(0)])
-    expected = 20_000 * torch.tensor(TOGETHER[1.0][0])
-    counts = slots[0].bincount(minlength=5)
-    assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
+    counts_of(slots, TOGETHER[1.0][0])
     last = [20_000 - int(slots[0].flip(0).eq(slot).nonzero()[0]) for slot in range(5)]
     assert (buffer["touched"][0, :5] - 5).tolist() == last
 

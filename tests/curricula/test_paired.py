@@ -54,11 +54,6 @@ def test_the_antagonist_trains_on_the_same_levels_with_its_own_chance() -> None:
     assert (plain.snapshot() == curriculum.antagonist.snapshot()).all()
 
 
-def test_it_learns_from_one_solver() -> None:
-    with pytest.raises(ValueError, match="learns from one Solver, got 2"):
-        live(paired(), solvers([0, 1]), [0, 1], range(1))
-
-
 def test_it_has_no_second_solver_whose_episodes_go_on() -> None:
     ppo = PPOSettings(horizon=8, continue_episodes=True)
     task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))

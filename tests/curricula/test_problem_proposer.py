@@ -49,17 +49,13 @@ def agent() -> ActorCritic:
     return proposer_actor_critic(network, categorical)
 
 
+def ppo(**settings: Any) -> PPOSettings:
+    return PPOSettings(**{"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings})
+
+
 def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
-    chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
-    return FirstOrderProposer(
-        task.space,
-        task.target,
-        agent(),
-        PPOSettings(**chosen),
-        probe_levels=2,
-        target_levels=3,
-        measure="return",
-    )
+    own = task.space, task.target, agent(), ppo(**settings)
+    return FirstOrderProposer(*own, probe_levels=2, target_levels=3, measure="return")
 
 
 def filtered(curriculum: Curriculum, times: int) -> Curriculum:
@@ -166,11 +162,8 @@ def sampled(**settings: Any) -> SampledFirstOrderProposer:
     """On bins in a row."""
     task = Seen(1, WANTED)
     task.space.coordinates = torch.arange(float(BINS)).unsqueeze(1)
-    chosen = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
-    ppo, even = PPOSettings(**chosen), torch.ones(BINS)
-    return SampledFirstOrderProposer(
-        task.space, task.target, agent(), ppo, even, probe_levels=2, probes=1, measure="return"
-    )
+    own = task.space, task.target, agent(), ppo(**settings), torch.ones(BINS)
+    return SampledFirstOrderProposer(*own, probe_levels=2, probes=1, measure="return")
 
 
 # Every level's episodes are aligned as its bin is wanted.

@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.curricula.progress import (
-    LearningProgressCurriculum,
-    progress_shares,
-    stretched,
-)
+from proposer_rl.curricula.progress import LearningProgressCurriculum, progress_shares
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError
 from tests.curricula.scripted import Scripted, reached, step
@@ -58,11 +54,6 @@ def test_a_first_look_shows_no_progress_and_all_bins_are_alike() -> None:
     task = Scripted(torch.tensor([[0.1, 0.9, 0.4, 0.0]]), batch_size=8)
     curriculum = LearningProgressCurriculum(task.space)
     assert step(curriculum, task, 0)[0].bincount(minlength=N).tolist() == [2] * N
-
-
-def test_small_success_is_stretched() -> None:
-    found = stretched(torch.tensor([0.0, 0.1, 0.5, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(found, torch.tensor([0, 0.5, 0.9, 1], dtype=torch.float64))
 
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=2, max_size=8), st.floats(0, 1))

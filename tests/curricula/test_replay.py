@@ -338,21 +338,14 @@ def test_levels_with_nested_entries_are_restored() -> None:
     assert (again.buffer == curriculum.buffer).all()
 
 
-def test_where_no_episode_ends_nothing_can_be_replayed() -> None:
-    whole = solvers([0])
-    learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
-    with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
-        live(robust(), learner, [0], range(1))
-
-
-def test_new_levels_are_trained_on_whether_they_have_scores_or_not() -> None:
+def test_where_no_episode_ends_new_levels_are_trained_on_and_none_is_replayed() -> None:
     whole = solvers([0])
     learner = PPO(whole.env, whole.agent, replace(whole.settings, horizon=1))
     curriculum = replay(train_on_new=True, replay_probability=1e-6)
     assert len(live(curriculum, learner, [0], range(4)).levels) == 4
-    curriculum = replay(train_on_new=True, replay_probability=1.0)
-    with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
-        live(curriculum, learner, [0], range(4))
+    for curriculum in (robust(), replay(train_on_new=True, replay_probability=1.0)):
+        with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
+            live(curriculum, learner, [0], range(4))
 
 
 def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:

@@ -43,20 +43,16 @@ def test_it_selects_every_few_updates_and_says_what_that_costs() -> None:
     assert len(told["levels"]["highest scores"]) == 6
 
 
-def test_what_is_mastered_or_hopeless_is_not_kept_while_there_is_else() -> None:
-    curriculum = selection(keep=3)
+def test_the_best_that_have_a_score_are_kept() -> None:
+    """Levels without one, as where no episode ends within the horizon, are not trained on."""
+    curriculum, few = selection(keep=3), torch.full((1, 16), -torch.inf)
     found = torch.tensor([[0.0, 0.25, 0.0, 0.2, 0.0, -torch.inf, 0.1] + [0.0] * 9])
     curriculum.scorer = GivenScores(found)
     curriculum.propose(student(0), P, [Streams(0)])
     assert curriculum.scores[0].tolist() == pytest.approx([0.25, 0.2, 0.1])
-
-
-def test_fewer_scores_than_are_kept_are_told() -> None:
-    """Levels without one, as where no episode ends within the horizon, are not trained on."""
+    few[0, :2] = 0.1
     curriculum = selection(keep=3)
-    found = torch.full((1, 16), -torch.inf)
-    found[0, :2] = 0.1
-    curriculum.scorer = GivenScores(found)
+    curriculum.scorer = GivenScores(few)
     with pytest.raises(DivergedError, match=r"on 2 of 16 .* fewer than 3 have"):
         curriculum.propose(student(0), P, [Streams(0)])
 

@@ -181,7 +181,7 @@ class SuccessSettings:
             value, f"success.key={self.key}: the entry of the info"
         )
 
-    def check_told(self, info: Mapping[str, Any]) -> None:
+    def check_info(self, info: Mapping[str, Any]) -> None:
         """Refuses the last info of an episode that does not say whether that was a success.
 
         Raises:

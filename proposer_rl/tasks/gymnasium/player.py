@@ -68,7 +68,7 @@ class WrapperError(ValueError):
 def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> WrapperError:
     """Returns what is wrong with a wrapper, as an error that another process can send."""
     name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
-    return WrapperError(f"wrappers: {name}: {error if isinstance(error, str) else told(error)}")
+    return WrapperError(f"wrappers: {name}: {error if isinstance(error, str) else cause(error)}")
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         once: stand still after the first episode of a level, for evaluations.
 
     Attributes:
-        told: the last info.
+        last_info: that of the last reset or step.
     """
 
     _seen: Any  # at last
@@ -170,7 +170,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         ]
         self.play = play
         super().__init__(self._built())
-        self.told: Mapping[str, Any] = {}
+        self.last_info: Mapping[str, Any] = {}
 
     @property
     def play(self) -> Play:
@@ -200,7 +200,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._set_up()
         given = self._named("option")
         try:
-            self._seen, self.told = self.env.reset(
+            self._seen, self.last_info = self.env.reset(
                 seed=self._play.seed, **({"options": given} if given else {})
             )
         except UnfitEnvironmentError:
@@ -217,13 +217,13 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             answer = stepped(self.env.step(action))
         except Exception as error:  # whatever an environment of somebody's may raise
             unfit = isinstance(error, UnfitEnvironmentError)
-            said = str(error) if unfit else f"step raises {told(error)}"
+            said = str(error) if unfit else f"step raises {cause(error)}"
             raise UnfitEnvironmentError(f"{said}, on the level {self._play}") from error
-        self._seen, reward, terminated, truncated, self.told = answer
+        self._seen, reward, terminated, truncated, self.last_info = answer
         self._return += reward
         over, rule = terminated or truncated, self._success
         if rule is not None and (over or rule.once):
-            step = Step(terminated, truncated, self.in_time, self._return, self.told)
+            step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
             self._succeeded = rule(step) or self._succeeded
         info = {"success": True} if over and self._succeeded else {}
         return self._seen, reward, terminated, truncated, info
@@ -263,7 +263,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         except Exception as error:
             if self._arguments:
                 raise self._refused(error) from error
-            raise UnfitEnvironmentError(f"it cannot be made: {told(error)}") from error
+            raise UnfitEnvironmentError(f"it cannot be made: {cause(error)}") from error
 
     def _named(self, way: str) -> dict[str, float]:
         """Returns the values that are set in one way, by the names that they have there."""
@@ -272,7 +272,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _refused(self, error: Exception) -> RefusedLevelError:
         return RefusedLevelError(
-            f"parameters: {self.make.env_id} refuses {self._play}: {told(error)}"
+            f"parameters: {self.make.env_id} refuses {self._play}: {cause(error)}"
         )
 
 
@@ -311,7 +311,7 @@ def imported(name: str) -> Callable[..., Any]:
     return result
 
 
-def told(error: Exception) -> str:
+def cause(error: Exception) -> str:
     """Returns an environment's exception as part of a line, with the place that raised it."""
     *_, last = traceback.extract_tb(error.__traceback__)
     reason = " ".join(str(error).split()) or "no reason given"

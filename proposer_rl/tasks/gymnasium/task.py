@@ -44,7 +44,7 @@ from proposer_rl.tasks.gymnasium.player import (
     MakeEnvironment,
     ParameterSettings,
     WrapperSettings,
-    told,
+    cause,
 )
 from proposer_rl.tasks.gymnasium.trial import tried
 from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
@@ -297,7 +297,7 @@ class GymnasiumTask(Task):
                 self._try_transforms(level, network, list(seen))
         except fails as error:
             kind = "transforms" if self._transforms else "network"
-            raise ValueError(f"{kind}: {told(error)}") from error
+            raise ValueError(f"{kind}: {cause(error)}") from error
         for name in ("channels", "image"):
             given = getattr(self._network, name)
             if given is not None and all(spec.ndim == 1 for spec in seen.values()):

@@ -25,8 +25,8 @@ from proposer_rl.tasks.gymnasium.player import (
     Play,
     RefusedLevelError,
     WrapperError,
+    cause,
     imported,
-    told,
     wrapper_error,
     wrapper_of,
 )
@@ -87,7 +87,7 @@ def _check_module(env_id: str) -> None:
     except ImportError:
         raise
     except Exception as error:  # whatever somebody's module may raise
-        raise UnfitEnvironmentError(f"its module cannot be imported: {told(error)}") from error
+        raise UnfitEnvironmentError(f"its module cannot be imported: {cause(error)}") from error
 
 
 def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
@@ -123,7 +123,7 @@ def _check_wrappers(
             check_observation_space(player.observation_space)
             check_action_space(player.action_space)
             if count == len(make.wrappers):
-                _tell_misleading(player.observation_space)
+                _warn_of_misleading(player.observation_space)
             first, second = (list(_played(player, SHORT)) for _ in range(2))
             player.close()
         except (ImportError, gymnasium.error.Error, WrapperError):
@@ -133,7 +133,7 @@ def _check_wrappers(
                 raise wrapper_error(make.wrappers[count - 1], error) from error
             if isinstance(error, RefusedLevelError | UnfitEnvironmentError):
                 raise
-            raise UnfitEnvironmentError(f"it does not work: {told(error)}") from error
+            raise UnfitEnvironmentError(f"it does not work: {cause(error)}") from error
         if _same_episodes(first, second) and not hasattr(player.env, "update_running_mean"):
             continue
         if count:
@@ -155,7 +155,7 @@ def _check_wrappers(
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
     """Plays one episode to its end, which must tell whether it was a success."""
     steps = list(_played(player, limit + 1))
-    success.check_told(player.told)
+    success.check_info(player.last_info)
     *_, last = steps
     early = last.truncated and player.in_time
     if success.kind == "survived" and early:
@@ -281,7 +281,7 @@ def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
     return drawn.astype(space.dtype)
 
 
-def _tell_misleading(space: spaces.Space[Any]) -> None:
+def _warn_of_misleading(space: spaces.Space[Any]) -> None:
     """Warns of what a network gets otherwise than expected."""
     for name, part in leaves(space):
         if name.split(".")[-1] == "action_mask":

@@ -121,7 +121,7 @@ def test_a_target_may_be_any_distribution(range_: dict, target: dict, mass: Any)
 
 
 def norm_mass(low: float, high: float, loc: float, scale: float) -> float:
-    """Of a normal distribution that is cut off at -4 and 4, where what is beyond lies."""
+    """Returns the mass of a normal cut off at -4 and 4, where what is beyond lies."""
     below = [0.5 + 0.5 * math.erf((end - loc) / scale / 2**0.5) for end in (low, high)]
     return (1.0 if high == 4.0 else below[1]) - (0.0 if low == -4.0 else below[0])
 

@@ -187,32 +187,6 @@ def test_pictures_show_the_level_and_the_episode(
     assert still[0]["level"]["seed"] == int(levels["seed"][0, 0])
 
 
-@pytest.mark.parametrize("image", [False, True])
-def test_of_images_and_continuous_actions_it_learns(image: bool) -> None:
-    walls = ["minigrid.wrappers.ImgObsWrapper"]
-    size = ParameterSettings(set="argument", name="goal_velocity", values=[0.0], target=0.0)
-    changed: dict[str, Any] = {"env_id": "MountainCarContinuous-v0", "parameters": {"goal": size}}
-    if image:
-        size = ParameterSettings(set="argument", values=[5, 6], target=6)
-        changed = {
-            "env_id": "minigrid:MiniGrid-Empty-5x5-v0", "wrappers": walls,
-            "parameters": {"size": size}, "max_steps": 8,
-        }  # fmt: skip
-    network = NetworkSettings(hidden=[8], channels=[4] if image else None)
-    task = walk_task(network=network, **changed)
-    learner = task.learner([Streams(0), Streams(1)])
-    before = learner.snapshot()
-    levels = task.target.sample(8, Streams(0).generator()).reshape(2, 4)
-    learner.env.set_levels(levels)
-    draws = [Streams(copy).generator() for copy in range(2)]
-    rollout, _ = learner.update(draws)
-    learner.check()
-    assert not (learner.snapshot() == before).all()
-    if not image:
-        assert rollout["action"].shape == (2, 4, 8, 1) and rollout["action"].std() > 0.3
-        assert task.probe(learner.agent, levels[0]).shape == (2, 4, 1)
-
-
 @pytest.mark.parametrize(
     ("name", "shape", "answers"),
     [
@@ -296,7 +270,7 @@ def test_levels_can_be_seeds_alone_of_separate_sets() -> None:
 
 
 def test_single_levels_are_of_the_seeds_that_are_measured_on() -> None:
-    """Of an environment that pays for the seeds below 3 alone."""
+    """The environment pays for the seeds below 3 alone."""
 
     def reset(self: Any, *, seed: Any = None, options: Any = None) -> Any:
         self.pays = float(seed < 3)

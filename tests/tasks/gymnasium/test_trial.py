@@ -256,6 +256,19 @@ def test_wrappers_that_begin_anew_with_each_episode_are_welcome() -> None:
     assert env.observation_spec["observation"].shape == (1, 4, 9)  # 3 times x, the goal, the time
 
 
+DRAWS = {"metadata": {"render_modes": ["rgb_array"]}}
+
+
+def hill(colour: int) -> dict[str, Any]:
+    """A hill too far away for a short episode, which is there to be seen if it has a colour."""
+    return {
+        **DRAWS,
+        "hill": 1.0,
+        "render": lambda self: np.full((8, 8, 3), colour * self.hill, np.uint8),
+    }
+
+
+HILL = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
 FRACTIONS = {"goal": ParameterSettings(low=1.0, high=3.0, target=3.0)}
 MASKED = spaces.Dict({"x": spaces.Box(0, 1, (1,)), "action_mask": spaces.MultiBinary(2)})
 WIDE = spaces.Box(0, 2**30, (2,), np.int64)
@@ -266,6 +279,8 @@ WHOLE = {"goal": ParameterSettings(values=[1, 3], target=3)}
 DOUBTED: list[tuple[Any, Any, str | None]] = [
     ({}, IGNORED, "parameters.typo: .* may not read this parameter"),
     ({}, GOAL, None),
+    (hill(0), HILL, "parameters.hill: .* may not read this parameter"),
+    (hill(50), HILL, None),
     ({"goal": 3}, FRACTIONS, "parameters.goal: goal is a whole number, 3, and gets"),
     ({}, FRACTIONS, None),
     ({"goal": 3}, WHOLE, None),
@@ -407,26 +422,6 @@ def test_a_wrapper_that_fails_after_the_trial_is_blamed(vectorization: Any) -> N
         task.environment(level)
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("drawn", [True, False])
-def test_what_is_only_drawn_arrives(drawn: bool) -> None:
-    """What lies far away is not met in a short episode, but it is there to be seen."""
-    hill = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
-    warned = pytest.warns(UserWarning, match="parameters.hill: .* may not read this parameter")
-    with nullcontext() if drawn else warned:
-        line_task(
-            odd(
-                metadata={"render_modes": ["rgb_array"]},
-                hill=1.0,
-                render=lambda self: np.full((8, 8, 3), 50 * self.hill * drawn, np.uint8),
-            ),
-            parameters=hill,
-        )
-
-
-DRAWS = {"metadata": {"render_modes": ["rgb_array"]}}
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "members",
@@ -470,22 +465,41 @@ def test_actions_arrive_as_they_were_meant() -> None:
         assert inner.action_space.contains(inner.taken)
 
 
-@pytest.mark.parametrize("memory", [None, 8])
-@pytest.mark.parametrize("env_id", ["Grey-v0", "Mixed-v0", "Robot-v0"])
-def test_of_all_spaces_it_learns_with_memory_and_without(env_id: str, memory: int | None) -> None:
-    channels = None if env_id == "Robot-v0" else [4]
+def of(name: str, *values: float) -> dict[str, Any]:
+    """An environment of an argument's values, in which episodes that end are successes."""
+    given = ParameterSettings(set="argument", name=name, values=[*values], target=values[-1])
+    rule = SuccessSettings(kind="terminated")
+    return {"parameters": {"a": given}, "success": rule, "max_steps": 8}
+
+
+ROOM = {"wrappers": ["minigrid.wrappers.ImgObsWrapper"], **of("size", 5, 6)}
+LEARNT: list[tuple[str, list[int] | None, int | None, dict[str, Any]]] = [
+    *((f"tests.tasks.gymnasium.odd:{name}-v0", channels, memory, {})
+      for name, channels in (("Grey", [4]), ("Mixed", [4]), ("Robot", None))
+      for memory in (None, 8)),
+    ("MountainCarContinuous-v0", None, None, of("goal_velocity", 0.0)),
+    ("minigrid:MiniGrid-Empty-5x5-v0", [4], None, ROOM),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("env_id", "channels", "memory", "more"), LEARNT)
+def test_of_all_spaces_it_learns_with_memory_and_without(
+    env_id: str, channels: Any, memory: int | None, more: Any
+) -> None:
     network = NetworkSettings(hidden=[8], channels=channels, memory=memory)
-    task = line_task(f"tests.tasks.gymnasium.odd:{env_id}", network=network)
+    task = line_task(env_id, network=network, **more)
     learner = task.learner([Streams(0), Streams(1)])
     before = learner.snapshot()
     levels = task.target.sample(8, Streams(0).generator()).reshape(2, 4)
     learner.env.set_levels(levels)
-    learner.update([Streams(copy).generator() for copy in range(2)])
+    rollout, _ = learner.update([Streams(copy).generator() for copy in range(2)])
     learner.check()
-    after = learner.snapshot()
-    assert not any((after[key] == before[key]).all() for key in ("parameters",) if key in after)
-    measured = task.measure(learner.agent)
-    assert measured.batch_size == (2,) and task.probe(learner.agent, levels[0]).shape[:2] == (2, 4)
+    assert not (learner.snapshot() == before).all()
+    if channels is None:  # continuous actions
+        assert rollout["action"].shape == (2, 4, 8, *task._acts.shape)
+        assert rollout["action"].std() > 0.3
+    assert task.measure(learner.agent).batch_size == (2,)
+    assert task.probe(learner.agent, levels[0]).shape[:2] == (2, 4)
     alone = task.learner([Streams(0)])
     assert alone.agent.distribution_class is learner.agent.distribution_class
 
