@@ -41,25 +41,25 @@ def make_curriculum(
         named, asked = curriculum.name, _settings(curriculum)
         own = asked.pop("curriculum")
         try:
-            curriculum = make(resolve_name(own.pop("_target_")), own, run)
+            made: Curriculum = make(resolve_name(own.pop("_target_")), own, run)
         except UnfitTaskError as error:
             raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
     else:
-        named, own = of_classes(curriculum), {}
-    if isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas:
+        made, named, own = curriculum, of_classes(curriculum), {}
+    if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
-            f"curriculum={type(curriculum).__name__}: trains replicas of the learner; use "
+            f"curriculum={type(made).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
     if filter is not None:
         asked = merged(asked, filter_content(filter))
     around = {key: asked[key] for key in ("filter", "model") if asked.get(key) is not None}
     if "filter" in around:
-        curriculum = filtered(curriculum, around["filter"], run)
+        made = filtered(made, around["filter"], run)
     if "model" in around:
-        curriculum = modelled(curriculum, around["model"], run)
+        made = modelled(made, around["model"], run)
     described = json.dumps(plain({"kind": named, **own, **around}), default=_name)
-    return curriculum, json.loads(described)
+    return made, json.loads(described)
 
 
 def _settings(recipe: Recipe) -> dict[str, Any]:
