@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import scipy  # whose functions are loaded where they are asked for
 import torch
@@ -164,6 +164,9 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
     """
     given = python_values(given)
     if isinstance(given, Mapping):
+        name = given.get("distribution", "norm")
+        if name != "norm":
+            raise ArgumentError(f"{key}.distribution={shown(name)}: must be norm")
         law = normal_law if "distribution" in given else weighted_law
         try:
             return law(line, **arguments(law, given, ("line",)))
@@ -226,16 +229,16 @@ def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list
     return Law(single[:1], single[-1:], quantile, cumulative, name)
 
 
-def normal_law(
-    line: Bins, distribution: Literal["norm"], loc: float = 0.0, scale: Positive = 1.0
-) -> Law:
+def normal_law(line: Bins, distribution: str, loc: float = 0.0, scale: Positive = 1.0) -> Law:
     """Returns a normal distribution on a continuous range, cut off at its ends.
 
     Raises:
         ArgumentError: of choices or whole numbers.
     """
     if not line.wide or not line.low.is_floating_point():
-        raise ArgumentError("distribution=norm: of a continuous range only; weigh values instead")
+        raise ArgumentError(
+            f"distribution={distribution}: of a continuous range only; weigh values instead"
+        )
 
     def quantile(shares: Tensor) -> Tensor:
         return torch.as_tensor(scipy.special.ndtri(shares.numpy()) * scale + loc)
