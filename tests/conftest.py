@@ -42,6 +42,13 @@ def pytest_configure() -> None:
             import_module(name)
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.parent == Path(__file__).parent / "research":
+            item.add_marker("research")
+
+
 def pytest_collection_finish() -> None:
     """Where tests run; the process that only deals them out to others imports nothing for them."""
     import torch
