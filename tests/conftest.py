@@ -99,6 +99,19 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
     running.close()
 
 
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two Solvers side by side in mazes, three checkpoints. Who changes the folder takes a copy."""
+    from tests.commands import trained_run
+
+    return trained_run(
+        tmp_path_factory.mktemp("runs") / "trained",
+        *("+method=target", "+scale=smoke", "compute.progress=false", "seeds=[3,5]"),
+        *("task.evaluation.levels=40", "schedule.keep_checkpoints=100"),
+        "schedule.checkpoint_every=2",
+    )
+
+
 @pytest.fixture
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Works in a folder of its own."""
