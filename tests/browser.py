@@ -19,10 +19,18 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromi
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """The browser, as Playwright drives it."""
-    from playwright.sync_api import sync_playwright
+    """The browser, as Playwright drives it; on a machine that is busy nothing comes too late."""
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=0)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=0)
         yield browser
         browser.close()
+
+
+def new_context(browser: Any, **options: Any) -> Any:
+    """A context of the browser that waits as long as it takes."""
+    context = browser.new_context(**options)
+    context.set_default_timeout(0)
+    return context

@@ -34,12 +34,6 @@ def trained_run(folder: Path, *arguments: str) -> Path:
     return folder
 
 
-def trained_pair(folder: Path) -> Path:
-    """The folder of two Solvers that were trained side by side."""
-    settings = ["compute.progress=false", "seeds=[3,5]", "task.evaluation.levels=40"]
-    return trained_run(folder, "+method=target", "+scale=smoke", *settings)
-
-
 def _forget_loggers() -> None:
     """Hydra's loggers write to what stood for the terminal in the test that called the command."""
     for logger in (logging.getLogger(), logging.getLogger("hydra")):

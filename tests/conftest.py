@@ -42,6 +42,13 @@ def pytest_configure() -> None:
             import_module(name)
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.parent == Path(__file__).parent / "research":
+            item.add_marker("research")
+
+
 def pytest_collection_finish() -> None:
     """Where tests run; the process that only deals them out to others imports nothing for them."""
     import torch
@@ -90,6 +97,19 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
     running = Processes(tmp_path_factory.mktemp("processes"))
     yield running
     running.close()
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two Solvers side by side in mazes, three checkpoints. Who changes the folder takes a copy."""
+    from tests.commands import trained_run
+
+    return trained_run(
+        tmp_path_factory.mktemp("runs") / "trained",
+        *("+method=target", "+scale=smoke", "compute.progress=false", "seeds=[3,5]"),
+        *("task.evaluation.levels=40", "schedule.keep_checkpoints=100"),
+        "schedule.checkpoint_every=2",
+    )
 
 
 @pytest.fixture

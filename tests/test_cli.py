@@ -23,12 +23,26 @@ from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted
+from tests.commands import trained_run
 from tests.same_run import tables
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 SMOKE = ["+scale=smoke", "compute.progress=false"]
 FEW = [*SMOKE, "schedule.updates=2"]
+COMMAND = ["+method=target", *FEW, "hydra.run.dir=run"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that has come to its end."""
+    return trained_run(tmp_path_factory.mktemp("finished") / "run", *COMMAND[:-1])
+
+
+@pytest.fixture
+def run(finished: Path, own_folder: None) -> Path:
+    """A copy of it, where the command leaves its own."""
+    return Path(shutil.copytree(finished, "run"))
 
 
 @pytest.mark.parametrize("method", ["perf_gain", "task_difficulty"])
@@ -57,10 +71,8 @@ def test_a_run_leaves_its_measurements(method: str, train, capsys) -> None:
     assert "not reached in 6 updates (censored)" in said and "run.png" in said
 
 
-@pytest.mark.pictures
-def test_a_run_ends_with_its_picture(train) -> None:
-    assert train("+method=target", *FEW, "hydra.run.dir=run") == 0
-    assert Path("run/run.png").stat().st_size > 10_000
+def test_a_run_ends_with_its_picture(finished: Path) -> None:
+    assert (finished / "run.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
@@ -113,41 +125,39 @@ def test_what_a_proposer_has_learnt_is_a_file_of_its_own(method: str, train) -> 
         assert tables(Path(name)) == tables(Path("of_run"))
 
 
-def test_a_finished_run_can_be_made_longer_but_not_changed(train, capsys) -> None:
-    arguments = ["+method=target", *FEW, "hydra.run.dir=run"]
-    assert train(*arguments) == 0
-    assert train(*arguments, "schedule.updates=4") == 0
-    assert [row["updates"] for row in read_csv("run/metrics.csv")] == [0, 2, 4]
-    before = tables(Path("run"))
-    assert train(*arguments, "solver.ppo.gamma=0.5") == 2
+def test_a_finished_run_can_be_made_longer_but_not_changed(run: Path, train, capsys) -> None:
+    assert train(*COMMAND, "schedule.updates=4") == 0
+    assert [row["updates"] for row in read_csv(run / "metrics.csv")] == [0, 2, 4]
+    before = tables(run)
+    assert train(*COMMAND, "solver.ppo.gamma=0.5") == 2
     assert "solver.ppo.gamma=0.5: the run in" in capsys.readouterr().err
-    assert tables(Path("run")) == before
+    assert tables(run) == before
 
 
-def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(train, monkeypatch, capsys) -> None:
-    arguments = ["+method=target", *FEW, "hydra.run.dir=run"]
-    assert train(*arguments) == 0
-    before = tables(Path("run"))
+def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(
+    run: Path, train, monkeypatch, capsys
+) -> None:
+    before = tables(run)
 
     def refused(updates: int) -> str:
         capsys.readouterr()
-        assert train(*arguments, f"schedule.updates={updates}") == 2
-        assert tables(Path("run")) == before
+        assert train(*COMMAND, f"schedule.updates={updates}") == 2
+        assert tables(run) == before
         return capsys.readouterr().err
 
-    Path("run/summary.json").unlink()  # as if it had been interrupted just before
+    (run / "summary.json").unlink()  # as if it had been interrupted just before
     assert "schedule.updates=1: the run in" in (said := refused(1)) and "made 2 updates" in said
-    assert train(*arguments) == 0
+    assert train(*COMMAND) == 0
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "run", lambda _: os.kill(os.getpid(), signal.SIGINT))
         patched.setattr("proposer_rl.runs.process.StopSignals._keep", signal.default_int_handler)
-        assert train(*arguments, "schedule.updates=4") == 128 + signal.SIGINT
-    assert not Path("run/summary.json").exists()  # it is not at the end of what was asked for
-    assert train(*arguments) == 0
-    shutil.rmtree("run/checkpoints")
+        assert train(*COMMAND, "schedule.updates=4") == 128 + signal.SIGINT
+    assert not (run / "summary.json").exists()  # it is not at the end of what was asked for
+    assert train(*COMMAND) == 0
+    shutil.rmtree(run / "checkpoints")
     assert "ended after 2 updates and has no checkpoint to go on from" in refused(4)
     monkeypatch.setattr("proposer_rl.cli.run.logger", None)  # nothing is left to be logged
-    assert train(*arguments) == 0
+    assert train(*COMMAND) == 0
 
 
 def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
@@ -218,38 +228,30 @@ def test_a_disk_that_takes_no_more_is_named_with_its_folder(
         raise OSError(errno.EFBIG, "File too large", *named)
 
     monkeypatch.setattr(function, full)
-    assert train("+method=target", *FEW, "hydra.run.dir=run") == 4
+    assert train(*COMMAND) == 4
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line == f"error: cannot use {Path(place).absolute()}: File too large"
 
 
-def test_a_damaged_summary_is_named(train, capsys) -> None:
-    arguments = ["+method=target", *FEW, "hydra.run.dir=run"]
-    assert train(*arguments) == 0
+def test_a_damaged_summary_is_named(run: Path, train, capsys) -> None:
     for content in ("{", "[]", "{}"):
-        Path("run/summary.json").write_text(content)
-        capsys.readouterr()
-        assert train(*arguments) == 2
+        (run / "summary.json").write_text(content)
+        assert train(*COMMAND) == 2
         assert "summary.json: is damaged; remove it" in capsys.readouterr().err
 
 
-def test_a_run_goes_on_in_the_precision_that_it_began_with(train, capsys, monkeypatch) -> None:
-    command = ["+method=target", *FEW, "hydra.run.dir=run"]
-    assert train(*command) == 0
-    assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
+def test_a_run_goes_on_in_the_precision_that_it_began_with(
+    run: Path, train, capsys, monkeypatch
+) -> None:
+    config, longer = run / "config.json", [*COMMAND, "schedule.updates=4"]
+    assert json.loads(config.read_text())["precision"] == "fp32"
     monkeypatch.setattr("proposer_rl.tasks.mazes.task.faster_precision", lambda *_: "bf16")
-    assert train(*command, "schedule.updates=4") == 0
-    assert json.loads(Path("run/config.json").read_text())["precision"] == "fp32"
-    assert train(*command, "schedule.updates=4", "precision=bf16") == 2
+    assert train(*longer) == 0
+    assert json.loads(config.read_text())["precision"] == "fp32"
+    assert train(*longer, "precision=bf16") == 2
     assert "error: precision='bf16': the run in" in capsys.readouterr().err
-
-
-def test_a_precision_that_nobody_wrote_is_told_in_one_line(train, capsys) -> None:
-    command = ["+method=domain_randomization", *SMOKE, "schedule.updates=1", "hydra.run.dir=run"]
-    assert train(*command) == 0
-    config = Path("run/config.json")
-    config.write_text(config.read_text().replace('"fp32"', '"fp8"'))
-    assert train(*command, "schedule.updates=4") == 2
+    config.write_text(config.read_text().replace('"fp32"', '"fp8"'))  # as nobody has written it
+    assert train(*longer, "precision=fp32", "schedule.updates=6") == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("error: precision='fp32': the run in") and "'fp8'" in error
 

@@ -20,6 +20,7 @@ import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.recipes import CONFIG_FOLDER
 from tests.commands import call, trained_run
+from tests.test_bin import MODULES
 from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
 
 PAGES = {
@@ -28,16 +29,6 @@ PAGES = {
     if file.parts[len(DOCS.parts)] != "api"
 }
 CONFIGURATION, LEVELS = PAGES["reference/configuration"], PAGES["how_to/levels"]
-
-
-def programs() -> dict[str, list[str]]:
-    """The module behind every command of bin/ that is a Python program, and its first arguments."""
-    found = {}
-    for file in (ROOT / "bin").iterdir():
-        started = re.search(r'-m ((?:proposer_rl|research).*) "', file.read_text(encoding="utf-8"))
-        if started:
-            found[file.name] = started[1].split()
-    return found
 
 
 def shown() -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -100,7 +91,7 @@ class Parsed(Exception):
 def test_the_arguments_are_understood(
     program: str, arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if program not in programs():  # in the shell: bin/test, which takes pytest's, and bin/docs
+    if program not in MODULES:  # in the shell: bin/test, which takes pytest's, and bin/docs
         assert (ROOT / "bin" / program).is_file()
         return
     parse = argparse.ArgumentParser.parse_args
@@ -110,7 +101,7 @@ def test_the_arguments_are_understood(
         raise Parsed
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
-    module, *first = programs()[program]
+    module, *first = MODULES[program].split()
     monkeypatch.setattr(sys, "argv", [f"bin/{program}", *first, *arguments])
     main = importlib.import_module(
         f"{module}.__main__" if (ROOT / module.replace(".", "/")).is_dir() else module

@@ -152,6 +152,10 @@ def test_only_the_command_line_sees_configurations() -> None:
         assert users == allowed, tool
 
 
+def test_the_package_imports_no_research() -> None:
+    assert [name for name, imported in imports(ROOT).items() if "research" in imported] == []
+
+
 def test_what_reads_runs_needs_no_torch() -> None:
     graph = imports(ROOT)
     readers = [name for name in graph if any(f"{name}.".startswith(f"{r}.") for r in READERS)]

@@ -19,6 +19,8 @@ from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.report.comparisons import UNDECIDED
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.studies import read_studies
+from proposer_rl.report.tables import escape_markdown
+from research import pages
 
 ROOT = Path(__file__).parents[1]
 FRAMES = "with the curriculum's (M)"
@@ -216,3 +218,29 @@ def test_a_run_of_today_is_of_the_same_variant_as_the_published_ones(study: str)
         aside = {"seed", "seeds", "schedule", "precision", "compute", "logger"}
         now, then = ({k: each[k] for k in each.keys() - aside} for each in (values, run.config))
         assert now == then, run.folder.name
+
+
+@pytest.mark.parametrize("name", ["curricula", pytest.param("medium", marks=pytest.mark.slow)])
+def test_the_committed_pages_come_out_of_the_committed_results(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Word for word, in a clean clone; their pictures are left out."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(
+        pages,
+        "_picture",
+        lambda drawing, _: f"![{escape_markdown(drawing.title)}](figures/{drawing.name}.png)",
+    )
+    study = Path("results", name)
+    given = [str(study)]
+    if name == "medium":
+        given += ["--scores", str(study / "scores.csv")]
+        given += ["--seconds", *map(str, sorted(study.glob("seconds*.json")))]
+    pages.main([*given, "-o", str(tmp_path)])
+    for page in (pages.CHOICE, pages.CLAIMS):
+        lines = [
+            (folder / page).read_text(encoding="utf-8").splitlines() for folder in (study, tmp_path)
+        ]
+        assert f"bin/research pages {' '.join(given)} -o {study}" in lines[0]
+        before, after = ([line for line in text if "bin/research" not in line] for text in lines)
+        assert before == after

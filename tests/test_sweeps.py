@@ -51,8 +51,9 @@ def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
         alone, together = measured(Path(str(seed)), seed), measured(Path("together"), seed)
         assert alone["samples"] == together["samples"]
         # Sums over another batch are rounded in another order.
-        for row, other in zip(alone["metrics.csv"], together["metrics.csv"], strict=True):
-            assert row == pytest.approx(other, abs=1e-6)
+        for table, near in (("metrics.csv", {}), ("training.csv", {"rel": 1e-3})):
+            for row, other in zip(alone[table], together[table], strict=True):
+                assert row == pytest.approx(other, abs=1e-6, **near)
     summary = json.loads(Path("together/summary.json").read_text())
     assert summary["seeds"] == [2, 0] and len(summary["updates_to_threshold"]) == 2
     alone = json.loads(Path("0/summary.json").read_text())
@@ -153,11 +154,7 @@ def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> No
     [
         # The second is refused before it imports PyTorch, which takes a process most of its time.
         ["task=maze,cartpole", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        [
-            "solver.ppo.epochs=0,1",
-            "hydra/launcher=submitit_local",
-            "hydra.launcher.timeout_min=5",
-        ],
+        ["solver.ppo.epochs=0,1", "hydra/launcher=submitit_local"],
     ],
     ids=["joblib", "submitit"],
 )

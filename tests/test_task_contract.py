@@ -31,7 +31,7 @@ TASKS = {
 }
 
 
-@pytest.fixture(params=TASKS.values(), ids=TASKS)
+@pytest.fixture(params=TASKS.values(), ids=TASKS, scope="module")
 def task(request: pytest.FixtureRequest) -> Task:
     make: Callable[[], Task] = request.param
     return make()

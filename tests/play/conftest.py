@@ -1,4 +1,4 @@
-"""Runs of seconds: mazes, mazes seen through a window, and cars; and the page of each."""
+"""The pages of runs of seconds: mazes, mazes seen through a window, and cars."""
 
 from __future__ import annotations
 
@@ -8,21 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.commands import trained_run
-from tests.play.pages import CARS, MAZES, VIEWS, Page, served
+from tests.play.pages import CARS, VIEWS, Page, served
 from tests.tiny import EXAMPLES
-
-
-@pytest.fixture(scope="session")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Mazes, two Solvers side by side, three checkpoints."""
-    return trained_run(tmp_path_factory.mktemp("runs") / "mazes", *MAZES, "seeds=[3,5]")
-
-
-@pytest.fixture(scope="session")
-def car_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(EXAMPLES)
-        yield trained_run(tmp_path_factory.mktemp("runs") / "cars", *CARS)
 
 
 @pytest.fixture(scope="session")
@@ -39,6 +26,9 @@ def page(run: Path) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="session")
-def car_page(car_run: Path) -> Iterator[Page]:
-    with served(car_run) as page:
-        yield page
+def car_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        run = trained_run(tmp_path_factory.mktemp("runs") / "cars", *CARS)
+        with served(run) as page:
+            yield page

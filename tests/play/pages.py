@@ -14,10 +14,6 @@ from proposer_rl.play.server import application, listen, server
 from tests.tiny import EXAMPLES
 
 TOKEN = "a-token-of-the-tests"
-MAZES = [
-    *("+method=target", "+scale=smoke", "compute.progress=false"),
-    *("schedule.keep_checkpoints=100", "schedule.checkpoint_every=2"),
-]
 VIEWS = [
     *("task=view_maze_smoke", "+method=target", "compute.progress=false"),
     *("schedule.updates=4", "schedule.keep_checkpoints=100"),

@@ -5,18 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import (
-    Browser,
-    BrowserContext,
-    Download,
-    Locator,
-    expect,
-)
+from playwright.sync_api import Browser, BrowserContext, Download, Locator, expect
 from playwright.sync_api import Page as Tab
 
 from proposer_rl.cli.stored import stored_run
@@ -24,7 +17,7 @@ from proposer_rl.models import cell_logits
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
 from proposer_rl.tasks.mazes.level_files import read_levels, shipped_levels
 from proposer_rl.tasks.mazes.levels import Level, planes
-from tests.browser import chromium, needs_chromium
+from tests.browser import chromium, needs_chromium, new_context
 from tests.play.pages import Page, served
 from tests.tasks.mazes.oracles import path_length
 
@@ -39,9 +32,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
-    with browser.new_context(viewport={"width": 1200, "height": 900}) as context:
-        context.set_default_timeout(0)  # none: a busy machine is slow
-        expect.set_options(timeout=0)
+    with new_context(browser, viewport={"width": 1200, "height": 900}) as context:
         yield context
 
 
@@ -309,9 +300,9 @@ def test_it_fits_a_phone_and_everything_has_a_name(
     nameless = """() => [...document.querySelectorAll("button, input, select, canvas")]
         .filter((one) => one.checkVisibility() && !one.labels?.length && !one.ariaLabel
             && !one.textContent.trim()).map((one) => one.outerHTML)"""
-    narrow = partial(browser.new_context, viewport={"width": 360, "height": 740}, has_touch=True)
     for address in (page.address, car_page.address):
-        with narrow() as context:
+        phone = {"viewport": {"width": 360, "height": 740}, "has_touch": True}
+        with new_context(browser, **phone) as context:
             for tab in opened(context, address):
                 assert tab.evaluate("document.documentElement.scrollWidth") <= 360
                 assert tab.evaluate(nameless) == []

@@ -11,7 +11,7 @@ import pytest
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.figures import cost_curves
-from tests.browser import chromium, needs_chromium
+from tests.browser import chromium, needs_chromium, new_context
 from tests.report.folders import LEVEL, PIXELS, cycle, png, write_jsonl, write_run
 
 # Where a point of a chart lies on the screen.
@@ -81,7 +81,7 @@ class Seen:
 @pytest.fixture(scope="module")
 def seen(written: Path) -> Iterator[Seen]:
     with chromium() as browser:
-        seen = Seen(browser.new_page())
+        seen = Seen(new_context(browser).new_page())
         seen.page.goto(written.as_uri())
         seen.page.wait_for_selector("html[data-ready]")
         yield seen
@@ -220,6 +220,6 @@ def test_without_scripts_a_reader_is_told_where_the_figures_are(seen: Seen, writ
     seen.page.emulate_media(media="print")
     assert seen.page.locator(".curves").is_visible() and seen.page.locator(".measure").is_hidden()
     seen.page.emulate_media(media="screen")
-    still = seen.page.context.browser.new_context(java_script_enabled=False).new_page()
+    still = new_context(seen.page.context.browser, java_script_enabled=False).new_page()
     still.goto(written.as_uri())
     assert still.get_by_text(note).is_visible() and still.locator(".curves").is_hidden()

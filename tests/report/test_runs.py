@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import lzma
 import os
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from proposer_rl.report.figures import draw_run
 from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means
+from research.publish import publish
 from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 
@@ -186,6 +188,30 @@ def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
         read_run(folder)
     assert message in str(refused.value) and "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{folder}: ")
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "message"),
+    [
+        ("runs", "run,config,facts\n../a,{},{}\n", "leads out of the study"),
+        ("runs", "run,config\na,{}\n", "an entry 'facts' is missing"),
+        ("runs", "run,config,facts\na,{},[]\n", "facts: Input should be a valid dictionary"),
+        ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
+        ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
+        ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),
+        ("levels", None, "levels.csv.xz is cut off"),
+    ],
+)
+def test_a_broken_study_is_named_in_one_line(
+    table: str, text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("research.publish.write_page", lambda _: None)  # its figures
+    publish([write_run(tmp_path / "target_0", levels=[0.5])], light := tmp_path / "light")
+    packed = b"" if text is None else lzma.compress(text.encode())
+    (light / f"{table}.csv.xz").write_bytes(packed)
+    with pytest.raises(UnreadableRun, match=message) as refused:
+        read_run(light)
+    assert len(str(refused.value).splitlines()) == 1 and TASK["title"] not in str(refused.value)
 
 
 def test_what_is_told_of_single_levels_is_each_seeds_own(tmp_path: Path) -> None:

@@ -1,15 +1,10 @@
-"""``bin/research``: its names, and that the wheel knows nothing of what lies there."""
+"""``bin/research``: its names."""
 
 from __future__ import annotations
 
 import pytest
 
 from research.__main__ import NAMES, main
-from tests.test_layering import ROOT, imports
-
-
-def test_the_package_imports_no_research() -> None:
-    assert [name for name, imported in imports(ROOT).items() if "research" in imported] == []
 
 
 def test_every_name_starts_its_module(

@@ -33,8 +33,6 @@ from research.ranking import EXACT, STEADY, budgets, choices, needs_of
 from research.timing import read_timing, timed
 from tests.report.folders import TASK, cycle, write_rockets, write_run, write_seconds
 
-ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "results"
 NEEDS = needs([CONFIG_FOLDER])
 NOTHING = "no target, episodes alone"
 SEEDS = 5
@@ -450,30 +448,6 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
         assert end.value.code == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", ["curricula", pytest.param("medium", marks=pytest.mark.slow)])
-def test_the_committed_pages_come_out_of_the_committed_results(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Word for word, in a clean clone."""
-    monkeypatch.chdir(ROOT)
-    study = Path("results", name)
-    given = [str(study)]
-    if name == "medium":
-        given += ["--scores", str(study / "scores.csv")]
-        given += ["--seconds", *map(str, sorted(study.glob("seconds*.json")))]
-    main([*given, "-o", str(tmp_path / "again")])
-    for page in (CHOICE, CLAIMS):
-        before, after = (
-            (folder / page).read_text(encoding="utf-8").splitlines()
-            for folder in (study, tmp_path / "again")
-        )
-        assert f"bin/research pages {' '.join(given)} -o {study}" in before
-        assert [line for line in after if "bin/research" not in line] == [
-            line for line in before if "bin/research" not in line
-        ]
 
 
 def test_a_claim_of_methods_that_are_missing_is_not_decided(tmp_path: Path) -> None:

@@ -14,12 +14,12 @@ import pytest
 
 from proposer_rl.cli.report import main as report
 from proposer_rl.report.figures import learning_curves
-from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
+from proposer_rl.report.reading import find_runs, read_run
 from proposer_rl.report.runs import tables
 from proposer_rl.report.studies import read_studies
 from research import publish
 from research.publish import main
-from tests.report.folders import LEVEL, TASK, cycle, write_run
+from tests.report.folders import LEVEL, cycle, write_run
 
 SECRET = "/home/somebody/code"
 
@@ -218,26 +218,3 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
         assert contents(tmp_path) == before and not Path("new").exists()
-
-
-@pytest.mark.parametrize(
-    ("table", "text", "message"),
-    [
-        ("runs", "run,config,facts\n../a,{},{}\n", "leads out of the study"),
-        ("runs", "run,config\na,{}\n", "an entry 'facts' is missing"),
-        ("runs", "run,config,facts\na,{},[]\n", "facts: Input should be a valid dictionary"),
-        ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
-        ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
-        ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),
-        ("levels", None, "levels.csv.xz is cut off"),
-    ],
-)
-def test_a_broken_study_is_named_in_one_line(
-    table: str, text: str | None, message: str, tmp_path: Path
-) -> None:
-    light = published(write_run(tmp_path / "target_0", levels=[0.5]), tmp_path / "light")
-    packed = b"" if text is None else lzma.compress(text.encode())
-    (light / f"{table}.csv.xz").write_bytes(packed)
-    with pytest.raises(UnreadableRun, match=message) as refused:
-        read_run(light)
-    assert len(str(refused.value).splitlines()) == 1 and TASK["title"] not in str(refused.value)

@@ -16,7 +16,7 @@ from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.evaluate import load
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from research.scores import main
-from tests.commands import call, trained_pair
+from tests.commands import call
 
 
 @pytest.fixture
@@ -29,11 +29,6 @@ def scores_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, st
         return code, said.err if code else said.out
 
     return call_it
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained_pair(tmp_path_factory.mktemp("runs") / "trained")
 
 
 @pytest.mark.slow

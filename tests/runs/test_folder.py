@@ -4,6 +4,7 @@ import json
 import math
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,45 +65,32 @@ def test_float64_of_numpy_is_a_float(folder: RunFolder) -> None:
     assert read_csv(folder.path / "metrics.csv") == [{"x": 0.1}]
 
 
+HEADERS: list[dict[str, object]] = [{}, {"a,b": 1}, {'"a"': 1}, {"": 1}]
+NO_TABLES = ["metrics", "../metrics.csv", "sub/metrics.csv", "scores.csv"]
+
+
 @pytest.mark.parametrize(
-    ("row", "message"),
+    ("name", "row", "message"),
     [
-        ({"update": 2}, r"missing \['loss'\], unknown \[\]"),
-        ({"update": 2, "loss": 0.1, "extra": 1}, r"missing \[\], unknown \['extra'\]"),
-        ({"update": 2, "loss": None}, "'loss' takes int or float, not None"),
-        ({"update": 2, "loss": np.float32(1)}, r"\(float32\)"),
-        ({"update": True, "loss": 1.0}, r"\(bool\)"),
-        ({"update": 2, "loss": "0.5"}, r"\(str\)"),
+        ("metrics.csv", {"update": 2}, r"missing \['loss'\], unknown \[\]"),
+        ("metrics.csv", {"update": 2, "loss": 0.1, "more": 1}, r"missing \[\], unknown \['more'\]"),
+        ("metrics.csv", {"update": 2, "loss": None}, "'loss' takes int or float, not None"),
+        ("metrics.csv", {"update": 2, "loss": np.float32(1)}, r"\(float32\)"),
+        ("metrics.csv", {"update": True, "loss": 1.0}, r"\(bool\)"),
+        ("metrics.csv", {"update": 2, "loss": "0.5"}, r"\(str\)"),
+        *(("training.csv", header, r"training\.csv") for header in HEADERS),
+        *((name, {"a": 1}, "a table is one of curriculum") for name in NO_TABLES),
+        ("cycles.jsonl", {"a": {1, 2}}, r"cycles\.jsonl: .*not JSON serializable"),
     ],
 )
-def test_refuses_a_row_and_leaves_the_table(
-    folder: RunFolder, row: dict[str, object], message: str
+def test_refuses_a_row_and_leaves_the_tables(
+    folder: RunFolder, name: str, row: dict[str, object], message: str
 ) -> None:
     folder.append("metrics.csv", {"update": 1, "loss": 0.5})
     with pytest.raises(ValueError, match=message):
-        folder.append("metrics.csv", row)
+        folder.append(name, row)
+    assert [path.name for path in folder.path.iterdir()] == ["metrics.csv"]
     assert read_csv(folder.path / "metrics.csv") == [{"update": 1, "loss": 0.5}]
-
-
-@pytest.mark.parametrize("row", [{}, {"a,b": 1}, {'"a"': 1}, {"": 1}])
-def test_refuses_a_header_and_makes_no_table(folder: RunFolder, row: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"metrics\.csv"):
-        folder.append("metrics.csv", row)
-    assert folder.lengths() == {}
-
-
-@pytest.mark.parametrize("name", ["metrics", "../metrics.csv", "sub/metrics.csv", "scores.csv"])
-def test_refuses_a_name(folder: RunFolder, name: str) -> None:
-    with pytest.raises(ValueError, match="a table is one of curriculum"):
-        folder.append(name, {"a": 1})
-
-
-def test_refuses_what_json_cannot_hold(folder: RunFolder) -> None:
-    with pytest.raises(ValueError, match=r"cycles\.jsonl: .*not JSON serializable"):
-        folder.append("cycles.jsonl", {"a": {1, 2}})
-    with pytest.raises(ValueError, match=r"s\.json: .*not JSON serializable"):
-        folder.write_json("s.json", {"a": object()})
-    assert list(folder.path.iterdir()) == []
 
 
 def _filled(folder: RunFolder, rows: int) -> None:
@@ -150,8 +138,9 @@ def test_after_a_crash_at_any_byte(
 @pytest.mark.parametrize(
     ("name", "read"), [("training.csv", read_csv), ("levels.jsonl", read_jsonl)]
 )
-def test_half_a_row_is_not_read_nor_added_to(folder: RunFolder, name: str, read: object) -> None:
-    assert callable(read)
+def test_half_a_row_is_not_read_nor_added_to(
+    folder: RunFolder, name: str, read: Callable[[Path], object]
+) -> None:
     folder.append(name, {"a": 1})
     with open(folder.path / name, "ab") as file:
         file.write(b"2")
@@ -201,42 +190,32 @@ def test_cut_back_leaves_other_files_alone(folder: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("read", "content", "message"),
     [
-        ("a,b\n1\n", "line 2: 1 cells under 2 columns"),
-        ("a,b\n1,2\n1,2,3\n", "line 3: 3 cells under 2 columns"),
-        ("a\nx\n", "line 2: 'x' is not a number"),
-        ("a\n\n", "line 2: '' is not a number"),
+        (read_csv, "a,b\n1\n", "line 2: 1 cells under 2 columns"),
+        (read_csv, "a,b\n1,2\n1,2,3\n", "line 3: 3 cells under 2 columns"),
+        (read_csv, "a\nx\n", "line 2: 'x' is not a number"),
+        (read_csv, "a\n\n", "line 2: '' is not a number"),
+        (read_csv, None, "there is no table"),
+        (read_jsonl, '{"a": 1}\n{"a"\n', "line 2: not JSON"),
+        (read_jsonl, "[1]\n", "line 1: not a JSON object"),
+        (read_jsonl, None, "there is no table"),
     ],
 )
-def test_read_csv_names_the_line(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "t.csv"
-    path.write_text(content)
-    with pytest.raises(ValueError, match=message):
-        read_csv(path)
+def test_what_is_no_table_is_refused_by_line(
+    read: Callable[[Path], object], content: str | None, message: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / "table").write_text(content)
+    with pytest.raises(FileNotFoundError if content is None else ValueError, match=message):
+        read(tmp_path / "table")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [('{"a": 1}\n{"a"\n', "line 2: not JSON"), ("[1]\n", "line 1: not a JSON object")],
-)
-def test_read_jsonl_names_the_line(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "t.jsonl"
-    path.write_text(content)
-    with pytest.raises(ValueError, match=message):
-        read_jsonl(path)
-
-
-def test_reading_no_table(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="there is no table"):
-        read_csv(tmp_path / "t.csv")
-    with pytest.raises(FileNotFoundError, match="there is no table"):
-        read_jsonl(tmp_path / "t.jsonl")
-
-
-def test_write_json_replaces(folder: RunFolder) -> None:
+def test_write_json_replaces_by_what_json_can_hold(folder: RunFolder) -> None:
     folder.write_json("summary.json", {"a": [1, 0.1]})
     folder.write_json("summary.json", {"b": None})
+    with pytest.raises(ValueError, match=r"summary\.json: .*not JSON serializable"):
+        folder.write_json("summary.json", {"a": object()})
     assert json.loads((folder.path / "summary.json").read_text()) == {"b": None}
     assert [path.name for path in folder.path.iterdir()] == ["summary.json"]
 

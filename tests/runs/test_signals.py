@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,6 +25,17 @@ def _as_before():
     before = {signum: signal.getsignal(signum) for signum in STOP_SIGNALS}
     yield
     assert {signum: signal.getsignal(signum) for signum in STOP_SIGNALS} == before
+
+
+@contextmanager
+def handled(signum: int, handler: Any) -> Iterator[StopSignals]:
+    """Stop signals where another handler was before."""
+    before = signal.signal(signum, handler)
+    try:
+        with StopSignals() as signals:
+            yield signals
+    finally:
+        signal.signal(signum, before)
 
 
 @pytest.mark.parametrize("signum", STOP_SIGNALS)
@@ -54,38 +68,26 @@ def test_a_job_that_is_not_queued_again_is_interrupted() -> None:
     def refuse(*_: object) -> None:
         raise RuntimeError("Job not requeued because: timed-out too many times.")
 
-    before = signal.signal(signal.SIGUSR2, refuse)
-    try:
-        with StopSignals() as signals:
-            send(signal.SIGUSR2)
-            with pytest.raises(Interrupted, match="stopped by SIGUSR2"):
-                signals.deliver()
-    finally:
-        signal.signal(signal.SIGUSR2, before)
+    with handled(signal.SIGUSR2, refuse) as signals:
+        send(signal.SIGUSR2)
+        with pytest.raises(Interrupted, match="stopped by SIGUSR2"):
+            signals.deliver()
 
 
 def test_a_handler_from_before_acts_after_the_checkpoint_and_may_let_the_run_go_on() -> None:
     """As submitit's does: it queues the job again and exits, or ignores SIGTERM."""
-    acted = []
-    before = signal.signal(signal.SIGUSR2, lambda signum, _: acted.append(signum))
-    try:
-        with StopSignals() as signals:
-            send(signal.SIGUSR2)
-            assert signals.pending and acted == []
-            signals.deliver()
-            assert not signals.pending and acted == [signal.SIGUSR2]
-    finally:
-        signal.signal(signal.SIGUSR2, before)
+    acted: list[int] = []
+    with handled(signal.SIGUSR2, lambda signum, _: acted.append(signum)) as signals:
+        send(signal.SIGUSR2)
+        assert signals.pending and acted == []
+        signals.deliver()
+        assert not signals.pending and acted == [signal.SIGUSR2]
 
 
 def test_an_ignored_signal_stays_ignored() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with StopSignals() as signals:
-            send(signal.SIGHUP)
-            assert not signals.pending
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    with handled(signal.SIGHUP, signal.SIG_IGN) as signals:
+        send(signal.SIGHUP)
+        assert not signals.pending
 
 
 def test_other_threads_change_nothing() -> None:
