@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import update_wrapper
 from inspect import iscoroutinefunction
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from transformers import TrainerCallback
 
+from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.sampler import TeacherSampler
 from proposer_rl.teaching.spaces import Items
@@ -136,4 +138,7 @@ class TaughtReward(TrainerCallback):
                 "sampler": self._sampler.state_dict(),
                 "told": self._told,
             }
-            torch.save(made, Path(args.output_dir) / f"checkpoint-{state.global_step}" / FILE)
+            content = BytesIO()
+            torch.save(made, content)
+            file = Path(args.output_dir) / f"checkpoint-{state.global_step}" / FILE
+            write_atomically(file, content.getvalue())
