@@ -1,14 +1,33 @@
-"""What two runs' folders have in common."""
+"""Runs that are stopped where a test chooses, and what two runs' folders have in common."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from signal import SIGTERM
 from typing import Any
 
 import torch
 
 from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv
+from proposer_rl.runs.process import Interrupted, StopSignals
+
+
+class StopAt(StopSignals):
+    """A signal that comes at the n-th safe point."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__()
+        self.left = points
+
+    @property
+    def pending(self) -> bool:
+        return self.left == 1
+
+    def deliver(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Interrupted(SIGTERM)
 
 
 def tables(folder: Path) -> dict[str, Any]:

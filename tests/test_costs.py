@@ -11,7 +11,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.tasks.mazes import MazeEnv
-from tests.stops import StopAt
+from tests.same_run import StopAt
 from tests.tiny import composed
 
 # Where frames are spent: in proposing, in observing, in improving.

@@ -196,15 +196,8 @@ def test_a_stock_script_learns_mazes(
 def test_methods_of_ones_own_run_from_the_command_line(
     method: str, example: Load, train: Callable[..., int]
 ) -> None:
-    folder = str(EXAMPLES / "conf")
-    arguments = [
-        "--config-dir",
-        folder,
-        f"+method={method}",
-        "+scale=smoke",
-        "compute.progress=false",
-    ]
-    assert train(*arguments, "hydra.run.dir=run") == 0
+    given = ["--config-dir", str(EXAMPLES / "conf"), f"+method={method}", "+scale=smoke"]
+    assert train(*given, "compute.progress=false", "hydra.run.dir=run") == 0
     rows = read_csv(Path("run/metrics.csv"))
     assert [row["updates"] for row in rows] == [0, 2, 4, 6]
 

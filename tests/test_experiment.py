@@ -39,8 +39,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Task
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
-from tests.same_run import assert_same_run
-from tests.stops import StopAt
+from tests.same_run import StopAt, assert_same_run
 from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import TASK, mountain_cars
 

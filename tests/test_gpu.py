@@ -26,8 +26,7 @@ from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from tests.commands import trained_run
-from tests.same_run import assert_same_run
-from tests.stops import StopAt
+from tests.same_run import StopAt, assert_same_run
 from tests.tasks.gymnasium.toys import CHOICES, GATE, TINY
 from tests.tiny import EXAMPLES, composed
 

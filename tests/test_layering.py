@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 PACKAGE = "proposer_rl"
@@ -43,6 +45,7 @@ def imported_names(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
             yield from (".".join([*start, alias.name]) for alias in node.names)
 
 
+@cache
 def modules(root: Path) -> dict[str, ast.Module]:
     """All modules by their dotted name within the package; that of a package is its folder's."""
     found = {}
@@ -53,6 +56,7 @@ def modules(root: Path) -> dict[str, ast.Module]:
     return found
 
 
+@cache
 def imports(root: Path) -> dict[str, set[str]]:
     """What each module imports: other packages' names, and the package's own modules with a dot."""
     trees = modules(root)
@@ -95,20 +99,10 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def reached(graph: dict[str, set[str]], start: str) -> set[str]:
-    """Everything that is imported when a module is, directly or not."""
-    seen: set[str] = set()
-    waiting = [f".{start}"]
-    while waiting:
-        name = waiting.pop()
-        if name in seen:
-            continue
-        seen.add(name)
-        if name.startswith("."):
-            waiting += graph[name[1:]]
-            # Importing a module imports the packages that it lies in.
-            above = name[1:].rpartition(".")[0]
-            waiting += [f".{above}"] if above else []
-    return seen
+    """Everything that is imported when a module is, directly or not, and the packages around."""
+    arrows = [(f".{name}", used) for name, others in graph.items() for used in others]
+    arrows += [(f".{name}", f".{name.rpartition('.')[0]}") for name in graph if "." in name]
+    return {f".{start}", *nx.descendants(nx.DiGraph(arrows), f".{start}")}
 
 
 def mentions(tree: ast.AST, word: str) -> list[str]:

@@ -21,6 +21,7 @@ import yaml
 
 from proposer_rl.recipes import available
 from tests import minimal
+from tests.test_bin import MODULES
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -146,11 +147,10 @@ def test_a_source_archive_holds_no_results_and_no_tests(built: Built) -> None:
 
 
 def test_every_command_of_the_checkout_is_installed() -> None:
-    for file in (ROOT / "bin").iterdir():
-        started = re.search(r'exec "\$PYTHON" -m (proposer_rl\S*)', file.read_text())
-        if started:
-            module, _, function = PROJECT["scripts"][f"proposer-{file.name}"].partition(":")
-            assert module.removesuffix(".__main__") == started[1]
+    for name, started in MODULES.items():
+        if started.startswith("proposer_rl"):
+            module, _, function = PROJECT["scripts"][f"proposer-{name}"].partition(":")
+            assert module.removesuffix(".__main__") == started.split()[0]
             source = ROOT / Path(*module.split(".")).with_suffix(".py")
             names = {getattr(node, "name", "") for node in ast.parse(source.read_text()).body}
             assert function in names

@@ -6,11 +6,11 @@ import os
 import re
 import shutil
 import socket
-import subprocess
 import sys
 import webbrowser
 from pathlib import Path
 from signal import SIGINT
+from typing import NoReturn
 
 import httpx
 import pytest
@@ -32,27 +32,37 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return said.err.splitlines()[-1]
 
 
+def serve(run: Path, folder: Path, output: int) -> NoReturn:
+    """The command in a process of its own: one that was forked from this, which has imported it."""
+    code = 1
+    try:
+        os.dup2(output, 1)
+        os.chdir(folder)
+        with open(1, "w", buffering=1) as sys.stdout:
+            sys.stderr = sys.stdout
+            play.main([str(run)])
+            code = 0
+    finally:
+        os._exit(code)
+
+
 def test_it_tells_its_address_and_ends_on_ctrl_c(run: Path, tmp_path: Path) -> None:
-    started = subprocess.Popen(
-        [sys.executable, "-m", "proposer_rl.cli.play", str(run)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"},
-    )
-    assert started.stdout is not None
-    line = started.stdout.readline()
-    found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{40,})/", line)
-    assert found, started.communicate()
-    assert CLIENT.get(f"{found[0]}api/run").json()["checkpoints"] == [1, 2, 3]
-    assert CLIENT.get(f"http://127.0.0.1:{found[1]}/").status_code == 403
-    for address in own_addresses():  # from outside of the machine there is nothing
-        with pytest.raises(OSError), socket.create_connection((address, int(found[1])), 5):
-            pass
-    started.send_signal(SIGINT)
-    assert started.communicate() == ("Ended.\n", "")
-    assert started.returncode == 0
+    said, output = os.pipe()
+    child = os.fork()
+    if child == 0:
+        serve(run, tmp_path, output)
+    os.close(output)
+    with open(said) as lines:
+        found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{40,})/", lines.readline())
+        assert found
+        assert CLIENT.get(f"{found[0]}api/run").json()["checkpoints"] == [1, 2, 3]
+        assert CLIENT.get(f"http://127.0.0.1:{found[1]}/").status_code == 403
+        for address in own_addresses():  # from outside of the machine there is nothing
+            with pytest.raises(OSError), socket.create_connection((address, int(found[1])), 5):
+                pass
+        os.kill(child, SIGINT)
+        assert lines.read() == "Ended.\n"
+    assert os.waitpid(child, 0)[1] == 0
     assert list(tmp_path.iterdir()) == []
 
 
