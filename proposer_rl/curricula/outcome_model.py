@@ -286,7 +286,7 @@ class Modelled(Combinator):
             self._judge(outcome)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned; labels are not judged again."""
+        """Puts back what ``state_dict`` returned; labels are not judged again."""
         super().load_state_dict(state)
         self._first = None
 
