@@ -28,6 +28,10 @@ from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
+FEW = 16
+"""Numbers of an observation that are kept with an episode in any case: pictures of tasks show where
+an agent was; what is larger, as images, takes most of the memory."""
+
 GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
 """Needs of a curriculum that reads what a policy has seen off rollouts."""
 
@@ -126,7 +130,8 @@ class ContinuedLevels:
         kept = rollout.exclude("advantage", "value_target")
         if not GRADIENTS & {*self._curriculum.needs}:
             seen = self._learner.agent.step_keys
-            kept = kept.exclude(*seen, *(("next", key) for key in seen))
+            large = [key for key in seen if kept.get(key).shape[3:].numel() > FEW]
+            kept = kept.exclude(*large, *(("next", key) for key in large))
         history = kept if self._history is None else torch.cat([self._history, kept], 2)
         before, length = history.shape[2] - rollout.shape[2], history.shape[2]
         begun = before - self._steps

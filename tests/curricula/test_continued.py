@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -265,3 +268,18 @@ def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(task: Any, tmp_path
         experiment(tmp_path / "resumed", updates, task()).run()
     experiment(tmp_path / "whole", 9, task()).run()
     assert_same_run(tmp_path / "resumed", tmp_path / "whole")
+
+
+def test_pictures_show_an_agent_that_the_policy_sees(
+    train: Callable[..., int], tmp_path: Path
+) -> None:
+    """What a policy sees is left out of episodes, but for where it was, step by step."""
+    settings = ["task.maze.observe_agent=true", "solver.ppo.continue_episodes=true"]
+    method = ["+method=plr", "+scale=smoke", "compute.progress=false", *settings]
+    assert train(*method, f"hydra.run.dir={tmp_path}") == 0
+    *_, last = (tmp_path / "curriculum.jsonl").read_text(encoding="utf-8").splitlines()
+    levels = json.loads(last)["levels"]
+    assert levels
+    for level in levels:
+        for here, there in pairwise(level["path"]):
+            assert sum(abs(a - b) for a, b in zip(here, there, strict=True)) <= 1
