@@ -28,9 +28,9 @@ from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
+# Numbers of an observation that are kept with an episode, since pictures of tasks show where an
+# agent was; what is larger, as images, takes most of the memory.
 FEW = 16
-"""Numbers of an observation that are kept with an episode in any case: pictures of tasks show where
-an agent was; what is larger, as images, takes most of the memory."""
 
 GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
 """Needs of a curriculum that reads what a policy has seen off rollouts."""
