@@ -1,0 +1,1 @@
+"""Small environments of many kinds, on which curricula are compared."""

@@ -1,0 +1,225 @@
+"""The base of environments that step a whole batch of levels at once, in torch."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from proposer_rl.models import own_state, population
+from proposer_rl.settings import signed
+from proposer_rl.tasks.parameters import SEED
+
+SHIFT, MIX = (30, 27, 31), (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)  # SplitMix64's finalizer
+STEP, ENTRY = -0x61C8864680B583EB, 0x632BE59BD9B4E019  # odd, and without a pattern
+UNIT = 2.0**-24  # between neighbouring numbers of :func:`uniform`
+
+
+class Step(NamedTuple):
+    """What a step leads to, in an environment of batch shape [*B].
+
+    Attributes:
+        state: float [*B, S], the next one.
+        reward: float [*B].
+        terminated: bool [*B].
+        success: whether it is one if the episode ends here, bool [*B].
+    """
+
+    state: Tensor
+    reward: Tensor
+    terminated: Tensor
+    success: Tensor
+
+
+@signed
+class BatchedEnv(EnvBase):
+    """An environment whose levels are named numbers, and that steps a batch [*B] of them at once.
+
+    A class of one's own has to say how large things are (``state_size``, ``observation_size``, and
+    ``actions`` or ``forces``), and to define :meth:`begin`, :meth:`advance`, and :meth:`observe`
+    where a Solver does not see the state alone. Nothing in these may be kept between calls. An
+    episode is truncated after ``max_steps``; its success is the entry ``"success"``.
+
+    Whatever is random comes from the level's ``seed`` and the number of the step, so that an
+    episode's chances are the level's own: equal levels and actions make equal episodes.
+
+    Args:
+        levels: [*B], with an entry for each parameter, and a ``seed`` where something is random.
+        max_steps: step limit of an episode.
+        device: of the states.
+
+    Attributes:
+        state_size: numbers S of a state.
+        observation_size: numbers of an observation.
+        actions: number of discrete actions; None for continuous ones.
+        forces: number of continuous actions, each clipped to -1 to 1.
+        draws: random numbers of a step, and of the beginning.
+    """
+
+    state_size: ClassVar[int]
+    observation_size: ClassVar[int]
+    actions: ClassVar[int | None] = None
+    forces: ClassVar[int] = 1
+    draws: ClassVar[int] = 0
+
+    @own_state()
+    def __init__(
+        self,
+        levels: TensorDictBase,
+        *,
+        max_steps: int = 100,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        batch = levels.batch_size
+        super().__init__(device=device, batch_size=batch, allow_done_after_reset=True)
+        self.max_steps = max_steps
+        flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, self.observation_size)),
+            state=Unbounded((*batch, self.state_size)),
+            step_count=Unbounded((*batch, 1), dtype=torch.int64),
+            success=flag,
+            shape=batch,
+        ).to(self.device)
+        self.action_spec = (
+            Unbounded((*batch, self.forces), device=self.device)
+            if self.actions is None
+            else Categorical(self.actions, batch, device=self.device)
+        )
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(ends, shape=batch).to(self.device)
+        self._level = {
+            str(name): self._number(entry).to(self.device, copy=True)
+            for name, entry in levels.items()
+        }
+
+    @abstractmethod
+    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+        """Returns the state that episodes begin in, float [*B, S].
+
+        Args:
+            level: each parameter by name, float [*B].
+            chance: ``draws`` uniform numbers from 0 to 1, float [*B, draws].
+        """
+
+    @abstractmethod
+    def advance(
+        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
+    ) -> Step:
+        """Returns what an action leads to.
+
+        Args:
+            state: float [*B, S].
+            action: int64 [*B], or float [*B, forces] from -1 to 1.
+            level: each parameter by name, float [*B].
+            chance: as of :meth:`begin`, others at every step.
+        """
+
+    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+        """Returns what a Solver sees, float [*B, observation_size]; here the state."""
+        return state
+
+    def set_levels(self, levels: TensorDictBase) -> None:
+        """Sets levels [*B], which are played from the next reset on.
+
+        Raises:
+            ValueError: if they are of another batch shape.
+        """
+        if levels.batch_size != self.batch_size:
+            raise ValueError(
+                f"levels must keep the environment's batch shape {list(self.batch_size)}, "
+                f"got {list(levels.batch_size)}"
+            )
+        for name, place in self._level.items():
+            place.copy_(self._number(levels[name]))
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Begins ended episodes anew, without asking a GPU first whether there are any."""
+        done = tensordict["done"]
+        if population.at_hand(done):
+            return super().maybe_reset(tensordict)
+        begun = self._reset()
+        return tensordict.copy().update(
+            {key: begun[key].where(done, tensordict[key]) for key in begun.keys()}
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+        steps = none.long()
+        # Of these TorchRL takes over only the entries of the levels that are reset.
+        return self._entries(self.begin(self._level, self._chance(steps)), steps, none, none, none)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        steps = tensordict["step_count"] + 1
+        action = tensordict["action"]
+        if self.actions is None:
+            action = action.clamp(-1, 1)
+        made = self.advance(tensordict["state"], action, self._level, self._chance(steps))
+        terminated = made.terminated.unsqueeze(-1)
+        truncated = (steps >= self.max_steps) & ~terminated
+        success = made.success.unsqueeze(-1) & (terminated | truncated)
+        state = self._entries(made.state, steps, success, terminated, truncated)
+        return state.set("reward", made.reward.unsqueeze(-1))
+
+    def _entries(
+        self, state: Tensor, steps: Tensor, success: Tensor, terminated: Tensor, truncated: Tensor
+    ) -> TensorDict:
+        entries = {
+            "observation": self.observe(state, self._level),
+            "state": state,
+            "step_count": steps,
+            "success": success,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        return TensorDict(entries, self.batch_size, device=self.device)
+
+    def _chance(self, steps: Tensor) -> Tensor:
+        """Returns the uniform numbers of steps int64 [*B, 1]: float [*B, draws]."""
+        if not self.draws:
+            return steps.new_zeros(*self.batch_size, 0, dtype=torch.float32)
+        return uniform(self._level[SEED].unsqueeze(-1), steps, self.draws)
+
+    @staticmethod
+    def _number(entry: Tensor) -> Tensor:
+        return entry.float() if entry.is_floating_point() else entry
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Does nothing: what is random comes from the levels' seeds."""
+
+
+def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
+    """Returns numbers that look uniform from 0 to 1, the same for equal seeds and steps.
+
+    The finalizer of SplitMix64 (Steele et al. 2014, "Fast Splittable Pseudorandom Number
+    Generators", OOPSLA) of both and of the number's place.
+
+    Args:
+        seed, step: int64 [*B, 1].
+        count: of the numbers.
+
+    Returns:
+        float32 [*B, count], below 1.
+
+    Example:
+        >>> uniform(torch.tensor([7]), torch.tensor([1]), 2)
+        tensor([0.6513, 0.4378])
+    """
+    place = torch.arange(1, count + 1, device=seed.device)
+    x = finalized(finalized(seed) + step * STEP) + place * ENTRY
+    return (finalized(x) >> 40 & (1 << 24) - 1).float() * UNIT
+
+
+def finalized(x: Tensor) -> Tensor:
+    """Returns int64 numbers each of whose bits depends on all bits of those given."""
+    for shift, factor in zip(SHIFT, (*MIX, 1), strict=True):
+        x = (x ^ (x >> shift & (1 << 64 - shift) - 1)) * factor
+    return x

@@ -1,0 +1,115 @@
+"""Any batched environment in torch as a task, by a file of settings."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from importlib import import_module
+from typing import Annotated, Any
+
+import torch
+from annotated_types import Ge
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Categorical, Unbounded
+from torchrl.envs import EnvBase
+
+from proposer_rl.learning import SolverSettings
+from proposer_rl.models import ActorCritic, Population, memory_actor_critic
+from proposer_rl.settings import ArgumentError
+from proposer_rl.task import ComputeContext, Task, distribution_of
+from proposer_rl.tasks.batched_envs.env import BatchedEnv
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
+from proposer_rl.tasks.ranges import RangeSettings, spaces
+
+
+class BatchedTask(Task):
+    """A :class:`~proposer_rl.tasks.batched_envs.env.BatchedEnv` some of whose numbers make a level.
+
+    Args:
+        env: dotted name of the environment's class.
+        max_steps: of an episode.
+        parameters: what differs between levels, by name.
+        network: of the Solver.
+        levels: fixed evaluation levels of each distribution.
+        solver: the Solver's training.
+        context: device, precision and cores.
+
+    Raises:
+        ArgumentError: naming the key, if there is no such class, or for a parameter that is no
+            range.
+    """
+
+    noun, batched = "levels", True
+    replayed = ("rollouts",)
+
+    def __init__(
+        self,
+        *,
+        env: str,
+        max_steps: Annotated[int, Ge(1)],
+        parameters: dict[str, RangeSettings],
+        network: NetworkSettings,
+        levels: Annotated[int, Ge(1)],
+        solver: SolverSettings,
+        context: ComputeContext,
+    ) -> None:
+        self._class, self._network = _environment_class(env), network
+        self.title = self._class.__name__.removesuffix("Env")
+        if network.memory is not None:
+            self.batched = None
+        space, target = spaces(parameters, device=context.device)
+        self.edit, self.target_shares = space.edit, space.shares(target)
+        super().__init__(
+            distributions={"target": target, "all": space},
+            target="target",
+            space=space,
+            solver=solver,
+            context=context,
+            levels=levels,
+            max_steps=max_steps,
+            measured={
+                "environment": env,
+                "levels": levels,
+                "steps": max_steps,
+                "parameters": {name: asdict(one) for name, one in parameters.items()},
+            },
+        )
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Returns texts about the task by their labels."""
+        target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
+        return {"Target": target, **super().about}
+
+    def environment(self, levels: TensorDictBase) -> EnvBase:
+        """Returns an environment of levels [*B]."""
+        return self._class(levels, max_steps=self.max_steps, device=self.device)
+
+    def network(self) -> nn.Module:
+        """Returns two MLPs, of the policy and of the critic, or a network with memory."""
+        kind = self._class
+        acts = Unbounded(kind.forces) if kind.actions is None else Categorical(kind.actions)
+        make = SolverNetwork if self._network.memory is None else memory_network
+        return make([Unbounded(kind.observation_size)], acts, self._network)
+
+    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
+        """Returns K networks, with memory or without."""
+        memory = self._network.memory
+        distribution = distribution_of(env.full_action_spec["action"])
+        if memory is not None:
+            seen = ["observation"]
+            return memory_actor_critic(population, seen, memory, distribution_class=distribution)
+        module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
+        return ActorCritic(module, distribution_class=distribution, copies=population.copies)
+
+
+def _environment_class(name: str) -> type[BatchedEnv]:
+    module, _, last = name.rpartition(".")
+    try:
+        kind = getattr(import_module(module), last)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ArgumentError(f"env={name}: cannot be imported ({error})") from error
+    if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
+        raise ArgumentError(f"env={name}: must be a class of BatchedEnv's")
+    return kind
