@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -84,7 +85,7 @@ class Components(NamedTuple):
 
 
 OF_A_RUN = ("task", "proposer", "seeds")
-OF_A_TASK = ("space", "target", "target_shares", "features", "edit")
+OF_A_TASK = ("space", "target", "target_shares", "features", "inputs", "edit")
 PARTS = (Scorer, ReplayRule)  # of curricula, made of settings that stand beside the curriculum's
 
 
@@ -100,7 +101,7 @@ def make(
     It gets by the names of its parameters:
 
     - ``task``, ``proposer`` and ``seeds`` of the run; ``space``, ``target``, ``target_shares``,
-      ``features`` and ``edit`` of the task, those with a default only where the task has them;
+      ``features``, ``inputs`` and ``edit`` of the task, those with a default only where the task has them;
     - a :class:`Scorer` or :class:`ReplayRule`, made of the settings that these take;
     - the other settings.
 
@@ -130,7 +131,7 @@ def make(
                 given[name] = getattr(run, name)
             elif name in OF_A_TASK:
                 needed = parameters[name].default is inspect.Parameter.empty
-                if needed or hasattr(run.task, name):
+                with nullcontext() if needed else suppress(AttributeError, ArgumentError):
                     given[name] = getattr(run.task, name)
         parts = {
             name: (part, [*inspect.signature(part).parameters])

@@ -1,4 +1,29 @@
-"""What students would reach on any level: a Bayesian regression that is carried from batch to batch."""
+"""A belief of what students reach on any level, which is carried from batch to batch.
+
+The log odds of success on a level with inputs x in [-1, 1]^D are
+
+    z = beta . phi(x) + u_i,      phi(x) = (1, 0, x, x squared, waves(x)),
+
+with random Fourier features ``waves`` of several lengths (Rahimi and Recht 2007, "Random Features
+for Large-Scale Kernel Machines", NeurIPS), and for levels that come back one by one, such as the
+items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them to
+the maximum of their posterior, by Newton's method, with the curvature there as the new precision
+(Laplace's approximation, one batch after another: Spiegelhalter and Lauritzen 1990, "Sequential
+updating of conditional probabilities on directed graphical structures", Networks 20). So its cost is
+linear in the levels of the batch, and nothing is kept of earlier ones.
+
+Students move. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards the
+prior, precision P and P beta alike:
+
+    P <- lambda P + (1 - lambda) P_0,      P beta <- lambda P beta,
+
+which gives a level that is ``age`` batches old the weight 2 ** (-age / half_life). The second column
+is a level's age, 0 now and one half-life more after each half_life of batches: a trend. Growing
+older by a batch is a linear map A of the columns, so that beta <- A^-T beta and P <- A P A^T.
+
+The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
+networks" (Neural Computation 4): with s^2 the variance of z, 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8))).
+"""
 
 from __future__ import annotations
 
@@ -9,119 +34,153 @@ from typing import Any
 import torch
 from torch import Tensor
 
-COLUMNS = 64  # random Fourier features
-SCALES = 0.3, 1.5  # shortest and longest length of these, in units of the root of D
-ROUGHNESS = 2.0  # prior variance of log odds that they add
-STEPS, CLOSE = 12, 1e-6  # of Newton's method
-OWN = 1.0  # prior variance of what is an item's own, in log odds
+WAVES = 64  # random Fourier features
+LENGTHS = 0.3, 1.5  # of the waves, in units of the root of D, on a logarithmic scale
+ROUGHNESS = 2.0  # prior variance of the log odds that the waves add
+OWN = 1.0  # prior variance of the log odds that are an item's own
+WIDEST = 24  # inputs; more are projected to as many
+STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
+LEAP = 3.0  # of log odds in one of its steps, at most
+EVERY = slice(None)
+SURE = 1e-3  # least curvature that a level adds, p (1 - p)
 
 
 class Belief:
-    """Beliefs of K students' success on levels."""
+    """Believes how likely K students succeed on levels.
+
+    Args:
+        students: number K.
+        inputs: numbers D that are known of a level.
+        items: number N of levels that come back, each with a memory of its own; 0 for none.
+        half_life: batches after which a level counts half.
+        ridge: prior precision of coefficients.
+    """
 
     def __init__(
         self,
         students: int,
         inputs: int,
-        items: int | None,
+        items: int = 0,
         *,
         half_life: float = 12.0,
         ridge: float = 0.3,
     ) -> None:
         generator = torch.Generator().manual_seed(0)
-        low, high = (math.log(scale) for scale in SCALES)
-        lengths = torch.rand(COLUMNS, generator=generator, dtype=torch.float64)
-        lengths = (low + (high - low) * lengths).exp() * math.sqrt(max(inputs, 1))
-        self._omega = torch.randn(inputs, COLUMNS, generator=generator, dtype=torch.float64)
-        self._omega /= lengths
-        self._phase = 2 * math.pi * torch.rand(COLUMNS, generator=generator, dtype=torch.float64)
-        self._height = math.sqrt(2 * ROUGHNESS * ridge / COLUMNS)
-        self._keep, self._ridge = 0.5 ** (1 / half_life), ridge
-        size = 2 + 2 * inputs + COLUMNS
-        self._prior = ridge * torch.eye(size, dtype=torch.float64)
-        self.mean = torch.zeros(students, size, dtype=torch.float64)
-        self.precision = self._prior.repeat(students, 1, 1)
-        self._shift = torch.eye(size, dtype=torch.float64)  # of the first, by the second
-        self._shift[1, 0] = -1 / half_life
-        self._back = torch.linalg.inv(self._shift).mT
-        self._cov: Tensor | None = None
-        self._items = items
-        if items:
-            self.own = torch.zeros(students, items, dtype=torch.float64)
-            self.known = torch.full((students, items), 1 / OWN, dtype=torch.float64)
 
-    def columns(self, inputs: Tensor) -> Tensor:
-        """Columns [K, n, F] of inputs float64 [K, n, D]."""
-        waves = self._height * (inputs @ self._omega + self._phase).cos()
-        one = torch.ones_like(waves[..., :1])
-        return torch.cat([one, torch.zeros_like(one), inputs, inputs.square(), waves], -1)
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        self._keep = 0.5 ** (1 / half_life)
+        self._project = None
+        if inputs > WIDEST:
+            self._project, inputs = normal(inputs, WIDEST) / math.sqrt(inputs), WIDEST
+        low, high = map(math.log, LENGTHS)
+        shares = torch.rand(2, WAVES, generator=generator, dtype=torch.float64)
+        lengths = (low + (high - low) * shares[0]).exp() * math.sqrt(max(inputs, 1))
+        self._frequencies, self._phases = normal(inputs, WAVES) / lengths, 2 * math.pi * shares[1]
+        self._height = math.sqrt(2 * ROUGHNESS * ridge / WAVES)
+        size = 2 + 2 * inputs + WAVES
+        self._prior = ridge * torch.eye(size, dtype=torch.float64)
+        self._aged, self._back = (torch.eye(size, dtype=torch.float64) for _ in range(2))
+        self._aged[1, 0], self._back[0, 1] = -1 / half_life, 1 / half_life
+        self._mean = torch.zeros(students, size, dtype=torch.float64)
+        self._precision = self._prior.repeat(students, 1, 1)
+        self._own = torch.zeros(students, items, dtype=torch.float64)
+        self._known = torch.full_like(self._own, 1 / OWN)  # the precision of that
+        self._covariance: Tensor | None = None
 
     def grow_older(self) -> None:
-        """One batch more has passed."""
-        keep, new = self._keep, 1 - self._keep
-        mean = keep * (self.precision @ self.mean.unsqueeze(-1))
-        self.precision = keep * self.precision + new * self._prior
-        self.mean = torch.linalg.solve(self.precision, mean).squeeze(-1)
-        self.mean = self.mean @ self._back.mT
-        self.precision = self._shift @ self.precision @ self._shift.mT
-        if self._items:
-            weight = self.known * self.own * keep
-            self.known = keep * self.known + new / OWN
-            self.own = weight / self.known
-        self._cov = None
+        """Lets a batch pass."""
+        old, new = self._keep, 1 - self._keep
+        weighed = old * (self._precision @ self._mean.unsqueeze(-1))
+        precision = old * self._precision + new * self._prior
+        mean = torch.linalg.solve(precision, weighed).squeeze(-1)
+        self._mean = mean @ self._back.mT
+        self._precision = self._aged @ precision @ self._aged.mT
+        weighed = old * self._known * self._own
+        self._known = old * self._known + new / OWN
+        self._own = weighed / self._known
+        self._covariance = None
 
-    def observe(self, inputs: Tensor, labels: Tensor, items: Tensor | None) -> None:
-        """Learns from labels [K, n] in [0, 1] at inputs [K, n, D]."""
-        phi = self.columns(inputs)
-        offset = self.own.gather(1, items) if self._items else torch.zeros_like(labels)
-        prior, precision = self.mean, self.precision
-        beta = prior.clone()
+    def observe(self, inputs: Tensor, labels: Tensor, items: Tensor | None = None) -> None:
+        """Learns from levels that students were trained on.
+
+        Args:
+            inputs: float64 [K, n, D].
+            labels: successes, or shares of them, in [0, 1]: float64 [K, n].
+            items: which of those that come back they are, int64 [K, n]; None where none do.
+        """
+        phi, prior, precision = self._columns(inputs), self._mean, self._precision
+        own = torch.zeros_like(labels) if items is None else self._own.gather(1, items)
+        z, mean = _times(phi, prior), prior
         for _ in range(STEPS):
-            p = ((phi @ beta.unsqueeze(-1)).squeeze(-1) + offset).sigmoid()
-            weight = (p * (1 - p)).clamp(min=1e-3)
-            curvature = phi.mT @ (phi * weight.unsqueeze(-1)) + precision
-            slope = (phi.mT @ (p - labels).unsqueeze(-1)).squeeze(-1)
-            slope = slope + (precision @ (beta - prior).unsqueeze(-1)).squeeze(-1)
-            step = torch.linalg.solve(curvature, slope)
-            size = (phi @ step.unsqueeze(-1)).abs().amax(1)  # no log odds moves by more than 3
-            beta = beta - step * (3 / size.clamp(min=3))
-            if float(step.abs().max()) < CLOSE:
+            p = (z + own).sigmoid()
+            slope = _times(phi.mT, p - labels) + _times(precision, mean - prior)
+            step = torch.linalg.solve(precision + _curvature(phi, p), slope)
+            moved = _times(phi, step)
+            size = moved.abs().amax(1, keepdim=True)
+            part = LEAP / size.clamp(min=LEAP)
+            mean, z = mean - part * step, z - part * moved
+            if float(size.max()) < CLOSE:
                 break
-        p = ((phi @ beta.unsqueeze(-1)).squeeze(-1) + offset).sigmoid()
-        weight = (p * (1 - p)).clamp(min=1e-3)
-        self.mean = beta
-        self.precision = phi.mT @ (phi * weight.unsqueeze(-1)) + precision
-        self._cov = None
-        if self._items:
-            z = (phi @ beta.unsqueeze(-1)).squeeze(-1)
-            start, known = self.own.clone(), self.known
-            own = start.clone()
-            for _ in range(4):
-                p = (z + own.gather(1, items)).sigmoid()
-                slope = torch.zeros_like(own).scatter_add(1, items, p - labels)
-                bend = torch.zeros_like(own).scatter_add(1, items, p * (1 - p))
-                own = own - (slope + known * (own - start)) / (bend + known)
-            self.own, self.known = own, known + bend
+        self._mean, self._covariance = mean, None
+        self._precision = precision + _curvature(phi, (z + own).sigmoid())
+        if items is not None:
+            self._observe_items(items, z, labels)
 
-    def predict(self, inputs: Tensor, items: Tensor | None, k: int | None = None) -> Tensor:
-        """Probability of success [K, n], or of student k's [n]."""
-        if self._cov is None:
-            self._cov = torch.linalg.inv(self.precision)
-        mean, cov = (self.mean, self._cov) if k is None else (self.mean[k], self._cov[k])
-        phi = self.columns(inputs)
-        z = (phi @ mean.unsqueeze(-1)).squeeze(-1)
-        variance = ((phi @ cov) * phi).sum(-1)
-        if self._items:
-            own, known = (self.own, self.known) if k is None else (self.own[k], self.known[k])
-            z = z + own.gather(-1, items)
-            variance = variance + 1 / known.gather(-1, items)
+    def predict(
+        self, inputs: Tensor, items: Tensor | None = None, of: slice = EVERY
+    ) -> Tensor:
+        """Returns the probability of success on levels, float64 [K, n].
+
+        Args:
+            inputs, items: as of :meth:`observe`.
+            of: some of the students, whose number K then is.
+        """
+        if self._covariance is None:
+            self._covariance = torch.linalg.inv(self._precision)
+        phi = self._columns(inputs)
+        z, variance = _times(phi, self._mean[of]), ((phi @ self._covariance[of]) * phi).sum(-1)
+        if items is not None:
+            z = z + self._own[of].gather(1, items)
+            variance = variance + 1 / self._known[of].gather(1, items)
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
     def state_dict(self) -> dict[str, Any]:
-        own = {"own": self.own, "known": self.known} if self._items else {}
-        return {"mean": self.mean, "precision": self.precision, **own}
+        """Returns means and precisions."""
+        return {name: getattr(self, f"_{name}") for name in ("mean", "precision", "own", "known")}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` returned."""
         for name, value in state.items():
-            setattr(self, name, value)
-        self._cov = None
+            setattr(self, f"_{name}", value)
+        self._covariance = None
+
+    def _observe_items(self, items: Tensor, z: Tensor, labels: Tensor) -> None:
+        """Moves what is the items' own, given what the inputs say of them, z [K, n]."""
+        prior, own = self._own, self._own
+        for _ in range(STEPS):
+            p = (z + own.gather(1, items)).sigmoid()
+            slope = self._known * (own - prior)
+            slope = slope.scatter_add(1, items, p - labels)
+            bend = self._known.scatter_add(1, items, (p * (1 - p)).clamp(min=SURE))
+            step = (slope / bend).clamp(-LEAP, LEAP)
+            own = own - step
+            if float(step.abs().max()) < CLOSE:
+                break
+        self._own, self._known = own, bend
+
+    def _columns(self, inputs: Tensor) -> Tensor:
+        """Returns the columns of inputs [K, n, D]: [K, n, F]."""
+        x = inputs if self._project is None else inputs @ self._project
+        waves = self._height * (x @ self._frequencies + self._phases).cos()
+        one = torch.ones_like(waves[..., :1])
+        return torch.cat([one, torch.zeros_like(one), x, x.square(), waves], -1)
+
+
+def _curvature(phi: Tensor, p: Tensor) -> Tensor:
+    return phi.mT @ (phi * (p * (1 - p)).clamp(min=SURE).unsqueeze(-1))
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)

@@ -40,6 +40,7 @@ from proposer_rl.task.protocols import (
     check_distributions,
     distribution_of,
     for_copies,
+    level_inputs,
     space_features,
 )
 
@@ -253,6 +254,13 @@ class Task(ABC):
         others.
         """
         return space_features(self.space, levels)
+
+    def inputs(self, levels: Levels) -> Tensor:
+        """Returns what a belief knows of levels [*B]: float64 [*B, D] on the CPU, each -1 to 1.
+
+        Here by where they lie in the space, if it has ``locate(levels)``; else D is 0.
+        """
+        return level_inputs(self.space, levels)
 
     @property
     def metrics(self) -> list[str]:

@@ -278,6 +278,19 @@ def space_features(space: Any, levels: Levels) -> Tensor:
     return torch.cat(parts, -1)
 
 
+def level_inputs(space: Any, levels: Levels) -> Tensor:
+    """Returns what a belief knows of levels [*B] of a space: float64 [*B, D] on the CPU.
+
+    That is ``space.inputs(levels)``, where there is such a method, or where they lie,
+    ``space.locate(levels)``; else D is 0.
+    """
+    for name in ("inputs", "locate"):
+        if hasattr(space, name):
+            known: Tensor = getattr(space, name)(levels).double().cpu()
+            return known
+    return torch.zeros(*levels.shape, 0, dtype=torch.float64)
+
+
 def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
     """Returns what makes a policy's distribution of its logits, by the actions' spec."""
     if isinstance(acts, MultiCategorical):

@@ -15,6 +15,7 @@ Number = int | float
 SEED = "seed"
 LARGEST_SEED = 2**31 - 1
 STEP = 0.1  # standard deviation of an edit, as a share of a range
+MOST_ITEMS = 1_000_000  # levels that are remembered one by one
 MOST_BINS = 256  # along an axis; readers of runs take no more
 MOST_COMBINATIONS = LARGEST_WHOLE = 2**63 - 1
 LARGEST = torch.finfo(torch.float32).max
@@ -73,6 +74,21 @@ class Bins:
             return (old + noise * STEP * (high - low)).clamp(low, high)
         return (old + _one_at_least(noise, float(high - low))).clamp(low, high)
 
+    def between(self, a: Tensor, b: Tensor, share: Tensor, noise: Tensor) -> Tensor:
+        """Returns values [n] between two, a share of the way from a to b, float64 [n], and near.
+
+        Noise, float64 [n], is added in shares of the whole range; whole numbers are rounded, and of
+        single values the nearest in the line is taken.
+        """
+        if not self.wide:
+            places = (torch.searchsorted(self.low, end).double() for end in (a, b))
+            last = len(self.low) - 1
+            place = torch.lerp(*places, share) + noise * last
+            return self.low[place.round().long().clamp(0, last)]
+        low, high = self.low[0], self.high[-1]
+        value = a.double().lerp(b.double(), share) + noise * (high - low)
+        return (value if self.low.is_floating_point() else value.round()).to(a).clamp(low, high)
+
     def scaled(self, values: Tensor) -> Tensor:
         """Returns where values float64 [*B] lie, -1 and 1 being the first and last middle: [*B].
 
@@ -83,6 +99,10 @@ class Bins:
             ends = torch.cat([self.low, self.high]).double()
         first, reach = ends[0], ends[-1] - ends[0]
         return 2 * (values - first) / reach - 1 if reach > 0 else 0 * values
+
+    def columns(self, values: Tensor) -> Tensor:
+        """Returns what a belief knows of values [*B], numbers of -1 to 1: float64 [*B, c]."""
+        return self.scaled(values.double()).unsqueeze(-1)
 
     def below(self, ends: Tensor) -> Tensor:
         """Returns the probability of a value of at most each of some ends, float64 [n]."""
@@ -218,6 +238,23 @@ class ParameterSpace:
         lines = [part.scaled(levels[name].cpu().double()) for name, part in self.bins.items()]
         return torch.stack(lines, -1).float() if lines else torch.zeros(*levels.batch_size, 0)
 
+    def inputs(self, levels: TensorDictBase) -> Tensor:
+        """Returns what a belief knows of levels [*B]: float64 [*B, D] on the CPU."""
+        known = [part.columns(levels[name].cpu()) for name, part in self.bins.items()]
+        return torch.cat(known, -1) if known else torch.zeros(*levels.batch_size, 0).double()
+
+    def items(self, levels: TensorDictBase) -> Tensor | None:
+        """Returns the bins of levels [*B] that are single values, int64 [*B] on the CPU, or None.
+
+        None where levels of a bin differ, or there are more bins than can be remembered one by one.
+        """
+        if self.size > MOST_ITEMS or any(part.wide for part in self.bins.values()):
+            return None
+        number = torch.zeros(levels.batch_size, dtype=torch.int64)
+        for name, part in self.bins.items():
+            number = number * len(part.low) + torch.searchsorted(part.low, levels[name].cpu())
+        return number
+
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Draws levels [K, P] of bins, int64 [K, P]; replica k's from generator k."""
         copies = [self._draw(own, g) for own, g in zip(choices, generators, strict=True)]
@@ -257,6 +294,24 @@ class ParameterSpace:
         seeds = [self._drawn_seeds(points.shape[1:2], g) for g in generators]
         drawn = {key: torch.stack([one[key] for one in seeds]) for key in seeds[0]}
         return TensorDict({**level, **drawn}, points.shape[:2], device=self._device)
+
+    def between(
+        self, a: TensorDictBase, b: TensorDictBase, noise: float, generator: torch.Generator
+    ) -> TensorDict:
+        """Returns levels [n] at random places between two each, [n], parameter by parameter.
+
+        Args:
+            a, b: levels of the space, or b of a target.
+            noise: its standard deviation along each parameter, in shares of the range.
+            generator: of the CPU.
+        """
+        share = torch.rand(a.batch_size, generator=generator, dtype=torch.float64)
+        level = {}
+        for name, part in self.bins.items():
+            off = noise * torch.randn(a.batch_size, generator=generator, dtype=torch.float64)
+            level[name] = part.between(a[name].cpu(), b[name].cpu(), share, off)
+        seeds = self._drawn_seeds(a.batch_size, generator)
+        return TensorDict({**level, **seeds}, a.batch_size, device=self._device)
 
     def edit(
         self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]

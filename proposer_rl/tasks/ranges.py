@@ -16,6 +16,7 @@ import scipy  # whose functions are loaded where they are asked for
 import torch
 from annotated_types import Ge, Le, Len
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from proposer_rl.settings import ArgumentError, Positive, arguments, plain, settings, shown
 from proposer_rl.tasks.parameters import (
@@ -96,6 +97,14 @@ class Labelled(Bins):
     """The places of texts, or whatever else is chosen from, in their list, which has no order."""
 
     labels: list[Any]
+
+    def between(self, a: Tensor, b: Tensor, share: Tensor, noise: Tensor) -> Tensor:
+        """Returns one of two choices each: b in so many of all draws as the share says."""
+        return torch.where(share < 0.5, a, b)
+
+    def columns(self, values: Tensor) -> Tensor:
+        """Returns whether values [*B] are each of the choices: float64 [*B, c]."""
+        return one_hot(values, len(self.labels)).double()
 
     def moved(self, old: Tensor, noise: Tensor) -> Tensor:
         """Returns another place for each of [n], drawn by its noise, float64 [n]."""

@@ -86,6 +86,12 @@ class MadeLevels(Parameters):
         values = zip(super().at(points, generators), generators, strict=True)
         return torch.stack([self.made(own, g) for own, g in values])
 
+    def between(
+        self, a: TensorDictBase, b: TensorDictBase, noise: float, generator: torch.Generator
+    ) -> TensorDict:
+        """Makes levels [n] of values at random places between those of two each."""
+        return self.made(super().between(a, b, noise, generator), generator)
+
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
         return self.made(super()._draw(choices, generator), generator)
 
