@@ -19,7 +19,7 @@ prior, precision P and P beta alike:
 
 which gives a level that is ``age`` batches old the weight 2 ** (-age / half_life). The second column
 is a level's age, 0 now and one half-life more after each half_life of batches: a trend. Growing
-older by a batch is a linear map A of the columns, so that beta <- A^-T beta and P <- A P A^T.
+older by a batch is a linear map A of the columns, so that before beta <- A^-T beta and P <- A P A^T.
 
 The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
 networks" (Neural Computation 4): with s^2 the variance of z, 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8))).
@@ -92,11 +92,10 @@ class Belief:
     def grow_older(self) -> None:
         """Lets a batch pass."""
         old, new = self._keep, 1 - self._keep
-        weighed = old * (self._precision @ self._mean.unsqueeze(-1))
-        precision = old * self._precision + new * self._prior
-        mean = torch.linalg.solve(precision, weighed).squeeze(-1)
-        self._mean = mean @ self._back.mT
-        self._precision = self._aged @ precision @ self._aged.mT
+        mean = self._mean @ self._back.mT
+        precision = self._aged @ self._precision @ self._aged.mT
+        self._precision = old * precision + new * self._prior
+        self._mean = torch.linalg.solve(self._precision, old * _times(precision, mean))
         weighed = old * self._known * self._own
         self._known = old * self._known + new / OWN
         self._own = weighed / self._known
