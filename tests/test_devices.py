@@ -19,7 +19,7 @@ from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
 from tests.processes import ROOT
 from tests.same_run import assert_same_run
-from tests.tasks.gymnasium.toys import CHOICES, TINY
+from tests.tasks.gymnasium.toys import CHOICES, GATE, TINY
 
 # Every operation there goes through Python: few of each kind, for one cycle of a Proposer's.
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
@@ -42,6 +42,7 @@ CALLED = {
     "proposer": ["+method=first_order_proposer_sampled", *QUIET],
     "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],
     "choices": ["+method=plr", *CHOICES, *FEW],
+    "batched": ["+method=plr", "task=arena/hill", *GATE, *FEW],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
 }
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
+from tests.tasks.batched_envs.toys import windy_task
 from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import mountain_cars, point_masses, sledges, tiny_task, tiny_view_task
 
@@ -28,6 +29,7 @@ TASKS = {
     "walk": walk_task,
     "views": tiny_view_task,
     "gates": point_masses,
+    "wind": windy_task,
 }
 
 

@@ -44,7 +44,8 @@ class BatchedEnv(EnvBase):
     A class of one's own has to say how large things are (``state_size``, ``observation_size``, and
     ``actions`` or ``forces``), and to define :meth:`begin`, :meth:`advance`, and :meth:`observe`
     where a Solver does not see the state alone. Nothing in these may be kept between calls. An
-    episode is truncated after ``max_steps``; its success is the entry ``"success"``.
+    episode is truncated after ``max_steps``; its success is the entry ``"success"``, and
+    ``"is_init"`` is whether it begins.
 
     Whatever is random comes from the level's ``seed`` and the number of the step, so that an
     episode's chances are the level's own: equal levels and actions make equal episodes.
@@ -80,11 +81,16 @@ class BatchedEnv(EnvBase):
         super().__init__(device=device, batch_size=batch, allow_done_after_reset=True)
         self.max_steps = max_steps
         flag = Binary(1, (*batch, 1), dtype=torch.bool)
+        # One entry where a Solver sees the state, which is then neither stored nor reset twice.
+        self._state = "observation" if type(self).observe is BatchedEnv.observe else "state"
         self.observation_spec = Composite(
-            observation=Unbounded((*batch, self.observation_size)),
-            state=Unbounded((*batch, self.state_size)),
-            step_count=Unbounded((*batch, 1), dtype=torch.int64),
-            success=flag,
+            {
+                "observation": Unbounded((*batch, self.observation_size)),
+                self._state: Unbounded((*batch, self.state_size)),
+                "step_count": Unbounded((*batch, 1), dtype=torch.int64),
+                "success": flag,
+                "is_init": flag.clone(),
+            },
             shape=batch,
         ).to(self.device)
         self.action_spec = (
@@ -95,17 +101,18 @@ class BatchedEnv(EnvBase):
         self.reward_spec = Unbounded((*batch, 1), device=self.device)
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch).to(self.device)
-        self._level = {
+        self._next = {
             str(name): self._number(entry).to(self.device, copy=True)
             for name, entry in levels.items()
         }
+        self._level = {name: entry.clone() for name, entry in self._next.items()}
 
     @abstractmethod
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
         """Returns the state that episodes begin in, float [*B, S].
 
         Args:
-            level: each parameter by name, float [*B].
+            level: each parameter by name, float [*B], or int64 where its values are whole numbers.
             chance: ``draws`` uniform numbers from 0 to 1, float [*B, draws].
         """
 
@@ -118,7 +125,7 @@ class BatchedEnv(EnvBase):
         Args:
             state: float [*B, S].
             action: int64 [*B], or float [*B, forces] from -1 to 1.
-            level: each parameter by name, float [*B].
+            level: as of :meth:`begin`.
             chance: as of :meth:`begin`, others at every step.
         """
 
@@ -127,7 +134,7 @@ class BatchedEnv(EnvBase):
         return state
 
     def set_levels(self, levels: TensorDictBase) -> None:
-        """Sets levels [*B], which are played from the next reset on.
+        """Sets levels [*B], each of which is played from its own next reset on.
 
         Raises:
             ValueError: if they are of another batch shape.
@@ -137,23 +144,30 @@ class BatchedEnv(EnvBase):
                 f"levels must keep the environment's batch shape {list(self.batch_size)}, "
                 f"got {list(levels.batch_size)}"
             )
-        for name, place in self._level.items():
-            place.copy_(self._number(levels[name]))
+        for name, place in self._next.items():
+            place.copy_(levels[name])
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Begins ended episodes anew, without asking a GPU first whether there are any."""
         done = tensordict["done"]
         if population.at_hand(done):
             return super().maybe_reset(tensordict)
-        begun = self._reset()
+        begun = self._begun(done)
         return tensordict.copy().update(
             {key: begun[key].where(done, tensordict[key]) for key in begun.keys()}
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        # Of these TorchRL takes over only the entries of the levels that are reset.
+        return self._begun(None if tensordict is None else tensordict.get("_reset", None))
+
+    def _begun(self, which: Tensor | None) -> TensorDict:
+        """Takes up the levels that are set, those of bool [*B, 1] or all, and begins all anew."""
+        for name, following in self._next.items():
+            level = self._level[name]
+            level.copy_(following if which is None else following.where(which.squeeze(-1), level))
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         steps = none.long()
-        # Of these TorchRL takes over only the entries of the levels that are reset.
         return self._entries(self.begin(self._level, self._chance(steps)), steps, none, none, none)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -161,7 +175,7 @@ class BatchedEnv(EnvBase):
         action = tensordict["action"]
         if self.actions is None:
             action = action.clamp(-1, 1)
-        made = self.advance(tensordict["state"], action, self._level, self._chance(steps))
+        made = self.advance(tensordict[self._state], action, self._level, self._chance(steps))
         terminated = made.terminated.unsqueeze(-1)
         truncated = (steps >= self.max_steps) & ~terminated
         success = made.success.unsqueeze(-1) & (terminated | truncated)
@@ -173,9 +187,10 @@ class BatchedEnv(EnvBase):
     ) -> TensorDict:
         entries = {
             "observation": self.observe(state, self._level),
-            "state": state,
+            self._state: state,
             "step_count": steps,
             "success": success,
+            "is_init": steps == 0,
             "terminated": terminated,
             "truncated": truncated,
             "done": terminated | truncated,
@@ -203,7 +218,8 @@ def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
     Generators", OOPSLA) of both and of the number's place.
 
     Args:
-        seed, step: int64 [*B, 1].
+        seed: int64 [*B, 1].
+        step: int64 [*B, 1].
         count: of the numbers.
 
     Returns:

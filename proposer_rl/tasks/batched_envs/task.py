@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 
-import torch
 from annotated_types import Ge
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -20,6 +18,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.task import ComputeContext, Task, distribution_of
 from proposer_rl.tasks.batched_envs.env import BatchedEnv
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
+from proposer_rl.tasks.gymnasium.player import imported
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 
 
@@ -35,6 +34,9 @@ class BatchedTask(Task):
         solver: the Solver's training.
         context: device, precision and cores.
 
+    Attributes:
+        seeded: whether levels have seeds, which random numbers come from.
+
     Raises:
         ArgumentError: naming the key, if there is no such class, or for a parameter that is no
             range.
@@ -42,6 +44,7 @@ class BatchedTask(Task):
 
     noun, batched = "levels", True
     replayed = ("rollouts",)
+    seeded: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -55,10 +58,10 @@ class BatchedTask(Task):
         context: ComputeContext,
     ) -> None:
         self._class, self._network = _environment_class(env), network
-        self.title = self._class.__name__.removesuffix("Env")
+        self.title = getattr(self, "title", self._class.__name__.removesuffix("Env"))
         if network.memory is not None:
             self.batched = None
-        space, target = spaces(parameters, device=context.device)
+        space, target = spaces(parameters, seeded=self.seeded, device=context.device)
         self.edit, self.target_shares = space.edit, space.shares(target)
         super().__init__(
             distributions={"target": target, "all": space},
@@ -105,11 +108,10 @@ class BatchedTask(Task):
 
 
 def _environment_class(name: str) -> type[BatchedEnv]:
-    module, _, last = name.rpartition(".")
     try:
-        kind = getattr(import_module(module), last)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ArgumentError(f"env={name}: cannot be imported ({error})") from error
+        kind = imported(name)
+    except ValueError as error:
+        raise ArgumentError(f"env={error}") from error
     if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
-        raise ArgumentError(f"env={name}: must be a class of BatchedEnv's")
+        raise ArgumentError(f"env={name!r}: must be a subclass of BatchedEnv")
     return kind

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
 from annotated_types import Ge
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
-from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import EnvBase
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from proposer_rl.learning import SolverSettings, in_first_episode
-from proposer_rl.models import own_state, population
-from proposer_rl.settings import settings, signed
-from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork
-from proposer_rl.tasks.ranges import RangeSettings, spaces
+from proposer_rl.settings import settings
+from proposer_rl.task import ComputeContext
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.task import BatchedTask
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings
+from proposer_rl.tasks.ranges import RangeSettings
 
 GATE = ("position", "width", "friction")
 START_PLACE, GOAL_PLACE = (0.0, 3.0), (0.0, -3.0)
@@ -32,8 +30,7 @@ STEEPNESS = 0.6  # of the reward
 NEAR = 0.25  # from the goal is a success
 
 
-@signed
-class PointMassEnv(EnvBase):
+class PointMassEnv(BatchedEnv):
     """Point masses that are to get through a gate in a wall and to stay at a goal, a batch of them.
 
     The environment of Klink et al. 2020 ("Self-Paced Deep Reinforcement Learning", arXiv
@@ -41,22 +38,17 @@ class PointMassEnv(EnvBase):
     ICML), without the noise of their accelerations (a deviation of 0.05, which hardly moves a
     mass): nothing is drawn at random.
 
+    - Level: ``position`` and ``width`` of the gate, and ``friction``.
     - Action: float32 ``[*B, 2]``, the force along x and y in shares of the largest, 10, held for a
       tenth of a second. What is beyond -1 and 1 is clipped.
-    - Observation: ``"observation"``, float32 ``[*B, 7]``: x, its speed, y, its speed, and the
+    - Observation, which is the state: float32 ``[*B, 7]``: x, its speed, y, its speed, and the
       level: the gate's position and width, and the friction.
-    - State besides: ``"step_count"``, int64 ``[*B, 1]``.
     - Dynamics: ten Euler steps of 0.01 seconds; the acceleration is 1.5 times the force, less
       friction times the speed. Positions stay within -4 and 4. The mass begins at rest at (0, 3).
     - Reward: float32 ``[*B, 1]``, exp(-0.6 d) at the distance d from the goal at (0, -3).
     - End: ``terminated`` where the mass hits the wall, the line y = 0 beside the gate, and stops
       there; ``truncated`` after ``max_steps``. ``"success"``, bool ``[*B, 1]``, is whether an
       episode ends with the time limit and less than 0.25 from the goal.
-
-    Args:
-        levels: with entries ``position``, ``width`` and ``friction`` ``[*B]``.
-        max_steps: step limit of an episode.
-        device: of the states.
 
     Example:
         >>> level = {"position": torch.zeros(1), "width": torch.ones(1), "friction": torch.zeros(1)}
@@ -66,102 +58,40 @@ class PointMassEnv(EnvBase):
         tensor([ 2.9325, -1.5000])
     """
 
-    @own_state()
-    def __init__(
-        self,
-        levels: TensorDictBase,
-        *,
-        max_steps: int = 100,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        batch = levels.batch_size
-        super().__init__(device=device, batch_size=batch, allow_done_after_reset=True)
-        self.max_steps = max_steps
-        flag = Binary(1, (*batch, 1), dtype=torch.bool)
-        self.observation_spec = Composite(
-            observation=Unbounded((*batch, 4 + len(GATE))),
-            step_count=Unbounded((*batch, 1), dtype=torch.int64),
-            success=flag,
-            shape=batch,
-        ).to(self.device)
-        self.action_spec = Unbounded((*batch, 2), device=self.device)
-        self.reward_spec = Unbounded((*batch, 1), device=self.device)
-        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(ends, shape=batch).to(self.device)
-        mass = torch.tensor([START_PLACE[0], 0.0, START_PLACE[1], 0.0, *[0.0] * len(GATE)])
-        self._first = mass.to(self.device).repeat(*batch, 1)
-        self.set_levels(levels)
+    state_size: ClassVar[int] = 4 + len(GATE)
+    observation_size: ClassVar[int] = state_size
+    forces: ClassVar[int] = 2
 
-    def set_levels(self, levels: TensorDictBase) -> None:
-        """Sets levels [*B], which each mass plays from its next reset on.
+    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+        """Returns the mass at rest, with its level."""
+        x, y = (torch.full_like(level[GATE[0]], place) for place in START_PLACE)
+        rest = torch.zeros_like(x)
+        return torch.stack([x, rest, y, rest, *(level[name] for name in GATE)], -1)
 
-        Raises:
-            ValueError: if they are of another batch shape.
-        """
-        if levels.batch_size != self.batch_size:
-            raise ValueError(
-                f"levels must keep the environment's batch shape {list(self.batch_size)}, "
-                f"got {list(levels.batch_size)}"
-            )
-        self._first[..., -len(GATE) :] = torch.stack([levels[n].float() for n in GATE], -1)
-
-    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begins ended episodes anew, without asking a GPU first whether there are any."""
-        done = tensordict["done"]
-        if population.at_hand(done):
-            return super().maybe_reset(tensordict)
-        begun = self._reset()
-        return tensordict.copy().update(
-            {key: begun[key].where(done, tensordict[key]) for key in begun.keys()}
-        )
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
-        none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
-        # Of these TorchRL takes over only the entries of the masses that are reset.
-        return self._state(self._first.clone(), none.long(), none, none)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        seen = tensordict["observation"]
-        place, speed, hit = after_substeps(seen, tensordict["action"])
+    def advance(
+        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
+    ) -> Step:
+        """Returns where the mass is after ten substeps."""
+        place, speed, hit = after_substeps(state, action)
+        away = torch.hypot(place[0] - GOAL_PLACE[0], place[1] - GOAL_PLACE[1])
         mass = torch.stack([place[0], speed[0], place[1], speed[1]], -1)
-        steps = tensordict["step_count"] + 1
-        terminated = hit.unsqueeze(-1)
-        away = torch.hypot(place[0] - GOAL_PLACE[0], place[1] - GOAL_PLACE[1]).unsqueeze(-1)
-        truncated = (steps >= self.max_steps) & ~terminated
-        state = self._state(torch.cat([mass, seen[..., 4:]], -1), steps, terminated, truncated)
-        state.set("success", truncated & (away < NEAR))
-        return state.set("reward", (-STEEPNESS * away).exp())
-
-    def _state(
-        self, seen: Tensor, steps: Tensor, terminated: Tensor, truncated: Tensor
-    ) -> TensorDict:
-        entries = {
-            "observation": seen,
-            "step_count": steps,
-            "success": torch.zeros_like(terminated),
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-        }
-        return TensorDict(entries, self.batch_size, device=self.device)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Does nothing, as nothing is random."""
+        after = torch.cat([mass, state[..., 4:]], -1)
+        return Step(after, (-STEEPNESS * away).exp(), hit, away < NEAR)
 
 
-def after_substeps(seen: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def after_substeps(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns where masses are after a step, and whether they hit the wall on their way.
 
     Args:
-        seen: observations, float [*B, 7].
-        action: forces in shares of the largest, float [*B, 2].
+        state: of masses, float [*B, 7].
+        action: forces in shares of the largest, float [*B, 2] from -1 to 1.
 
     Returns:
         Places and speeds along x and y, float [2, *B], and bool [*B].
     """
-    x, x_speed, y, y_speed, gate, width, friction = seen.unbind(-1)
+    x, x_speed, y, y_speed, gate, width, friction = state.unbind(-1)
     place, speed = torch.stack([x, y]), torch.stack([x_speed, y_speed])
-    push = action.movedim(-1, 0).clamp(-1, 1) * (DT * GAIN * FORCE)
+    push = action.movedim(-1, 0) * (DT * GAIN * FORCE)
     kept = 1 - DT * friction
     path = [place]
     for _ in range(SUBSTEPS):
@@ -197,25 +127,21 @@ class GateSettings:
     friction: RangeSettings
 
 
-class PointMassTask(Task):
+class PointMassTask(BatchedTask):
     """A point mass that is to get through a gate in a wall, and to stay at a goal behind it.
 
     Args:
-        max_steps: of an episode.
+        max_steps, network, levels, solver, context: as of
+            :class:`~proposer_rl.tasks.batched_envs.task.BatchedTask`.
         parameters: what differs between levels.
-        network: of the Solver.
-        levels: fixed evaluation levels of each distribution.
-        solver: the Solver's training.
-        context: device, precision and cores.
 
     Raises:
         ValueError: naming the key, for a parameter that is no range, or below zero where it cannot
             be.
     """
 
-    title, noun, batched = "point mass", "gates", True
+    title, noun, seeded = "point mass", "gates", False
     key = "The wall with its gate, the goal (orange), and the way of the mass."
-    replayed = ("rollouts",)
 
     def __init__(
         self,
@@ -227,37 +153,19 @@ class PointMassTask(Task):
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
-        self._network = network
-        space, target = spaces(vars(parameters), seeded=False, device=context.device)
-        for name in ("width", "friction"):
-            for bins in (space.bins[name], target.bins[name]):
-                if bins.low[0] < 0:
-                    raise ValueError(f"parameters.{name}: {bins:} goes below zero")
-        self.edit, self.target_shares = space.edit, space.shares(target)
         super().__init__(
-            distributions={"target": target, "all": space},
-            target="target",
-            space=space,
+            env=f"{__name__}.{PointMassEnv.__name__}",
+            max_steps=max_steps,
+            parameters=vars(parameters),
+            network=network,
+            levels=levels,
             solver=solver,
             context=context,
-            levels=levels,
-            max_steps=max_steps,
-            measured={"levels": levels, "steps": max_steps, "parameters": asdict(parameters)},
         )
-
-    @property
-    def about(self) -> dict[str, str]:
-        """Returns texts about the task by their labels."""
-        target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-        return {"Target": target, **super().about}
-
-    def environment(self, levels: TensorDictBase) -> PointMassEnv:
-        """Returns an environment of masses before their gates."""
-        return PointMassEnv(levels, max_steps=self.max_steps, device=self.device)
-
-    def network(self) -> nn.Module:
-        """Returns two MLPs, of the policy and of the critic."""
-        return SolverNetwork([Unbounded(4 + len(GATE))], Unbounded(2), self._network)
+        for name in ("width", "friction"):
+            for bins in (self.space.bins[name], self.target.bins[name]):
+                if bins.low[0] < 0:
+                    raise ValueError(f"parameters.{name}: {bins:} goes below zero")
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None
