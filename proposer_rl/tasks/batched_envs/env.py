@@ -133,6 +133,15 @@ class BatchedEnv(EnvBase):
         """Returns what a Solver sees, float [*B, observation_size]; here the state."""
         return state
 
+    @classmethod
+    def features(cls, level: Mapping[str, Tensor]) -> Tensor:
+        """Returns what else a model of outcomes knows of levels, float [*B, F]; here nothing.
+
+        Args:
+            level: each parameter by name, [*B].
+        """
+        return next(iter(level.values())).unsqueeze(-1)[..., :0]
+
     def set_levels(self, levels: TensorDictBase) -> None:
         """Sets levels [*B], each of which is played from its own next reset on.
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Annotated, ClassVar
 
+import torch
 from annotated_types import Ge
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Categorical, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
 from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import ComputeContext, Task, distribution_of
+from proposer_rl.task import ComputeContext, Levels, Task, distribution_of
 from proposer_rl.tasks.batched_envs.env import BatchedEnv
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
 from proposer_rl.tasks.gymnasium.player import imported
@@ -88,6 +89,19 @@ class BatchedTask(Task):
     def environment(self, levels: TensorDictBase) -> EnvBase:
         """Returns an environment of levels [*B]."""
         return self._class(levels, max_steps=self.max_steps, device=self.device)
+
+    def features(self, levels: Levels) -> Tensor:
+        """Returns where levels [K, n] lie and the environment's own features: float [K, n, F]."""
+        return torch.cat([super().features(levels), self._own_features(levels)], -1)
+
+    def inputs(self, levels: Levels) -> Tensor:
+        """Returns the environment's own features of levels [*B], or else where they lie."""
+        own = self._own_features(levels)
+        return own if own.shape[-1] else super().inputs(levels)
+
+    def _own_features(self, levels: Levels) -> Tensor:
+        level = {str(name): entry for name, entry in levels.items()}
+        return self._class.features(level).double().cpu()
 
     def network(self) -> nn.Module:
         """Returns two MLPs, of the policy and of the critic, or a network with memory."""
