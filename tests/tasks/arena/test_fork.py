@@ -7,7 +7,7 @@ import torch
 from proposer_rl.tasks.arena.fork import ForkEnv
 from tests.tasks.arena.episodes import levels, play
 
-BOTH = levels(depth=[0.1, 0.93, 0.95, 1.0], length=[6, 2, 6, 2])
+BOTH = levels(depth=[0.1, 0.96, 0.98, 1.0], length=[6, 2, 6, 2])
 
 
 def test_going_right_is_right_on_all_levels_but_the_deep() -> None:
