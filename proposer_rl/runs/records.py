@@ -99,7 +99,7 @@ class TaskFacts(BaseModel):
     distributions: Annotated[list[Name], Field(min_length=1)]
     space: Annotated[
         dict[Name, Annotated[list[FiniteFloat], Field(min_length=1, max_length=256)]],
-        Field(max_length=8),
+        Field(max_length=16),
     ] = {}
     about: dict[Name, Text] = {}
     measured: Any
