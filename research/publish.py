@@ -27,7 +27,7 @@ from proposer_rl.report.runs import NAMES, STUDY, Run, tables, to_csv
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import in_few_colours, render
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.records import anywhere, encoded, printable
+from proposer_rl.runs.records import anywhere, encoded, from_here, printable
 
 MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (
@@ -117,7 +117,7 @@ def write_page(folder: Path) -> None:
             write_atomically(folder / f"{prefix}{drawing.name}.png", in_few_colours(png))
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
-    command = report_command("bin/report", [folder], None, None)
+    command = anywhere(from_here(report_command("bin/report", [folder], None, None)))
     said = above.strip() or f"{title}\n\n{DATA}"
     write_atomically(file, encoded(document([said, MARK, *parts], command, [])))
 
@@ -170,9 +170,11 @@ def _six_digits(value: Any) -> Any:
 def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
     """A mapping without this machine's folders; of a checkpoint begun with its last two parts.
 
+    Paths inside the working folder, such as a repository's, are those from there.
+
     Seeds of Proposers are called by the folders above those of their last Solvers.
     """
-    text = json.dumps(dict(value))
+    text = from_here(json.dumps(dict(value)))
     if os.path.isabs(reused):
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
     found: dict[str, Any] = json.loads(anywhere(text))

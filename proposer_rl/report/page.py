@@ -125,18 +125,21 @@ def incomplete(study: Study) -> list[str]:
 
 
 def commands(study: Study) -> list[str]:
-    """What each group was started with; seeds that differ in nothing else in one command."""
+    """What each group was started with; seeds that differ in nothing else in one command.
+
+    Seeds that were trained side by side are again, since on some tasks they draw other numbers
+    alone.
+    """
     found = []
     for group in study.groups:
         seeds: dict[str, list[int]] = {}
         for run in group.runs:
             seeds.setdefault(_command(run), []).append(run.seed)
-        found += [
-            f"{command} seed={','.join(map(str, with_them))}"
-            if command
-            else f"# {group.label}: the command was not recorded"
-            for command, with_them in seeds.items()
-        ]
+        for command, own in seeds.items():
+            if not command:
+                found.append(f"# {group.label}: the command was not recorded")
+            else:
+                found.append(f"{command}{_joined(own)}" if command.endswith("=") else command)
     return found
 
 
@@ -160,14 +163,14 @@ def report_command(
     baseline: str | None,
     *more: str,
 ) -> str:
-    """What writes this report again, without the places of this machine."""
+    """What writes this report again, from the same folder."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [] if baseline is None else [f"--baseline={baseline}"]
-    return anywhere(f"{program} {shlex.join([*map(str, folders), *asked, *more])}")
+    return f"{program} {shlex.join([*map(str, folders), *asked, *more])}"
 
 
 def _command(run: Run) -> str:
-    """What started a run, but for its seed; empty where that is not known in full."""
+    """What started a run, ending in ``seed=`` where it had but one; empty where it is not known."""
     overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
     if not isinstance(overrides, list) or not isinstance(arguments, dict):
         return ""
@@ -182,10 +185,20 @@ def _command(run: Run) -> str:
     # A task or curriculum of one's own that prl.train was given is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
-    before = [f"PYTHONPATH={shlex.quote(anywhere(paths))}"] if paths else []
-    options = ["--config-dir", config, "-m"] if config else ["-m"]
-    quoted = [shlex.quote(anywhere(word)) for word in [*options, *words]]
+    many, seeds = ["-m"], "seed="
+    if run.shared_by > 1:
+        together = run.config.get("seeds")
+        if not (isinstance(together, list) and all(isinstance(seed, int) for seed in together)):
+            return ""
+        many, seeds = [], f"seeds=[{_joined(together)}]"
+    before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
+    options = ["--config-dir", config] if config else []
+    quoted = [shlex.quote(word) for word in [*options, *many, *words, seeds]]
     return " ".join([*before, "bin/train", *quoted])
+
+
+def _joined(seeds: Sequence[int]) -> str:
+    return ",".join(map(str, seeds))
 
 
 def _versions(run: Run) -> str:
