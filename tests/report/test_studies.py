@@ -112,7 +112,7 @@ def test_a_command_names_the_paths_that_it_was_given(tmp_path: Path) -> None:
     )
     given = [Path("/data/my sweeps"), Path("results/medium")]
     made = "bin/report '/data/my sweeps' results/medium --threshold=0.5 --baseline=plr"
-    assert report_command("bin/report", given, 0.5, "plr") == made
+    assert report_command("bin/report", given, 0.5, ["plr"]) == made
 
 
 def test_seeds_that_were_trained_side_by_side_are_again(tmp_path: Path) -> None:
