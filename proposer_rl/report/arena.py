@@ -136,13 +136,14 @@ def summary(arena: Arena) -> Table:
         )
     note = (
         f"Differences to {arena.reference} in the mean of the headline along training; the better "
-        "one is that of the higher mean on the task. Worst case: the lowest over tasks, with its "
-        "95 % interval; lowest end: of all tasks' intervals. Mean: all tasks count alike and are "
-        "taken as they are, so that its 95 % interval is over seeds: squared errors of the tasks "
-        "add up, with Satterthwaite's degrees of freedom. p: of the mean difference between the "
-        "first method and each other, on the tasks that both have, in pairs of runs where seeds "
-        "agree; by Student's t with the same errors, two-sided, corrected for the number of "
-        "methods (Holm). Intervals are not corrected. Methods that lack a task come last."
+        "one is that of the higher mean on the task, so that differences are rather too low than "
+        "too high. Worst case: the lowest over tasks, with its 95 % interval; lowest end: of all "
+        "tasks' intervals. Mean: all tasks count alike and are taken as they are, so that its 95 % "
+        "interval is over seeds: squared errors of the tasks add up, with Satterthwaite's degrees "
+        "of freedom. p: of the mean difference between the first method and each other, on the "
+        "tasks that both have, in pairs of runs where seeds agree; by Student's t with the same "
+        "errors, two-sided, corrected for the number of methods (Holm). Intervals are not "
+        "corrected. Methods that lack a task come last."
     )
     return Table("arena", f"Worst case and mean over {every} tasks", note, rows)
 
@@ -222,6 +223,7 @@ def _draw(figure: FigureBase, arena: Arena, rows: int, columns: int) -> None:
         axes.plot(found[worst].value, places[worst], "o", ms=10, mfc="none", mec="black", mew=0.9)
         axes.set_title(f"{label}\nworst {write(_worst(found).value, 2)}", fontsize=8)
         axes.set_yticks([*places.values()], [*places], fontsize=7)
+        axes.set_ylim(-0.8, len(places) - 0.2)
         axes.tick_params(axis="x", labelsize=7)
     for axes in grid.flat[max(len(arena.found) - columns, 0) : len(arena.found)]:
         axes.tick_params(labelbottom=True)  # nothing is below it
