@@ -208,7 +208,7 @@ def differences(arena: Arena) -> Drawing:
 
 def _draw(figure: FigureBase, arena: Arena, rows: int, columns: int) -> None:
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    places = {task: place for place, task in enumerate(reversed(arena.tasks))}
+    places = {task: place for place, task in enumerate(reversed([*arena.tasks]))}
     for axes in grid.flat[len(arena.found) :]:
         axes.set_axis_off()
     for axes, (label, found) in zip(grid.flat, arena.found.items(), strict=False):
