@@ -56,10 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _answer(options: argparse.Namespace) -> None:
     folders, output, seconds = options.folder, options.output, options.seconds
-    scores, threshold, baseline = options.scores, options.threshold, options.baseline
+    scores, threshold = options.scores, options.threshold
+    baselines = [] if options.baseline is None else [options.baseline]
     needed = needs([CONFIG_FOLDER])  # by methods whose runs do not tell
     check_output(output, CHOICE, STUDY)
-    studies, notes = read_checked(folders, threshold, baseline)
+    studies, notes = read_checked(folders, threshold, baselines)
     if len(studies) > 1:
         titles = "; ".join(study.title for study in studies)
         raise OutputError(f"the runs were not measured alike ({titles}); give fewer")
@@ -68,7 +69,7 @@ def _answer(options: argparse.Namespace) -> None:
         check_names(study.runs)
     given = {"--scores": [scores] if scores else [], "--seconds": seconds, "-o": [output]}
     more = [text for name, paths in given.items() if paths for text in (name, *map(str, paths))]
-    made = page.report_command("bin/research pages", folders, threshold, baseline, *more)
+    made = page.report_command("bin/research pages", folders, threshold, baselines, *more)
     ranked, *rounds = timed(study, read_timing(seconds)) if seconds else [study]
     others = generalisation_table(study, [] if scores is None else read_scores(scores))
     files: dict[str, bytes] = {}

@@ -20,14 +20,15 @@ import numpy as np
 import pandas as pd
 
 from proposer_rl.cli.errors import command
+from proposer_rl.report import arena
 from proposer_rl.report.figures import heat_maps, learning_curves
-from proposer_rl.report.page import document, report_command, section
+from proposer_rl.report.page import document, over_tasks, report_command, section
 from proposer_rl.report.reading import OutputError, find_runs, read_run
 from proposer_rl.report.runs import NAMES, STUDY, Run, tables, to_csv
 from proposer_rl.report.studies import read_studies
-from proposer_rl.report.style import in_few_colours, render
+from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.records import anywhere, encoded, printable
+from proposer_rl.runs.records import anywhere, encoded, from_here, printable
 
 MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (
@@ -108,18 +109,27 @@ def write_page(folder: Path) -> None:
     file, parts = folder / "README.md", []
     title = f"# {folder.name.replace('_', ' ').capitalize()}"
     above = file.read_text(encoding="utf-8").partition(MARK)[0] if file.is_file() else ""
+    compared = arena.arena(studies)
+    (folder / "figures").mkdir(exist_ok=True)
+    if compared is not None:
+        drawing = arena.differences(compared)
+        write_atomically(folder / f"figures/{drawing.name}.png", _picture(drawing))
+        parts.append(over_tasks(compared, "figures/"))
     for number, study in enumerate(studies):
         prefix = f"figures/{f'{number + 1}_' if number else ''}"
-        (folder / "figures").mkdir(exist_ok=True)
         drawings = [each for each in (learning_curves(study), heat_maps(study)) if each]
         for drawing in drawings:
-            (png,) = render(drawing, "png")
-            write_atomically(folder / f"{prefix}{drawing.name}.png", in_few_colours(png))
+            write_atomically(folder / f"{prefix}{drawing.name}.png", _picture(drawing))
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
-    command = report_command("bin/report", [folder], None, None)
+    command = anywhere(from_here(report_command("bin/report", [folder], None, ())))
     said = above.strip() or f"{title}\n\n{DATA}"
     write_atomically(file, encoded(document([said, MARK, *parts], command, [])))
+
+
+def _picture(drawing: Drawing) -> bytes:
+    (png,) = render(drawing, "png")
+    return in_few_colours(png)
 
 
 def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
@@ -170,9 +180,11 @@ def _six_digits(value: Any) -> Any:
 def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
     """A mapping without this machine's folders; of a checkpoint begun with its last two parts.
 
+    Paths inside the working folder, such as a repository's, are those from there.
+
     Seeds of Proposers are called by the folders above those of their last Solvers.
     """
-    text = json.dumps(dict(value))
+    text = from_here(json.dumps(dict(value)))
     if os.path.isabs(reused):
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
     found: dict[str, Any] = json.loads(anywhere(text))

@@ -122,7 +122,7 @@ PROSE = {
     "docs/explanation/filtering.md": 5,
     "docs/explanation/first_order.md#Results": 4,
     "docs/explanation/proposer.md#Results": 3,
-    "docs/explanation/results.md": 30,
+    "docs/explanation/results.md": 24,
     "docs/how_to/reuse_a_proposer.md": 2,
 }
 NUMBER = r"[−]?\d*\.\d+"

@@ -15,7 +15,7 @@ from submitit.core.utils import UncompletedJobError
 from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.train import main
 from proposer_rl.experiment import Experiment
-from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.recipes import CONFIG_FOLDER, available, file_content
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, locked
 from tests.commands import call
@@ -255,3 +255,38 @@ def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
         (frozen, "results/medium/proposer.pt", 107, "none"),
         ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
     ]
+
+
+def test_the_arena_is_one_command_and_one_more_method_one_more_row(
+    train, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = {}
+
+    def note(config: RunConfig, *_):
+        path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
+        made[path.as_posix()] = config
+        raise KeyError("enough")
+
+    monkeypatch.setattr("proposer_rl.cli.run.parts", note)
+    row = "+method=no_oracle/currot"
+    assert train("+sweep=arena_develop", "task=arena/hill", row) == 1
+    assert train("+sweep=arena", "task=arena/hill", "+method=ncc", "seeds=[1,2]") == 1
+    folder, seeds = "sweeps/arena/arena/hill", [*range(100, 110)]
+    few = made.pop(f"{folder}/ncc-none-seed_1-2")
+    assert few.method == "ncc" and few.seeds == [1, 2] and few.model is None
+    ((path, asks),) = made.items()
+    assert path == f"{folder}/currot-modelled-seed_{'-'.join(map(str, seeds))}"
+    assert asks.seeds == seeds and asks.model is not None
+
+
+def test_the_arena_has_every_task_in_one_half_and_known_rows() -> None:
+    planned = OmegaConf.load(CONFIG_FOLDER / "sweep/arena.yaml").hydra.sweeper.params
+    develop = OmegaConf.load(CONFIG_FOLDER / "sweep/arena_develop.yaml").hydra.sweeper.params
+    halves = [*planned.task.split(","), *develop.task.split(",")]
+    assert len(set(halves)) == len(halves)
+    assert {f"arena/{name}" for name in available("task/arena")} <= set(halves)
+    rows = planned["+method"].split(",")
+    assert {"target", "domain_randomization"} <= set(rows)
+    for row in rows:  # of what asks for success nothing asks more of the task than episodes
+        curriculum = file_content(f"method/{row}")["curriculum"]
+        assert curriculum.get("source", "episodes") == "episodes"

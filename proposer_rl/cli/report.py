@@ -47,7 +47,7 @@ def _run(options: argparse.Namespace) -> None:
         options.folder,
         options.output,
         options.threshold,
-        options.baseline,
+        options.baseline or (),
         progress=not options.quiet,
         meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
@@ -78,8 +78,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--baseline",
         metavar="METHOD",
+        action="append",
         help="what the others are measured against, as the report calls it (default: "
-        "domain_randomization, else the first)",
+        "domain_randomization, else the first); again for more, of which several tasks take the "
+        "better one (default: domain_randomization and target)",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

@@ -10,13 +10,14 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import figures, outcomes, page, runs
+from proposer_rl.report import arena, figures, outcomes, page, runs
 from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import Meanings, answer
 from proposer_rl.report.reading import OutputError, find_runs
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
+from proposer_rl.report.tables import Table
 from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
 from proposer_rl.runs.records import encoded, words
 
@@ -49,13 +50,15 @@ SELECTION = {
 
 
 def read_checked(
-    folders: Sequence[Path], threshold: float | None, baseline: str | None
+    folders: Sequence[Path], threshold: float | None, baselines: Sequence[str]
 ) -> tuple[list[Study], list[str]]:
     """The studies of the runs in some folders; see :func:`write_report`."""
-    studies, notes = read_studies(find_runs(folders), threshold, baseline)
+    first = next(iter(baselines), None)
+    studies, notes = read_studies(find_runs(folders), threshold, first)
     labels = sorted({group.label for study in studies for group in study.compared})
-    if baseline not in (None, *labels):
-        raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
+    for baseline in baselines:
+        if baseline not in labels:
+            raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
     for study in studies:
         if threshold is not None and not can_reach(study.headline, threshold):
             raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
@@ -66,7 +69,7 @@ def write_report(
     folders: Sequence[Path],
     output: Path,
     threshold: float | None = None,
-    baseline: str | None = None,
+    baselines: Sequence[str] = (),
     progress: bool = True,
     meanings: Meanings | None = None,
 ) -> Path:
@@ -76,18 +79,23 @@ def write_report(
         folders: of runs, or with runs in them.
         output: folder to write to; a report in it is replaced, other files stay.
         threshold: of the headline measurement, in place of the runs' own.
-        baseline: label of the method that the others are measured against; None for
-            ``domain_randomization`` or, where that is missing, the first.
+        baselines: labels of methods that the others are measured against: on each task the first,
+            over several tasks the best of all. Without any ``domain_randomization`` or, where that
+            is missing, the first; over several tasks ``domain_randomization`` and ``target``.
         progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
-    studies, notes = read_checked(folders, threshold, baseline)
+    studies, notes = read_checked(folders, threshold, baselines)
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
     title = "Curricula: what the runs show"
     parts = [f"# {title}", f"The whole report is [{PAGE}]({PAGE}), one file for a browser."]
+    over_tasks, compared = None, arena.arena(studies, baselines)
+    if compared is not None:
+        over_tasks = _over_tasks(compared, files)
+        parts.append(page.over_tasks(compared, f"{FIGURES}/"))
     with tqdm(
         total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
     ) as bar:
@@ -97,8 +105,10 @@ def write_report(
                 prefix += f"{len(sections) + 1}_"
             sections.append(_section(study, prefix, files, bar, meanings or {}))
             parts.append(page.section(study, f"{FIGURES}/{prefix}"))
-    command = page.report_command("bin/report", folders, threshold, baseline)
-    html = page.render(title=title, command=command, sections=sections, notes=notes)
+    command = page.report_command("bin/report", folders, threshold, baselines)
+    html = page.render(
+        title=title, command=command, sections=sections, notes=notes, arena=over_tasks
+    )
     files["report.md"] = encoded(page.document(parts, command, notes))
     for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
         if path.is_dir() and not path.is_symlink():
@@ -121,15 +131,34 @@ def check_output(output: Path, *signs: str) -> None:
         )
 
 
+def _over_tasks(compared: arena.Arena, files: dict[str, bytes]) -> page.Section:
+    """What the page shows of several tasks first; its files are added to the others."""
+    tables = [arena.summary(compared), arena.task_table(compared)]
+    _add(tables, "", files)
+    drawing = arena.differences(compared)
+    svg, png = render(drawing, "svg", "png")
+    files |= {f"{FIGURES}/{drawing.name}.svg": svg, f"{FIGURES}/{drawing.name}.png": png}
+    return {
+        "answer": arena.answer(compared),
+        "summary": tables[0],
+        "tasks": tables[1],
+        "figure": page.figure(drawing, png),
+    }
+
+
+def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
+    for table in tables:
+        files[f"{TABLES}/{prefix}{table.name}.csv"] = encoded(table.to_csv())
+        files[f"{TABLES}/{prefix}{table.name}.md"] = encoded(table.to_markdown())
+
+
 def _section(
     study: Study, prefix: str, files: dict[str, bytes], bar: tqdm, meanings: Meanings
 ) -> page.Section:
     """What the page shows of a study; its files are added to the others."""
     methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
-    for table in (methods, *tables):
-        files[f"{TABLES}/{prefix}{table.name}.csv"] = encoded(table.to_csv())
-        files[f"{TABLES}/{prefix}{table.name}.md"] = encoded(table.to_markdown())
+    _add([methods, *tables], prefix, files)
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = runs.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": runs.to_csv(own) for name, own in rows.items()}

@@ -8,7 +8,7 @@ import hashlib
 import io
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
+from proposer_rl.report import arena
 from proposer_rl.report.outcomes import Meanings, against_baseline, answer, group_table, meaning
 from proposer_rl.report.runs import COST, Run
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import DASHES, DPI, Drawing, in_few_colours
-from proposer_rl.report.tables import escape_markdown
+from proposer_rl.report.tables import Table, escape_markdown
 from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
@@ -125,18 +126,21 @@ def incomplete(study: Study) -> list[str]:
 
 
 def commands(study: Study) -> list[str]:
-    """What each group was started with; seeds that differ in nothing else in one command."""
+    """What each group was started with; seeds that differ in nothing else in one command.
+
+    Seeds that were trained side by side are again, since on some tasks they draw other numbers
+    alone.
+    """
     found = []
     for group in study.groups:
         seeds: dict[str, list[int]] = {}
         for run in group.runs:
             seeds.setdefault(_command(run), []).append(run.seed)
-        found += [
-            f"{command} seed={','.join(map(str, with_them))}"
-            if command
-            else f"# {group.label}: the command was not recorded"
-            for command, with_them in seeds.items()
-        ]
+        for command, own in seeds.items():
+            if not command:
+                found.append(f"# {group.label}: the command was not recorded")
+            else:
+                found.append(f"{command}{_joined(own)}" if command.endswith("=") else command)
     return found
 
 
@@ -157,17 +161,17 @@ def report_command(
     program: str,
     folders: Sequence[Path],
     threshold: float | None,
-    baseline: str | None,
+    baselines: Sequence[str],
     *more: str,
 ) -> str:
-    """What writes this report again, without the places of this machine."""
+    """What writes this report again, from the same folder."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
-    asked += [] if baseline is None else [f"--baseline={baseline}"]
-    return anywhere(f"{program} {shlex.join([*map(str, folders), *asked, *more])}")
+    asked += [f"--baseline={baseline}" for baseline in baselines]
+    return f"{program} {shlex.join([*map(str, folders), *asked, *more])}"
 
 
 def _command(run: Run) -> str:
-    """What started a run, but for its seed; empty where that is not known in full."""
+    """What started a run, ending in ``seed=`` where it had but one; empty where it is not known."""
     overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
     if not isinstance(overrides, list) or not isinstance(arguments, dict):
         return ""
@@ -182,10 +186,20 @@ def _command(run: Run) -> str:
     # A task or curriculum of one's own that prl.train was given is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
-    before = [f"PYTHONPATH={shlex.quote(anywhere(paths))}"] if paths else []
-    options = ["--config-dir", config, "-m"] if config else ["-m"]
-    quoted = [shlex.quote(anywhere(word)) for word in [*options, *words]]
+    many, seeds = ["-m"], "seed="
+    if run.shared_by > 1:
+        together = run.config.get("seeds")
+        if not (isinstance(together, list) and all(isinstance(seed, int) for seed in together)):
+            return ""
+        many, seeds = [], f"seeds=[{_joined(together)}]"
+    before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
+    options = ["--config-dir", config] if config else []
+    quoted = [shlex.quote(word) for word in [*options, *many, *words, seeds]]
     return " ".join([*before, "bin/train", *quoted])
+
+
+def _joined(seeds: Sequence[int]) -> str:
+    return ",".join(map(str, seeds))
 
 
 def _versions(run: Run) -> str:
@@ -212,19 +226,36 @@ def section(study: Study, figures: str) -> str:
     if short := incomplete(study):
         text = f"Not finished, or shorter than {study.horizon} updates"
         about = [*about, (text, ", ".join(short))]
-    methods, pairs = group_table(study), against_baseline(study)
+    tables = group_table(study), against_baseline(study)
     parts = [
         f"## {escape_markdown(study.title)}",
         escape_markdown(" ".join(answer(study))),
         "\n".join(f"- {escape_markdown(f'{name}: {text}')}" for name, text in about),
         f"![Learning curves and updates to the threshold]({figures}learning_curves.png)",
     ]
-    for table in (methods, pairs):
+    parts += _tables(tables)
+    made = "\n".join(commands(study))
+    return "\n\n".join([*parts, "### Commands", f"```bash\n{made}\n```"])
+
+
+def over_tasks(compared: arena.Arena, figures: str) -> str:
+    """What methods reach over several tasks: the answer, the tables and their figure."""
+    drawing = arena.differences(compared)
+    summary, by_task = arena.summary(compared), arena.task_table(compared)
+    picture = f"![{escape_markdown(drawing.title)}]({figures}{drawing.name}.png)"
+    said = escape_markdown(" ".join(arena.answer(compared)))
+    return "\n\n".join(
+        ["## Over all tasks", said, *_tables([summary]), picture, *_tables([by_task])]
+    )
+
+
+def _tables(tables: Iterable[Table]) -> list[str]:
+    parts = []
+    for table in tables:
         if table.rows:
             parts += [f"### {escape_markdown(table.title)}", escape_markdown(table.note)]
             parts.append(table.to_markdown().strip())
-    made = "\n".join(commands(study))
-    return "\n\n".join([*parts, "### Commands", f"```bash\n{made}\n```"])
+    return parts
 
 
 def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:

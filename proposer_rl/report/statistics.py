@@ -97,6 +97,20 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
     return Estimate(value, math.sqrt(sum(squares)), float(sum(squares) ** 2 / sum(parts)))
 
 
+def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
+    """Mean of independent estimates, which count alike: their squared errors add up.
+
+    With Satterthwaite's degrees of freedom (Biometrics Bulletin 2, 1946). Without an error where
+    one is not known, or none has any.
+    """
+    value = float(np.mean([one.value for one in found]))
+    squares = [one.error**2 for one in found]
+    if not sum(squares) > 0:
+        return Estimate(value, math.nan, 1.0)
+    parts = [square**2 / one.freedom for square, one in zip(squares, found, strict=True)]
+    return Estimate(value, math.sqrt(sum(squares)) / len(found), sum(squares) ** 2 / sum(parts))
+
+
 def balanced(one: Values, other: Values) -> Estimate:
     """Welch's difference if both had as many values as the fewer, and the variances seen."""
     a, b = (np.asarray(values, dtype=float) for values in (one, other))

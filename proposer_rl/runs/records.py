@@ -143,6 +143,11 @@ def encoded(text: str) -> bytes:
     return text.encode("utf-8", "replace")
 
 
+def from_here(text: str) -> str:
+    """Text whose paths inside the working folder begin there, as they do on any machine."""
+    return re.sub(rf"(?<![\w./]){re.escape(str(Path.cwd()))}/", "", text)
+
+
 def anywhere(text: str) -> str:
     """Text without the folders of the machine it comes from: of a whole path the last part."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)

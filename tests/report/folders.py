@@ -91,7 +91,7 @@ def write_run(
     what is reached on every single level at the end, on every distribution.
     """
     run = RunFolder(folder)
-    settings = config(method, seeds[0], **changes)
+    settings = config(method, seeds[0], **{"seeds": list(seeds), **changes})
     run.write_json("config.json", settings)
     kind = settings["schedule"]["headline"].rpartition("_")[2]
     level = LEVEL if task is TASK else {"picture": png(np.full((8, 8, 3), 7))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from proposer_rl.report.charts import charts
 from proposer_rl.report.comparisons import primary
 from proposer_rl.report.measures import COSTS
 from proposer_rl.report.outcomes import comparison_table, group_table
-from proposer_rl.report.page import commands, document, incomplete
+from proposer_rl.report.page import commands, document, incomplete, report_command
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from research.ranking import ranking, spread
@@ -99,16 +100,37 @@ def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> 
     ]
 
 
-def test_a_command_is_complete_without_the_folders_of_its_machine(tmp_path: Path) -> None:
+def test_a_command_names_the_paths_that_it_was_given(tmp_path: Path) -> None:
     arguments = {"config_dir": "/home/somebody/my conf", "pythonpath": "/home/x/code:/srv/y/lib"}
     overrides = ["+method=mine", "task.file=/data/z/levels.txt"]
     write_run(tmp_path / "a", facts={"arguments": arguments, "overrides": overrides})
     (study,), _ = read(tmp_path)
     (command,) = commands(study)
     assert command == (
-        "PYTHONPATH=code:lib bin/train --config-dir 'my conf' -m +method=mine "
-        "task.file=levels.txt seed=0"
+        "PYTHONPATH=/home/x/code:/srv/y/lib bin/train --config-dir '/home/somebody/my conf' -m "
+        "+method=mine task.file=/data/z/levels.txt seed=0"
     )
+    given = [Path("/data/my sweeps"), Path("results/medium")]
+    made = "bin/report '/data/my sweeps' results/medium --threshold=0.5 --baseline=plr"
+    assert report_command("bin/report", given, 0.5, ["plr"]) == made
+
+
+def test_seeds_that_were_trained_side_by_side_are_again(tmp_path: Path) -> None:
+    """In their order: on Gymnasium's tasks a seed draws other numbers alone."""
+    for name, seeds in {"a": [5, 3, 4], "b": [0, 1], "c": [7]}.items():
+        words = [f"seeds={seeds}" if len(seeds) > 1 else f"seed={seeds[0]}"]
+        overrides = ["task=cartpole", "+method=plr", *words, "+sweep=own"]
+        write_run(tmp_path / name, "plr", seeds, facts={"overrides": overrides})
+    hostile = write_run(tmp_path / "d", "plr", [8, 9], facts={"overrides": overrides})
+    settings = hostile / "config.json"
+    settings.write_text(json.dumps({**json.loads(settings.read_text()), "seeds": "`x`"}))
+    (study,), _ = read(tmp_path)
+    assert commands(study) == [
+        "bin/train task=cartpole +method=plr 'seeds=[0,1]'",
+        "bin/train task=cartpole +method=plr 'seeds=[5,3,4]'",
+        "bin/train -m task=cartpole +method=plr seed=7",
+        "# plr: the command was not recorded",
+    ]
 
 
 @pytest.mark.parametrize(

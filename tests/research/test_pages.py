@@ -236,7 +236,7 @@ def test_the_same_runs_give_the_same_pages(
 ) -> None:
     monkeypatch.setattr("research.pages.DRAWINGS", [learning_curves, cost_curves])
     folders = sorted(map(str, runs.iterdir()), reverse=True)
-    command = f"bin/research pages {runs.name} -o {pages.name}"
+    command = f"bin/research pages {runs} -o {pages}"  # as it can be given again
     before = contents(pages)
     assert set(before) >= {CHOICE, CLAIMS, "figures/cost.png", "figures/proposals.png"}
     main([*folders, "-o", str(tmp_path / "again")])
@@ -312,7 +312,7 @@ def test_seconds_can_be_those_of_methods_timed_in_turns(tmp_path: Path) -> None:
     main([str(tmp_path / "runs"), "-o", str(tmp_path / "pages"), "--seconds", str(file)])
     text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
     assert "turns on one machine (abacus, threads: 3): medians of the rounds; a difference" in text
-    assert "--seconds seconds.json -o pages" in text
+    assert f"--seconds {file} -o {tmp_path / 'pages'}" in text
     (row,) = (line for line in text.splitlines() if line.startswith(f"| {NOTHING} |"))
     *others, last = row.split(" | ")
     assert last.startswith("**accel**") and last.endswith(", no significant difference to plr |")
@@ -376,7 +376,7 @@ def test_further_methods_are_timed_beside_some_of_the_others(tmp_path: Path) -> 
     files = [str(first), str(later)]
     main([str(tmp_path / "runs"), "--seconds", *files, "-o", str(tmp_path / "pages")])
     text = (tmp_path / "pages" / CHOICE).read_text(encoding="utf-8")
-    assert "--seconds first.json later.json -o pages" in text
+    assert f"--seconds {first} {later} -o {tmp_path / 'pages'}" in text
     with pytest.raises(UnreadableRun, match=r"other.json: has methods .* beside none of: plr"):
         read_timing([first, write_seconds(tmp_path / "other.json", {"ncc": [1.0]})])
 

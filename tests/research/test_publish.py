@@ -115,6 +115,18 @@ def test_a_study_has_no_pictures_and_names_no_folder_of_the_machine(
     assert facts["arguments"] == {"config_dir": "conf", "pythonpath": "code"}
 
 
+def test_a_path_inside_the_working_folder_stays_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = f"{tmp_path}/results/medium/proposer.pt"
+    facts = {"overrides": ["+method=frozen_proposer", f"checkpoint={given}", "seed=0"]}
+    write_run(tmp_path / "runs" / "a", "frozen_proposer", [0], facts=facts, checkpoint=given)
+    (run,) = read_run(published(tmp_path / "runs", tmp_path / "results" / "light"))
+    assert run.config["checkpoint"] == "results/medium/proposer.pt"
+    assert run.facts["overrides"][1] == "checkpoint=results/medium/proposer.pt"
+
+
 def test_runs_of_other_checkpoints_are_published(tmp_path: Path) -> None:
     for life in range(3):
         given = f"{tmp_path}/lives/{life}/lifetime_2"

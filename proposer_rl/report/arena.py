@@ -1,0 +1,256 @@
+"""Methods over several tasks: on each against the better of the baselines, worst case first."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from proposer_rl.report import statistics
+from proposer_rl.report.comparisons import difference, primary
+from proposer_rl.report.statistics import ERROR, FEWEST, Estimate
+from proposer_rl.report.studies import USUAL_BASELINE, Study
+from proposer_rl.report.style import BLUE, VERMILLION, Drawing
+from proposer_rl.report.tables import Cell, Table, write
+from proposer_rl.runs.folder import is_rate
+
+USUAL_BASELINES = (USUAL_BASELINE, "target")
+COLUMNS = 4  # of the figure
+
+
+@dataclass(frozen=True)
+class Arena:
+    """Tasks that have all baselines, and the methods on them.
+
+    Attributes:
+        tasks: by their names, in the order of these.
+        baselines: their labels.
+    """
+
+    tasks: Mapping[str, Study]
+    baselines: tuple[str, ...]
+
+    @property
+    def reference(self) -> str:
+        """What methods are measured against, in words."""
+        *others, last = self.baselines
+        return f"the better of {', '.join(others)} and {last}" if others else last
+
+    def difference(self, task: str, one: str, other: str) -> Estimate | None:
+        """How two methods differ in the mean headline along training; None if one is not there."""
+        study = self.tasks[task]
+        groups = [study.group(label) for label in (one, other)]
+        if groups[0] is None or groups[1] is None:
+            return None
+        outcome = primary(study)
+        found = difference(outcome, groups[0], groups[1])
+        few = min(len(group.runs) for group in groups if group) < FEWEST
+        # Without spread, as where nobody ever succeeds, a task adds nothing to the error of a mean.
+        return found if few or not math.isnan(found.error) else found._replace(error=0.0)
+
+    @cached_property
+    def better(self) -> dict[str, str]:
+        """The baseline of the highest mean on every task."""
+        return {
+            task: max(self.baselines, key=lambda label: _mean(study, label))
+            for task, study in self.tasks.items()
+        }
+
+    @cached_property
+    def found(self) -> dict[str, dict[str, Estimate]]:
+        """The difference to the better baseline by method and task, the best worst case first.
+
+        Methods that lack a task come after those that have all.
+        """
+        labels = {group.label for study in self.tasks.values() for group in study.compared}
+        every = {
+            label: {
+                task: own
+                for task in self.tasks
+                if (own := self.difference(task, label, self.better[task])) is not None
+            }
+            for label in sorted(labels)
+        }
+        order = sorted(every, key=lambda label: (-len(every[label]), -_worst(every[label]).value))
+        return {label: every[label] for label in order}
+
+    @cached_property
+    def leads(self) -> dict[str, tuple[Estimate, float]]:
+        """How far the first method is before each other in the mean, with Holm's p-value."""
+        first, *others = self.found
+        means = [statistics.mean_of_estimates(self._common(first, other)) for other in others]
+        corrected = statistics.holm([mean.p for mean in means])
+        return dict(zip(others, zip(means, corrected, strict=True), strict=True))
+
+    def _common(self, one: str, other: str) -> list[Estimate]:
+        found = (self.difference(task, one, other) for task in self.tasks)
+        return [each for each in found if each is not None]
+
+
+def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
+    """The tasks of some studies that have all baselines and measure a rate; None of fewer than two.
+
+    Args:
+        studies: each a task.
+        baselines: labels; of none uniform levels and the target alone.
+    """
+    chosen = tuple(baselines or USUAL_BASELINES)
+    fit = [
+        study
+        for study in studies
+        if is_rate(study.headline) and all(study.group(label) for label in chosen)
+    ]
+    if len(fit) < 2:
+        return None
+    names = _names(fit)
+    return Arena(dict(sorted(zip(names, fit, strict=True))), chosen)
+
+
+def summary(arena: Arena) -> Table:
+    """A row for each method: the worst case over tasks, the mean, and how far the first leads."""
+    first, *_ = arena.found
+    rows: list[dict[str, Cell]] = []
+    every = len(arena.tasks)
+    for label, found in arena.found.items():
+        ends = {task: one.interval().low for task, one in found.items()}
+        known = not any(map(math.isnan, ends.values()))
+        lowest = min(ends, key=ends.__getitem__) if known else None
+        lead, p = arena.leads.get(label, (None, None))
+        rows.append(
+            {
+                "method": label,
+                "tasks": every if len(found) == every else f"{len(found)} of {every}",
+                "worst case": _worst(found).interval(),
+                "its task": _worst_task(found),
+                "lowest end": None if lowest is None else ends[lowest],
+                "the end's task": lowest,
+                "mean over tasks": statistics.mean_of_estimates([*found.values()]).interval(),
+                f"{first} minus it, mean over tasks": lead and lead.interval(),
+                "p (Holm)": p,
+            }
+        )
+    note = (
+        f"Differences to {arena.reference} in the mean of the headline along training; the better "
+        "one is that of the higher mean on the task, so that differences are rather too low than "
+        "too high. Worst case: the lowest over tasks, with its 95 % interval; lowest end: of all "
+        "tasks' intervals. Mean: all tasks count alike and are taken as they are, so that its 95 % "
+        "interval is over seeds: squared errors of the tasks add up, with Satterthwaite's degrees "
+        "of freedom. p: of the mean difference between the first method and each other, on the "
+        "tasks that both have, in pairs of runs where seeds agree; by Student's t with the same "
+        "errors, two-sided, corrected for the number of methods (Holm). Intervals are not "
+        "corrected. Methods that lack a task come last."
+    )
+    return Table("arena", f"Worst case and mean over {every} tasks", note, rows)
+
+
+def task_table(arena: Arena) -> Table:
+    """A row for each method and task: the differences to every baseline and to the better one."""
+    rows: list[dict[str, Cell]] = []
+    for label, found in arena.found.items():
+        for task, to_better in found.items():
+            group = arena.tasks[task].group(label)
+            row: dict[str, Cell] = {
+                "method": label,
+                "task": task,
+                "seeds": len(group.runs) if group else 0,
+                "mean along training": _mean(arena.tasks[task], label),
+            }
+            for baseline in arena.baselines:
+                own = arena.difference(task, label, baseline) if label != baseline else None
+                row[f"minus {baseline}"] = own and own.interval()
+            if len(arena.baselines) > 1:
+                row |= {"minus the better": to_better.interval(), "the better": arena.better[task]}
+            rows.append(row)
+    note = (
+        "Differences of means over seeds with 95 % intervals, not corrected: Student's over pairs "
+        f"of runs where both have the same seeds, else Welch's; with fewer than {FEWEST} seeds "
+        "none."
+    )
+    return Table("arena_tasks", "Task by task", note, rows)
+
+
+def answer(arena: Arena) -> tuple[str, str]:
+    """Which method has the best worst case, and whether it is better in the mean than others."""
+    first, found = next(iter(arena.found.items()))
+    worst = write(_worst(found).interval())
+    beaten = [p <= ERROR and lead.value > 0 for lead, p in arena.leads.values()]
+    lost = [label for label, (lead, p) in arena.leads.items() if p <= ERROR and lead.value < 0]
+    behind = f", and significantly worse than {', '.join(lost)}" if lost else ""
+    return (
+        f"Of {len(arena.found)} methods on {len(arena.tasks)} tasks, {first} has the best worst "
+        f"case: a difference of {worst} to {arena.reference}, on {_worst_task(found)}.",
+        f"In the mean over tasks it is significantly better than {sum(beaten)} of the "
+        f"{len(beaten)} others{behind}.",
+    )
+
+
+def differences(arena: Arena) -> Drawing:
+    """Every method's difference to the better baseline on every task, with its interval."""
+    count = len(arena.found)
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
+    size = (1.6 + 2.2 * columns, 0.7 + (0.75 + 0.19 * len(arena.tasks)) * rows)
+    return Drawing(
+        "arena",
+        f"Difference to {arena.reference}, task by task",
+        "Mean of the headline along training, method minus baseline, with its 95 % interval. Blue "
+        "is better, red is worse, hollow is neither; the ring is the method's worst case.",
+        [partial(_draw, arena=arena, rows=rows, columns=columns)],
+        1,
+        size=size,
+    )
+
+
+def _draw(figure: FigureBase, arena: Arena, rows: int, columns: int) -> None:
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    places = {task: place for place, task in enumerate(reversed([*arena.tasks]))}
+    for axes in grid.flat[len(arena.found) :]:
+        axes.set_axis_off()
+    for axes, (label, found) in zip(grid.flat, arena.found.items(), strict=False):
+        axes.axvline(0, color="0.4", linewidth=0.8)
+        for task, estimate in found.items():
+            value, low, high = estimate.interval()
+            colour = BLUE if low > 0 else VERMILLION if high < 0 else "0.45"
+            y, face = places[task], "white" if colour == "0.45" else colour
+            axes.plot([low, high], [y, y], color=colour, linewidth=1.6)
+            axes.plot(value, y, "o", ms=5, mfc=face, mec=colour, mew=1.1)
+        worst = _worst_task(found)
+        axes.plot(found[worst].value, places[worst], "o", ms=10, mfc="none", mec="black", mew=0.9)
+        axes.set_title(f"{label}\nworst {write(_worst(found).value, 2)}", fontsize=8)
+        axes.set_yticks([*places.values()], [*places], fontsize=7)
+        axes.set_ylim(-0.8, len(places) - 0.2)
+        axes.tick_params(axis="x", labelsize=7)
+    for axes in grid.flat[max(len(arena.found) - columns, 0) : len(arena.found)]:
+        axes.tick_params(labelbottom=True)  # nothing is below it
+        axes.set_xlabel("difference", fontsize=8)
+
+
+def _mean(study: Study, label: str) -> float:
+    group = study.group(label)
+    return float(np.mean(primary(study).values(group))) if group else math.nan
+
+
+def _worst_task(found: Mapping[str, Estimate]) -> str:
+    return min(found, key=lambda task: found[task].value)
+
+
+def _worst(found: Mapping[str, Estimate]) -> Estimate:
+    return found[_worst_task(found)]
+
+
+def _names(studies: Sequence[Study]) -> list[str]:
+    """What the tasks were called on the command lines, or else their titles; each but once."""
+    names, seen = [], Counter[str]()
+    for study in studies:
+        given = study.example.facts.get("overrides")
+        words = [word for word in given if isinstance(word, str)] if isinstance(given, list) else []
+        called = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+        name = next((name for name in called if name.isprintable()), study.title)
+        seen[name] += 1
+        names.append(f"{name} #{seen[name]}" if seen[name] > 1 else name)
+    return names
