@@ -295,12 +295,7 @@ class Modelled(Combinator):
         return super().improve(_answering(student, self._predict), streams)
 
     def log(self) -> dict[str, Any]:
-        """Returns also how right the model was about levels before it saw their outcomes.
-
-        ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``,
-        that of one number for all; ``reliability``, for each tenth of the probabilities how many
-        were predicted there, their mean, and the mean of what it was; of each student.
-        """
+        """Returns also how right the model was, as :func:`calibration`."""
         self._take_in()
         log = super().log()
         if not self._seen:
@@ -309,22 +304,7 @@ class Modelled(Combinator):
             torch.cat([seen[name] for seen in self._seen], 1) for name in ("predicted", "label")
         )
         self._seen = []
-        part = (predicted * PARTS).long().clamp(max=PARTS - 1)
-        sums = [
-            torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
-            for values in (torch.ones_like(label), predicted, label)
-        ]
-        means = [(total / sums[0].clamp(min=1)).tolist() for total in sums[1:]]
-        constant = (label - label.mean(1, keepdim=True)).square().mean(1)
-        return log | {
-            "brier": (predicted - label).square().mean(1).tolist(),
-            "brier_constant": constant.tolist(),
-            "reliability": {
-                "levels": sums[0].long().tolist(),
-                "predicted": means[0],
-                "reached": means[1],
-            },
-        }
+        return log | calibration(predicted, label)
 
     def _judge(self, outcome: TensorDictBase) -> None:
         """Warns where the first outcomes show that the labels say little."""
@@ -368,6 +348,35 @@ class Modelled(Combinator):
         if wrong:
             raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
         return phi
+
+
+def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
+    """Returns how right a model was about levels before it saw what came of them, for JSON.
+
+    ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``, that
+    of one number for all; ``reliability``, for each tenth of the probabilities how many were
+    predicted there, their mean, and the mean of what it was; of each student.
+
+    Args:
+        predicted: probabilities float64 [K, m].
+        label: in [0, 1], float64 [K, m].
+    """
+    part = (predicted * PARTS).long().clamp(max=PARTS - 1)
+    sums = [
+        torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
+        for values in (torch.ones_like(label), predicted, label)
+    ]
+    means = [(total / sums[0].clamp(min=1)).tolist() for total in sums[1:]]
+    constant = (label - label.mean(1, keepdim=True)).square().mean(1)
+    return {
+        "brier": (predicted - label).square().mean(1).tolist(),
+        "brier_constant": constant.tolist(),
+        "reliability": {
+            "levels": sums[0].long().tolist(),
+            "predicted": means[0],
+            "reached": means[1],
+        },
+    }
 
 
 class _Fitted(NamedTuple):

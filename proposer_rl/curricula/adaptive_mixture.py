@@ -1,0 +1,333 @@
+"""A mixture of the target, uniform sampling and a way between them; its shares follow what is seen.
+
+Every batch has three arms: levels of the **target** itself; **uniform** ones of the whole space; and
+the **way**: levels that a belief holds for mastered, as near to the target as there are. With b what
+was seen of success on the target lately (below), their shares are
+
+    t = low + (HIGH - low) b / (b + HALF),      w = (1 - t) q,      u = (1 - t) (1 - q).
+
+The target gets more the more often it is solved: there training pays most. While it is never
+solved, ``low`` lies between FLOOR, where all of its episodes return the same and so teach nothing,
+and LOW, where they differ as much as any others. Of what is left the way gets a part q that grows
+with the skill of the belief, 1 - its squared errors on uniform levels over those of their mean.
+Uniform sampling is never given up, as beliefs may be wrong: with little skill it leads.
+
+For the way, each of some draws of the target gets the candidate of its own that is nearest to it
+among those whose expected success is at least ``delta``, by optimal assignment with squared
+distances, less a bonus for learnability, 4 p (1 - p). Candidates are new levels of the space and
+levels between those of the last batch's way and the target (where the space knows what lies between
+two levels): the interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via
+Constrained Optimal Transport" (ICML), with particles in place of bins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any
+
+import torch
+from annotated_types import Ge
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+
+from proposer_rl.curricula.batches import packed
+from proposer_rl.curricula.belief import Belief
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.student import Student
+from proposer_rl.settings import Count, Share, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Distribution, Levels, Space, level_inputs
+
+Inputs = Callable[[Levels], Tensor]
+"""What is known of levels [*B]: float [*B, D], each about -1 to 1."""
+
+ARMS = ("target", "uniform", "way")
+TARGET, UNIFORM, WAY = range(3)
+NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
+AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
+FORBIDDEN = 1e3  # cost of a candidate that is not mastered
+FAILURES = 4.0  # on the target, that are taken for seen at the beginning
+SHOWN = 6  # levels of each arm that a reader is shown
+EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
+
+
+class AdaptiveMixture(Curriculum):
+    """Mixes the target, uniform sampling and a way between them by what was seen of each.
+
+    See the module for the equations. Labels are successes where they are told; else returns, as
+    shares of the range from the lowest to the highest that was seen. It asks nothing of a student,
+    so that it costs no frames and no oracle.
+
+    Args:
+        space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
+            ``items(levels)`` the numbers of levels that come back one by one.
+        target: what is to be mastered; None where all levels of the space count: then there are
+            the uniform arm and the way alone, whose levels are learnable ones near to uniform ones.
+        inputs: what the belief knows of levels; None for what the space says, see
+            :func:`~proposer_rl.task.level_inputs`.
+        delta: least expected success of a level of the way.
+        half_life: batches after which the belief counts an outcome half.
+        times: candidates for each level of the way.
+    """
+
+    remembers = ("_inbox", "_sums", "_best", "_lowest", "_highest", "_told")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution | None = None,
+        inputs: Inputs | None = None,
+        *,
+        delta: Share = 0.3,
+        half_life: Annotated[float, Ge(1)] = 12.0,
+        times: Count = 4,
+        learn: float = 0.2,
+        floor: Share = 0.1,
+        low: float = 0.25,
+        high: float = 0.9,
+        half: float = 0.1,
+        memory: float = 6.0,
+        remember: float = 20.0,
+        skilled: float = 0.4,
+        shares: list[float] | None = None,
+    ) -> None:
+        self._space, self._target = space, target
+        self._known = inputs or partial(level_inputs, space)
+        self._delta, self._half_life, self._times = delta, half_life, times
+        self._learn, self._floor, self._low, self._high = learn, floor, low, high
+        self._half, self._memory, self._remember, self._skilled = half, memory, remember, skilled
+        self._given = shares
+        self._inbox = Inbox()
+        self._belief: Belief | None = None
+        self._sums = torch.zeros(0, len(ARMS), 5, dtype=torch.float64)
+        self._best = torch.zeros(0, dtype=torch.float64)  # label of the target
+        self._lowest = torch.full((0,), torch.inf, dtype=torch.float64)  # return
+        self._highest = -self._lowest
+        self._told = False  # whether success is told
+        self._last: dict[str, Levels] = {}  # on the way, of each student [m]
+        self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and its label [K, m]
+        self._shown: dict[str, Any] = {}
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Returns levels [K, n] of the three arms, in a random order."""
+        self._begin(len(streams))
+        assert self._belief is not None
+        self._take_in()
+        shares = self._shares()
+        made = [self._batch(k, count, shares[k], own) for k, own in enumerate(streams)]
+        levels, arms = (torch.stack(one) for one in zip(*made, strict=True))
+        inputs, items = self._inputs(levels), self._items(levels)
+        predicted = self._belief.predict(inputs, items)
+        self._show(levels[0], arms[0])
+        notes = {"arm": arms, "inputs": inputs, "predicted": predicted}
+        return self._inbox.batch(levels, **notes, **({} if items is None else {"items": items}))
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Keeps what came of levels, which the next proposal learns from."""
+        self._inbox.check(batch, outcome)
+        results = {
+            name: outcome[name].double().cpu()
+            for name in ("return", "success")
+            if name in outcome.keys()
+        }
+        self._inbox.put(batch, **batch.notes.exclude("number", "place", "size"), **results)
+
+    def log(self) -> dict[str, Any]:
+        """Returns the shares and what they follow from, and how right the belief was.
+
+        ``shares`` of the arms, ``target_success``, b, ``target_signal``, how much returns on the
+        target differ in units of all, and ``skill`` of the belief, each student's; and as
+        :func:`~proposer_rl.curricula.outcome_model.calibration`.
+        """
+        self._take_in()
+        shown, self._shown = self._shown, {}
+        if self._seen:
+            predicted, label = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
+            shown |= calibration(predicted, label)
+            self._seen = []
+        return shown
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns also the belief, and the last levels of the way."""
+        belief = {} if self._belief is None else self._belief.state_dict()
+        last = {student: packed(levels) for student, levels in self._last.items()}
+        return {**super().state_dict(), "belief": belief, "last": last}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` returned."""
+        if state["belief"]:
+            self._begin(len(state["best"]))
+            assert self._belief is not None
+            self._belief.load_state_dict(state["belief"])
+        super().load_state_dict(state)
+        like = type(self._space.sample(1, torch.Generator()))
+        self._last = {k: like.from_dict(one, batch_dims=1) for k, one in state["last"].items()}
+
+    def _begin(self, students: int) -> None:
+        if self._belief is not None:
+            return
+        one = self._space.sample(1, torch.Generator())
+        items = 0 if self._items(one) is None else self._space.size
+        width = self._inputs(one).shape[-1]
+        self._belief = Belief(students, width, items, half_life=self._half_life)
+        self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
+        self._best = self._best.new_zeros(students)
+        self._lowest = self._lowest.new_full((students,), torch.inf)
+        self._highest = -self._lowest
+
+    def _take_in(self) -> None:
+        """Learns from the outcomes since the last proposal."""
+        for seen in self._inbox.take():
+            assert self._belief is not None
+            labels = self._labels(seen)
+            self._belief.grow_older()
+            self._belief.observe(seen["inputs"], labels, seen.get("items", None))
+            self._seen.append((seen["predicted"], labels))
+            error, returns = (seen["predicted"] - labels).square(), seen["return"]
+            rows = [torch.ones_like(labels), labels, error, returns, returns.square()]
+            of = F.one_hot(seen["arm"], len(ARMS)).double().mT
+            faded = 0.5 ** (1 / self._memory) * self._sums
+            self._sums = faded + of @ torch.stack(rows, -1)
+            tried, won = self._sums[:, TARGET, :2].unbind(-1)
+            faded = 0.5 ** (1 / self._remember) * self._best
+            self._best = torch.maximum(faded, won / (tried + FAILURES))
+
+    def _labels(self, seen: TensorDictBase) -> Tensor:
+        """Returns successes, or where returns lie between the lowest and the highest: [K, m]."""
+        returns = seen["return"]
+        self._lowest = torch.minimum(self._lowest, returns.amin(1))
+        self._highest = torch.maximum(self._highest, returns.amax(1))
+        self._told = "success" in seen.keys()
+        if self._told:
+            return seen["success"]
+        low, high = self._lowest.unsqueeze(1), self._highest.unsqueeze(1)
+        wide = (high - low) > EQUAL * torch.maximum(high.abs(), low.abs())
+        return torch.where(wide, (returns - low) / (high - low), 0.5)
+
+    def _shares(self) -> Tensor:
+        """Returns the shares of the arms in the next batch, float64 [K, 3]."""
+        number, label, error, returns, squares = self._sums.unbind(-1)
+
+        def variance(number: Tensor, mean: Tensor, square: Tensor) -> Tensor:
+            return (square / number - (mean / number).square()).clamp(min=0)
+
+        every = variance(number.sum(1), returns.sum(1), squares.sum(1))
+        own = variance(number, returns, squares)[:, TARGET]
+        signal = (own / every).sqrt().nan_to_num(1.0, posinf=1.0).clamp(max=1)
+        rate = (label / number)[:, UNIFORM].nan_to_num(0.0)
+        constant = number[:, UNIFORM] * rate * (1 - rate)
+        skill = 1 - (error[:, UNIFORM] + 1) / (constant + 1)
+        low = self._floor + (self._low - self._floor) * (2 * signal).clamp(max=1)
+        half = self._half if self._told else 0.5
+        target = low + (self._high - low) * self._best / (self._best + half)
+        if self._target is None:
+            target = torch.zeros_like(target)
+        way = (self._skilled + 0.5 * skill).clamp(0.2, 0.8)
+        shares = torch.stack([target, (1 - target) * (1 - way), (1 - target) * way], -1)
+        if self._given is not None:
+            shares = torch.tensor([self._given] * len(shares), dtype=torch.float64)
+        self._shown |= {
+            "shares": {arm: shares[:, i].tolist() for i, arm in enumerate(ARMS)},
+            "target_success": self._best.tolist(),
+            "target_signal": signal.tolist(),
+            "skill": skill.tolist(),
+        }
+        return shares
+
+    def _batch(self, k: int, count: int, shares: Tensor, streams: Streams) -> tuple[Levels, Tensor]:
+        """Returns levels [n] of one student in a random order, and their arms."""
+        draw = streams.generator("levels")
+        arms = allotted(shares, count, draw)
+        target, uniform, way = torch.bincount(arms, minlength=len(ARMS)).tolist()
+        parts = [self._space.sample(uniform, draw)]
+        if target and self._target is not None:
+            parts = [self._target.sample(target, draw), *parts]
+        if way:
+            parts.append(self._way(k, way, draw))
+        order = torch.randperm(count, generator=draw)
+        return torch.cat(parts)[order], arms[order]
+
+    def _way(self, k: int, count: int, draw: torch.Generator) -> Levels:
+        """Returns levels [n] that are mastered, and near to the target."""
+        assert self._belief is not None
+        targets = (self._target or self._space).sample(count, draw)
+        levels = self._candidates(k, self._times * count, targets, draw)
+        goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
+        only = slice(k, k + 1)
+        p = self._belief.predict(x[None], None if items is None else items[None], only)[0]
+        allowed = p >= p.max().clamp(max=self._delta)
+        extra = torch.where(allowed, -self._learn * 4 * p * (1 - p), FORBIDDEN)
+        chosen = []
+        for start in range(0, count, AT_ONCE):
+            end = min(start + AT_ONCE, count)
+            few = slice(self._times * start, self._times * end)
+            far = torch.cdist(goals[start:end], x[few]).square() / max(x.shape[1], 1)
+            chosen.append(few.start + assigned(far + extra[few]))
+        self._last[str(k)] = levels[torch.cat(chosen)]
+        return self._last[str(k)]
+
+    def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
+        """Returns levels [n] of the space and, if it can tell, on the way to those of the target."""
+        space: Any = self._space
+        if not hasattr(space, "between"):
+            return space.sample(count, draw)
+        half = count // 2
+        fresh = space.sample(count - half, draw)
+        last = self._last.get(str(k), fresh)
+        a = last[torch.randint(len(last), (half,), generator=draw)]
+        b = targets[torch.randint(len(targets), (half,), generator=draw)]
+        every = torch.cat([fresh, space.between(a, b, NEAR, draw)])
+        return every[torch.randperm(count, generator=draw)]
+
+    def _show(self, levels: Levels, arms: Tensor) -> None:
+        """Keeps some levels [n] of each arm for readers."""
+        self._shown["levels"] = {
+            arm: levels[(arms == i).nonzero().flatten()[:SHOWN]]
+            for i, arm in enumerate(ARMS)
+            if (arms == i).any()
+        }
+
+    def _inputs(self, levels: Levels) -> Tensor:
+        return self._known(levels).double().cpu()
+
+    def _items(self, levels: Levels) -> Tensor | None:
+        space: Any = self._space
+        return space.items(levels) if hasattr(space, "items") else None
+
+
+def assigned(costs: Tensor) -> Tensor:
+    """Returns a candidate for each goal, none twice, at the least sum of costs.
+
+    Args:
+        costs: float64 [G, C], C at least G.
+
+    Returns:
+        int64 [G].
+
+    Example:
+        >>> assigned(torch.tensor([[1.0, 2.0, 9.0], [1.0, 5.0, 9.0]]))
+        tensor([1, 0])
+    """
+    # SciPy's solvers take long to import, and few curricula need them.
+    from scipy.optimize import linear_sum_assignment
+
+    return torch.from_numpy(linear_sum_assignment(costs.numpy())[1])
+
+
+def allotted(shares: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Returns the arms of levels, int64 [n], in rising order: as many of each as its share is.
+
+    What is left of a level is drawn, so that on average numbers are as the shares.
+
+    Args:
+        shares: that add up to one, float64 [arms].
+        count: number n of levels.
+        generator: of the CPU.
+    """
+    start = torch.rand(1, generator=generator, dtype=torch.float64)
+    arms = torch.searchsorted(shares.cumsum(0) * count, start + torch.arange(count), right=True)
+    return arms.clamp(max=len(shares) - 1)
