@@ -166,6 +166,16 @@ MADE: dict[str, Make] = {
     "transport on a model": lambda: modelled(
         filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2, exploration=0.1))
     ),
+    "mixture on a model": lambda: modelled(
+        Mixed(
+            [
+                filtered(SamplingCurriculum(SPACE)),
+                SamplingCurriculum(TARGET),
+                filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2)),
+            ],
+            [1, 1, 1],
+        )
+    ),
     "progress on a model": lambda: modelled(LearningProgressCurriculum(SPACE, probes=2)),
     "edits on a model": lambda: modelled(replay("learnability", "exact", edits=3)),
     "filter on a model": lambda: modelled(filtered(SamplingCurriculum(SPACE))),
