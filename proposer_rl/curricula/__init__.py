@@ -14,6 +14,7 @@ from typing import Any
 from proposer_rl.curricula.batches import SomeBins as SomeBins
 from proposer_rl.curricula.batches import level_keys as level_keys
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
+from proposer_rl.curricula.bounds import BoundsCurriculum as BoundsCurriculum
 from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
 from proposer_rl.curricula.buffer import draw_slots as draw_slots
 from proposer_rl.curricula.buffer import empty_buffer as empty_buffer

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from proposer_rl.curricula import (
+    BoundsCurriculum,
     Curriculum,
     Filtered,
     FirstOrderCurriculum,
@@ -153,6 +154,7 @@ MADE: dict[str, Make] = {
     "alp_gmm, exact": lambda: MixtureCurriculum(
         SPACE, source="exact", warmup=8, refit=6, components=3
     ),
+    "adr": lambda: BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
     "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
