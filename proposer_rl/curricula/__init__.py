@@ -50,6 +50,7 @@ from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
+from proposer_rl.curricula.self_paced import SelfPacedCurriculum as SelfPacedCurriculum
 from proposer_rl.curricula.student import Student as Student
 from proposer_rl.curricula.student import TaskStudent as TaskStudent
 from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError

@@ -27,6 +27,7 @@ from proposer_rl.curricula import (
     Schedule,
     Scorer,
     SelectionCurriculum,
+    SelfPacedCurriculum,
     TaskStudent,
     TransportCurriculum,
 )
@@ -155,6 +156,9 @@ MADE: dict[str, Make] = {
         SPACE, source="exact", warmup=8, refit=6, components=3
     ),
     "adr": lambda: BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
+    "spdl": lambda: SelfPacedCurriculum(
+        SPACE, TARGET, TASK.target_shares, delta=0.01, episodes=6, measure="return"
+    ),
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
     "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
