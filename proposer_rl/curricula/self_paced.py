@@ -142,17 +142,17 @@ class SelfPacedCurriculum(Curriculum):
         if not len(self.means):
             return {}
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
-        now = [Gaussian(*own) for own in zip(*self._arrays(), strict=True)]
         return {
             "histogram": along_axes(counts, self.space),
             "means": self.means.tolist(),
             "deviations": self.deviations.tolist(),
-            "target_divergence": [divergence(own, self._target)[0] for own in now],
+            "target_divergence": [divergence(now, self._target)[0] for now in self._gaussians()],
             **({"expected_performance": list(self._expected)} if self._expected else {}),
         }
 
-    def _arrays(self) -> tuple[Floats, Floats]:
-        return self.means.numpy(), self.deviations.numpy()
+    def _gaussians(self) -> list[Gaussian]:
+        each = zip(self.means.numpy(), self.deviations.numpy(), strict=True)
+        return [Gaussian(mean, deviation) for mean, deviation in each]
 
     def _take_in(self) -> None:
         """Adds episodes, and makes a step where there are enough."""
@@ -169,9 +169,9 @@ class SelfPacedCurriculum(Curriculum):
             for name in ("points", "log_density", "reached")
         )
         found = [
-            step_towards(self._target, Gaussian(mean, deviation), *own, *self._limits)
-            for mean, deviation, *own in zip(
-                *self._arrays(), points, log_density, reached, strict=True
+            step_towards(self._target, now, *own, *self._limits)
+            for now, own in zip(
+                self._gaussians(), zip(points, log_density, reached, strict=True), strict=True
             )
         ]
         self.means, self.deviations = (
